@@ -1,0 +1,179 @@
+"""The frequency lattice of a study, its half with xi_z >= 0, and rectangular blocks of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import LatticeError
+
+# Beyond this the half lattice of doubles alone takes 34 GB and more; no FFT of it is sensible.
+_LARGEST_M = 2048
+AXES = ("xi_x", "xi_y", "xi_z")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A rectangular block of the half lattice, in units of the spacing.
+
+    Attributes:
+        start: the lowest index k of each axis; may be negative in x and y.
+        shape: the number of samples of each axis.
+    """
+
+    start: tuple[int, int, int]
+    shape: tuple[int, int, int]
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return math.prod(self.shape)
+
+    def indices(self, axis: int) -> NDArray[np.int64]:
+        """The indices k of an axis, int64 (shape[axis],)."""
+        return np.arange(self.start[axis], self.start[axis] + self.shape[axis], dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The frequencies xi = h k with h = 2 xi_max / M and k = -M/2..M/2 on each axis.
+
+    A surface measure is real, so its transform at -xi is the conjugate of that at xi, and only the
+    half with xi_z >= 0 is ever computed and stored: shape (M+1, M+1, M/2+1).
+
+    Args:
+        xi_max: half the side of the frequency cube, in cycles per unit length.
+        M: number of intervals per axis, even.
+
+    Raises:
+        LatticeError: xi_max not positive and finite; M not an even integer from 2 to 2048.
+    """
+
+    xi_max: float
+    M: int
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.xi_max) and self.xi_max > 0):
+            raise LatticeError(f"xi_max must be positive and finite, found {self.xi_max}")
+        if isinstance(self.M, bool) or not isinstance(self.M, int) or self.M % 2 or not 2 <= self.M <= _LARGEST_M:
+            raise LatticeError(f"M must be an even integer from 2 to {_LARGEST_M}, found {self.M!r}")
+
+    @property
+    def spacing(self) -> float:
+        """Distance h of neighbouring frequencies, in cycles per unit length."""
+        return 2 * self.xi_max / self.M
+
+    @property
+    def half_period(self) -> float:
+        """1/(2h): surfaces must lie in the open cube of coordinates below this, in units of length."""
+        return 1 / (2 * self.spacing)
+
+    @property
+    def highest_frequency(self) -> float:
+        """The length |xi| of the cube's corners, in cycles per unit length."""
+        return math.sqrt(3) * self.xi_max
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Samples along xi_x, xi_y, xi_z of the half lattice."""
+        return self.M + 1, self.M + 1, self.M // 2 + 1
+
+    @property
+    def half(self) -> Block:
+        """The half lattice xi_z >= 0 as one block."""
+        return Block((-self.M // 2, -self.M // 2, 0), self.shape)
+
+    @cached_property
+    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies along xi_x, xi_y, xi_z of the half lattice, in cycles per unit length."""
+        return self.frequencies(self.half)
+
+    def frequencies(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies along the three axes of a block, in cycles per unit length."""
+        x, y, z = (self.spacing * block.indices(axis) for axis in range(3))
+        return x, y, z
+
+    def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
+        """Weights of the trapezoidal rule over the whole cube, for a block of its half, (block.shape).
+
+        The end samples of each axis count half; samples with xi_z > 0 count twice, for themselves
+        and for their conjugates. The factor h^3 is included.
+        """
+        x, y, z = (
+            np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3)
+        )
+        z = z * np.where(block.indices(2) > 0, 2.0, 1.0)
+        weights: NDArray[np.float64] = x[:, None, None] * y[:, None] * z
+        return weights
+
+    def shells(self, block: Block) -> NDArray[np.int32]:
+        """The squared length |k|^2 of each index triple of a block, int32 (block.shape)."""
+        x, y, z = (block.indices(axis).astype(np.int32) ** 2 for axis in range(3))
+        lengths: NDArray[np.int32] = x[:, None, None] + y[:, None] + z
+        return lengths
+
+    @property
+    def shell_count(self) -> int:
+        """Number of values that `shells` can take: 3 (M/2)^2 + 1."""
+        return 3 * (self.M // 2) ** 2 + 1
+
+    def split(self, largest_size: int) -> tuple[Block, ...]:
+        """The half lattice in equal blocks of at most ``largest_size`` samples.
+
+        Blocks differ in shape only at the high ends, as the chunks of a regular grid do. The slow
+        axes are cut first, which keeps each block one contiguous run as long as possible.
+        """
+        shape = list(self.shape)
+        for axis in range(3):
+            rest = math.prod(shape[axis + 1 :])
+            parts = math.ceil(shape[axis] * rest / largest_size)
+            shape[axis] = math.ceil(shape[axis] / min(parts, shape[axis]))
+            if math.prod(shape) <= largest_size:
+                break
+        return tuple(self._blocks((shape[0], shape[1], shape[2])))
+
+    def _blocks(self, chunk: tuple[int, int, int]) -> Iterator[Block]:
+        starts = [range(0, total, step) for total, step in zip(self.shape, chunk, strict=True)]
+        for offsets in product(*starts):
+            i, j, k = (
+                (first + offset, min(step, total - offset))
+                for first, offset, step, total in zip(self.half.start, offsets, chunk, self.shape, strict=True)
+            )
+            yield Block((i[0], j[0], k[0]), (i[1], j[1], k[1]))
+
+    def place(self, block: Block) -> tuple[slice, slice, slice]:
+        """Where a block lies in an array of the half lattice."""
+        x, y, z = (
+            slice(start - first, start - first + count)
+            for first, start, count in zip(self.half.start, block.start, block.shape, strict=True)
+        )
+        return x, y, z
+
+    @classmethod
+    def of(cls, field: xr.DataArray) -> Lattice:
+        """The lattice on whose half a field is sampled.
+
+        Raises:
+            LatticeError: an array without the three axes, or whose axes are not those of the half
+                of a lattice.
+        """
+        if not set(AXES) <= set(field.coords):
+            raise LatticeError(f"a Fourier field needs the coordinates {', '.join(AXES)}, found {list(field.coords)}")
+        found = [np.asarray(field[name].values, dtype=np.float64) for name in AXES]
+        if found[0].ndim != 1 or len(found[0]) < 3:
+            raise LatticeError(f"xi_x must be an axis of at least three samples, found shape {found[0].shape}")
+        lattice = cls(float(found[0][-1]), len(found[0]) - 1)
+        for name, axis, expected in zip(AXES, found, lattice.axes, strict=True):
+            if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=1e-12, atol=1e-12 * lattice.xi_max):
+                raise LatticeError(
+                    f"{name} does not run over the half (xi_z >= 0) of a lattice of xi_max {lattice.xi_max:g} and "
+                    f"M {lattice.M}; select whole fields, not parts of them"
+                )
+        return lattice

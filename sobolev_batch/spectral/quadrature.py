@@ -1,0 +1,174 @@
+"""From a mesh to weighted points: which rule each triangle gets, in batches of bounded size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
+from sobolev_batch.spectral.triangles import Corners
+from sobolev_batch.surfaces.mesh import Mesh
+
+Reals = NDArray[np.float64]
+
+# Triangles per slice: keeps the temporaries of a slice with a mid-sized rule near 50 MB.
+_SLICE = 1 << 17
+
+
+@dataclass(frozen=True)
+class WeightedPoints:
+    """A sum of Dirac masses.
+
+    Attributes:
+        coordinates: (3, n) float64, one contiguous row per axis, in units of length.
+        weights: (n,) float64, in squared units of length.
+    """
+
+    coordinates: Reals
+    weights: Reals
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """How triangles become points.
+
+    Args:
+        method: "auto" gives every triangle the smallest symmetric rule that keeps the tolerance at
+            all frequencies of the lattice, and subdivides those too large for any; an integer is
+            the degree of one symmetric rule for all (1 to 50); "gauss8" is the 64-point product rule
+            of K. Koga's paper.
+
+    Raises:
+        InputError: any other method.
+    """
+
+    method: str | int = "auto"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.method, bool) or (
+            self.method not in ("auto", "gauss8")
+            and not (isinstance(self.method, int) and 1 <= self.method <= HIGHEST_DEGREE)
+        ):
+            raise InputError(
+                f"quadrature must be 'auto', 'gauss8' or a degree from 1 to {HIGHEST_DEGREE}, found {self.method!r}"
+            )
+
+    def batches(
+        self, mesh: Mesh, highest_frequency: float, tolerance: float, capacity: int
+    ) -> Iterator[WeightedPoints]:
+        """The points of a mesh, in batches of at most ``capacity`` points, nearly equal in size.
+
+        Args:
+            mesh: the surface.
+            highest_frequency: the largest |ξ| at which the points must stand for the mesh, in
+                cycles per unit length.
+            tolerance: largest quadrature error at any such frequency, relative to the area; "auto"
+                keeps it, the others ignore it.
+            capacity: bound on the points of one batch.
+        """
+        pieces = [
+            piece
+            for group in self._groups(mesh, highest_frequency, tolerance)
+            for piece in group.cut(max(1, min(_SLICE, capacity // group.rule.size)))
+        ]
+        total = sum(piece.point_count for piece in pieces)
+        target = -(-total // -(-total // capacity))
+        waiting: list[_Group] = []
+        filled = 0
+        for piece in pieces:
+            if waiting and filled + piece.point_count > capacity:
+                yield _join(mesh, waiting)
+                waiting, filled = [], 0
+            waiting.append(piece)
+            filled += piece.point_count
+            if filled >= target:
+                yield _join(mesh, waiting)
+                waiting, filled = [], 0
+        if waiting:
+            yield _join(mesh, waiting)
+
+    def point_count(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
+        """How many points `batches` makes in all."""
+        return sum(group.point_count for group in self._groups(mesh, highest_frequency, tolerance))
+
+    def _groups(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> list[_Group]:
+        everything = np.arange(len(mesh.triangles))
+        if self.method == "gauss8":
+            return [_Group(gauss_rule(8), 0, everything)]
+        if isinstance(self.method, int):
+            return [_Group(symmetric_rule(self.method), 0, everything)]
+        return _smallest_rules(mesh, 2 * np.pi * highest_frequency, tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Triangles that share a rule, each cut into 4^splits similar ones first."""
+
+    rule: TriangleRule
+    splits: int
+    members: NDArray[np.int64]
+
+    @property
+    def point_count(self) -> int:
+        return len(self.members) * self.rule.size * 4**self.splits
+
+    def cut(self, largest: int) -> Iterator[_Group]:
+        step = max(1, largest // 4**self.splits)
+        for first in range(0, len(self.members), step):
+            yield _Group(self.rule, self.splits, self.members[first : first + step])
+
+    def points(self, mesh: Mesh) -> WeightedPoints:
+        a, b, c = (corner[self.members] for corner in mesh.corners)
+        areas = mesh.areas[self.members]
+        for _ in range(self.splits):
+            a, b, c = _quarter((a, b, c))
+            areas = np.tile(areas / 4, 4)
+        rule = self.rule
+        coordinates = np.empty((3, rule.size, len(areas)))
+        for axis in range(3):
+            np.matmul(rule.barycentric, np.stack([a[:, axis], b[:, axis], c[:, axis]]), out=coordinates[axis])
+        return WeightedPoints(coordinates.reshape(3, -1), np.outer(rule.weights, areas).ravel())
+
+
+def _smallest_rules(mesh: Mesh, wavenumber: float, tolerance: float) -> list[_Group]:
+    rules, reach = reaches(tolerance)
+    sizes = wavenumber * mesh.centroid_radii
+    splits = np.ceil(np.log2(np.maximum(sizes / reach[-1], 1.0))).astype(np.int64)
+    choice = np.searchsorted(reach, sizes / 2.0**splits)
+    # Rounding of the logarithm may leave a size just beyond the last reach.
+    choice = np.minimum(choice, len(rules) - 1)
+    kinds, group_of = np.unique(splits * len(rules) + choice, return_inverse=True)
+    if len(kinds) == 1:
+        members = [np.arange(len(sizes))]
+    else:
+        order = np.argsort(group_of, kind="stable")
+        members = np.split(order, np.cumsum(np.bincount(group_of))[:-1])
+    return [
+        _Group(rules[kind % len(rules)], int(kind // len(rules)), chosen)
+        for kind, chosen in zip(kinds.tolist(), members, strict=True)
+    ]
+
+
+def _quarter(corners: Corners) -> Corners:
+    """Each triangle cut into four similar ones at its edge midpoints; children of one kind stay together."""
+    a, b, c = corners
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    return (
+        np.concatenate([a, ab, ca, ab]),
+        np.concatenate([ab, b, bc, bc]),
+        np.concatenate([ca, bc, c, ca]),
+    )
+
+
+def _join(mesh: Mesh, groups: list[_Group]) -> WeightedPoints:
+    made = [group.points(mesh) for group in groups]
+    if len(made) == 1:
+        return made[0]
+    return WeightedPoints(
+        np.concatenate([points.coordinates for points in made], axis=1),
+        np.concatenate([points.weights for points in made]),
+    )

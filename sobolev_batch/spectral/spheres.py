@@ -1,0 +1,115 @@
+"""Closed forms for spheres: transforms, norms and inner products of their area measures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.special import gamma, kv
+
+from sobolev_batch.errors import OrderError
+from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.surfaces.sphere import Sphere
+
+
+def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """The transform ∫ exp(-2πi ξ·x) dσ(x) of a sphere's area measure.
+
+    Args:
+        sphere: radius R and centre c, in units of length.
+        frequencies: (..., 3) float64, in cycles per unit length.
+
+    Returns:
+        complex128 (...): 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) = sin(πt)/(πt).
+    """
+    lengths = np.sqrt(np.einsum("...i,...i->...", frequencies, frequencies))
+    phases = np.exp(-2j * np.pi * (frequencies @ np.asarray(sphere.center)))
+    return np.asarray(sphere.area * np.sinc(2 * sphere.radius * lengths) * phases)
+
+
+def sphere_block(sphere: Sphere, lattice: Lattice, block: Block) -> NDArray[np.complex128]:
+    """The transform of a sphere on a block of the lattice, complex128 (block.shape)."""
+    x, y, z = lattice.frequencies(block)
+    lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)
+    values = (sphere.area * np.sinc(2 * sphere.radius * lengths)).astype(np.complex128)
+    for axis, frequencies in enumerate((x, y, z)):
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        values *= np.exp(-2j * np.pi * sphere.center[axis] * frequencies).reshape(shape)
+    return values
+
+
+def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
+    """The inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
+
+    With C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ, a Matérn function, it is 4πR₁R₂ times the mean over
+    |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), d the distance of the centres: closed for
+    concentric spheres, a smooth one-dimensional integral otherwise. Relative error about 1e-13.
+
+    Raises:
+        OrderError: an order that is not below -1/2, or so low that the Bessel functions overflow.
+    """
+    nu = -order - 0.5
+    if not nu > 0:
+        raise OrderError(f"the norm of a surface needs an order below -1/2, found {order:g}")
+    apart = math.dist(first.center, second.center)
+    radii = first.radius, second.radius
+    near, far = radii[0] - radii[1], radii[0] + radii[1]
+
+    def integrand(t: float) -> float:
+        return _matern_difference(nu, abs(near + apart * t), abs(far + apart * t))
+
+    if apart == 0:
+        mean = integrand(0.0)
+    else:
+        # The Matérn function has a kink at zero: integrate up to it from both sides.
+        kinks = sorted(t for t in (-near / apart, -far / apart) if -1 < t < 1)
+        edges = [-1.0, *kinks, 1.0]
+        mean = 0.5 * sum(
+            quad(integrand, low, high, epsabs=0, epsrel=1e-13, limit=200)[0]
+            for low, high in zip(edges[:-1], edges[1:], strict=True)
+        )
+    value = 8 * math.pi * radii[0] * radii[1] * mean
+    if not math.isfinite(value):
+        raise OrderError(f"order {order:g} is too low for the closed form of spheres: its Bessel functions overflow")
+    return value
+
+
+def sphere_norm(sphere: Sphere, order: float) -> float:
+    """The Sobolev norm of a sphere's area measure, of an order s < -1/2."""
+    return math.sqrt(sphere_inner_product(sphere, sphere, order))
+
+
+def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
+    """The Sobolev distance of two spheres' area measures, of an order s < -1/2.
+
+    The squared distance is a difference of inner products: its absolute error is about 1e-13 of the
+    squared norms.
+    """
+    squared = (
+        sphere_inner_product(first, first, order)
+        + sphere_inner_product(second, second, order)
+        - 2 * sphere_inner_product(first, second, order)
+    )
+    return math.sqrt(max(squared, 0.0))
+
+
+def _matern_difference(nu: float, shorter: float, longer: float) -> float:
+    """C(2π shorter) - C(2π longer), without cancellation where both arguments are small.
+
+    C(b) = √π (b/2)^ν K_ν(b) / Γ(ν+1/2), and d/db [b^ν K_ν(b)] = -b^ν K_{ν-1}(b).
+    """
+    low, high = 2 * math.pi * shorter, 2 * math.pi * longer
+    factor = math.sqrt(math.pi) / (2**nu * gamma(nu + 0.5))
+    if max(low, high) < 1:
+        rise, _ = quad(lambda b: b**nu * kv(nu - 1, b) if b > 0 else 0.0, low, high, epsabs=0, epsrel=1e-13, limit=200)
+        return float(factor * rise)
+    return float(factor * (_matern(nu, low) - _matern(nu, high)))
+
+
+def _matern(nu: float, b: float) -> float:
+    """b^ν K_ν(b), with its limit 2^(ν-1) Γ(ν) at zero."""
+    value = b**nu * kv(nu, b) if b > 0 else math.inf
+    return float(value) if math.isfinite(value) else float(2 ** (nu - 1) * gamma(nu))

@@ -1,0 +1,152 @@
+"""The Fourier transform of a surface on a lattice: closed form, or quadrature and NUFFT."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.nufft import Precision, transform_points
+from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.spheres import sphere_block
+from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.sphere import Sphere
+
+# Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
+# another version are then computed again instead of being compared with new ones.
+NUMERICS_VERSION = 1
+
+# Points of one NUFFT call: 4 million take 0.5 GB with their strengths and their sorting, and make
+# the FFT of a call a small part of it.
+DEFAULT_BATCH = 1 << 22
+
+# What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
+_FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
+_COARSEST_EPS = 0.1
+
+
+@dataclass(frozen=True)
+class Transform:
+    """How fields are computed.
+
+    Args:
+        eps: accuracy of a field relative to the surface's area, of triangle rule and NUFFT alike.
+            None stands for 1e-9 in complex128 and 1e-6 in complex64.
+        precision: "complex128" or "complex64".
+        quadrature: see `Quadrature`.
+
+    Raises:
+        InputError: a precision that does not exist, or an eps beyond what it can hold.
+    """
+
+    eps: float | None = None
+    precision: Precision = "complex128"
+    quadrature: Quadrature = field(default_factory=Quadrature)
+
+    def __post_init__(self) -> None:
+        if self.precision not in get_args(Precision):
+            raise InputError(f"dtype must be 'complex128' or 'complex64', found {self.precision!r}")
+        if self.eps is None:
+            object.__setattr__(self, "eps", 1e-9 if self.precision == "complex128" else 1e-6)
+        finest = _FINEST_EPS[self.precision]
+        if not finest <= self.accuracy <= _COARSEST_EPS:
+            raise InputError(
+                f"eps must lie between {finest:g} and {_COARSEST_EPS:g} in {self.precision}, found {self.eps!r}"
+            )
+
+    @property
+    def accuracy(self) -> float:
+        """The eps in force."""
+        return float(self.eps) if self.eps is not None else float("nan")
+
+
+def fourier_transform(
+    surface: Surface,
+    lattice: Lattice,
+    eps: float | None = None,
+    *,
+    dtype: Precision = "complex128",
+    quadrature: str | int = "auto",
+    threads: int | None = None,
+) -> xr.DataArray:
+    """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
+
+    Args:
+        surface: a `Mesh` or `Sphere`, in units of length.
+        lattice: the frequencies.
+        eps: accuracy relative to the surface's area; the error reached is a small multiple of it.
+            Default 1e-9, or 1e-6 in single precision.
+        dtype: "complex128" or "complex64".
+        quadrature: "auto", a degree from 1 to 50, or "gauss8".
+        threads: of the NUFFT; default one per core.
+
+    Returns:
+        The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
+        xi_z in cycles per unit length. The other half is the conjugate of this one.
+
+    Raises:
+        LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
+        InputError: settings out of range.
+
+    Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
+    """
+    settings = Transform(eps, dtype, Quadrature(quadrature))
+    values = transform_block(surface, lattice, lattice.half, settings, threads=threads or os.cpu_count() or 1)
+    return as_field(values, lattice, {"eps": settings.accuracy, "quadrature": quadrature, "area": surface.area})
+
+
+def as_field(values: NDArray[Any], lattice: Lattice, attributes: dict[str, Any]) -> xr.DataArray:
+    """An array over the half lattice as a labelled field."""
+    units = {"units": "cycles per unit length"}
+    coordinates = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
+    return xr.DataArray(values, coords=coordinates, dims=AXES, name="fourier", attrs=attributes)
+
+
+def transform_block(
+    surface: Surface,
+    lattice: Lattice,
+    block: Block,
+    settings: Transform,
+    *,
+    threads: int = 1,
+    batch: int = DEFAULT_BATCH,
+) -> NDArray[np.complexfloating[Any, Any]]:
+    """The transform of a surface on one block of the lattice, complex (block.shape).
+
+    Memory is that of the block (about twelve times its bytes), of the mesh, and of one batch of
+    points: it does not grow with the number of points.
+
+    Raises:
+        LatticeError: a mesh reaches beyond the lattice's half period.
+    """
+    if isinstance(surface, Sphere):
+        return sphere_block(surface, lattice, block).astype(settings.precision, copy=False)
+    require_inside(surface, lattice)
+    points = settings.quadrature.batches(surface, lattice.highest_frequency, settings.accuracy, batch)
+    return transform_points(
+        points, lattice, block, eps=settings.accuracy, precision=settings.precision, threads=threads
+    )
+
+
+def require_inside(mesh: Mesh, lattice: Lattice) -> None:
+    """Refuse a mesh that does not fit into the lattice's period, where its points would fold.
+
+    Raises:
+        LatticeError: some |coordinate| is not below 1/(2h).
+    """
+    reach = max(float(np.abs(bound).max()) for bound in mesh.bounds)
+    if not reach < lattice.half_period:
+        needed = 2 * math.floor(2 * lattice.xi_max * reach) + 2
+        raise LatticeError(
+            f"the mesh reaches to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
+            f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
+            f"take M >= {needed}, a smaller xi_max, or scale the mesh down"
+        )

@@ -1,0 +1,87 @@
+"""The source `files`: meshes from the file system, by path or glob."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from sobolev_batch.errors import StudyError
+from sobolev_batch.surfaces.readers import read_mesh
+from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, file_digest
+
+
+class Files(Source):
+    """Mesh files.
+
+    Attributes:
+        paths: paths or globs (``**`` crosses folders), relative to the study file. A path that is
+            named must exist when its mesh is computed; a glob must match something at once.
+        distribution: an installed Python distribution. Paths are then those of files that it
+            recorded at its installation, without wildcards; nothing of it is imported.
+    """
+
+    paths: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False)]
+    distribution: str | None = None
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """One member per file, sorted by path; named by the file's stem where that tells them apart."""
+        if self.distribution is not None:
+            found = {self._recorded(self.distribution, path) for path in self.paths}
+        else:
+            found = {match for path in self.paths for match in _matches(folder, path)}
+        paths = sorted(found)
+        return tuple(FileMember(name, -1, path) for name, path in zip(_names(paths), paths, strict=True))
+
+    @staticmethod
+    def _recorded(name: str, path: str) -> Path:
+        try:
+            recorded = distribution(name).files or []
+        except PackageNotFoundError as error:
+            raise StudyError(
+                f"the distribution {name!r} is not installed; install it, for example by pip install {name}"
+            ) from error
+        for file in recorded:
+            if file.as_posix() == path:
+                return Path(str(file.locate()))
+        raise StudyError(f"the distribution {name!r} {distribution(name).version} contains no file {path!r}")
+
+
+@dataclass(frozen=True)
+class FileMember(Member):
+    """A mesh file."""
+
+    path: Path
+
+    def load(self) -> Surface:
+        """Read the file."""
+        return read_mesh(self.path)
+
+    def fingerprint(self) -> Fingerprint:
+        """The digest of the file's bytes, and its format."""
+        return {"file": file_digest(self.path), "format": "".join(self.path.suffixes).lower()}
+
+
+def _matches(folder: Path, path: str) -> list[Path]:
+    if not glob.has_magic(path):
+        return [folder / path]
+    found = [Path(match) for match in glob.glob(str(folder / path), recursive=True) if Path(match).is_file()]
+    if not found:
+        raise StudyError(f"the glob {path!r} matches no file below {folder.resolve()}")
+    return found
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Stems, or file names where stems collide, or whole paths where file names do too."""
+    stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
+    same_stem, same_name = Counter(stems), Counter(path.name for path in paths)
+    return [
+        stem if same_stem[stem] == 1 else path.name if same_name[path.name] == 1 else path.as_posix()
+        for stem, path in zip(stems, paths, strict=True)
+    ]

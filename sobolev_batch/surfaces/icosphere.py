@@ -1,0 +1,26 @@
+"""Icosahedral triangulations of the unit sphere."""
+
+from __future__ import annotations
+
+import trimesh
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.mesh import Mesh
+
+# 20 * 4^12 is 335 million triangles, some 24 GB of indices and corners: beyond it a level is a typing error.
+FINEST_LEVEL = 12
+
+
+def icosphere(level: int) -> Mesh:
+    """The icosahedral triangulation T_level of the unit sphere centred at the origin.
+
+    T_0 is the inscribed icosahedron; each level splits every triangle at its edge midpoints and
+    projects the new vertices to the sphere: 10*4^level + 2 vertices, 20*4^level triangles.
+
+    Raises:
+        InputError: a level that is not an integer from 0 to 12.
+    """
+    if isinstance(level, bool) or not isinstance(level, int) or not 0 <= level <= FINEST_LEVEL:
+        raise InputError(f"an icosphere's level must be an integer from 0 to {FINEST_LEVEL}, found {level!r}")
+    sphere = trimesh.creation.icosphere(subdivisions=level, radius=1.0)
+    return Mesh(sphere.vertices, sphere.faces)

@@ -1,0 +1,187 @@
+"""Triangle meshes: the vertices and triangles of a surface, checked once and then frozen."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sobolev_batch.errors import MeshError
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+# Twice the rounding error of a cross product, relative to the squared longest edge: an area below
+# this is not distinguishable from zero in double precision.
+_AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
+
+
+@dataclass(frozen=True)
+class MeshCounts:
+    """What is unusual about a mesh. All of it is legitimate in a surface measure, none is repaired.
+
+    Attributes:
+        zero_area: triangles whose area is zero to double precision.
+        duplicate: triangles that repeat the three vertices of an earlier one, in any orientation.
+        boundary_edges: edges of exactly one triangle.
+        nonmanifold_edges: edges of more than two triangles.
+    """
+
+    zero_area: int
+    duplicate: int
+    boundary_edges: int
+    nonmanifold_edges: int
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh in three-dimensional space, as a sum of flat area measures.
+
+    Args:
+        vertices: real array (n, 3), finite, in the user's unit of length.
+        triangles: integer array (m, 3) of indices into ``vertices``, m > 0.
+
+    Both are copied, converted to float64 and int64 and made read-only. Zero-area triangles,
+    duplicates, open boundaries and non-manifold edges are kept; `counts` reports them.
+
+    Raises:
+        MeshError: coordinates that are not finite, indices that are negative, out of range or not
+            integers, no triangles, or a total area of zero; the message names the entries.
+    """
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+    def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
+        checked_vertices = _check_vertices(vertices)
+        checked_triangles = _check_triangles(triangles, len(checked_vertices))
+        object.__setattr__(self, "vertices", checked_vertices)
+        object.__setattr__(self, "triangles", checked_triangles)
+        if not np.isfinite(self.area):
+            raise MeshError(
+                "the mesh has coordinates so large that its area overflows double precision: "
+                f"largest absolute coordinate {np.abs(checked_vertices).max():.3g}; rescale it"
+            )
+        if not np.any(self.areas > self._smallest_area):
+            raise MeshError(
+                f"the total area of the {len(checked_triangles)} triangles is zero: every one is "
+                "degenerate, so there is no surface measure to compare"
+            )
+
+    @cached_property
+    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The first, second and third corners of all triangles, each (m, 3)."""
+        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
+        return a, b, c
+
+    @cached_property
+    def areas(self) -> NDArray[np.float64]:
+        """Area of each triangle (m,), in squared units of length."""
+        a, b, c = self.corners
+        with np.errstate(over="ignore", invalid="ignore"):
+            normals = np.cross(b - a, c - a)
+            areas = 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
+        return _frozen(areas)
+
+    @cached_property
+    def area(self) -> float:
+        """Total area, in squared units of length."""
+        return float(self.areas.sum())
+
+    @cached_property
+    def edge_lengths(self) -> NDArray[np.float64]:
+        """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
+        a, b, c = self.corners
+        return _frozen(np.stack([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))], 1))
+
+    @cached_property
+    def centroid_radii(self) -> NDArray[np.float64]:
+        """Distance from each triangle's centroid to its farthest corner (m,)."""
+        a, b, c = self.corners
+        centroids = (a + b + c) / 3
+        radii = [np.linalg.norm(corner - centroids, axis=1) for corner in (a, b, c)]
+        return _frozen(np.maximum.reduce(radii))
+
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper corner of the bounding box of the vertices that triangles use, (3,) each."""
+        lower = np.minimum.reduce([corner.min(axis=0) for corner in self.corners])
+        upper = np.maximum.reduce([corner.max(axis=0) for corner in self.corners])
+        return _frozen(lower), _frozen(upper)
+
+    @cached_property
+    def counts(self) -> MeshCounts:
+        """How many triangles and edges are degenerate, duplicate, open or non-manifold."""
+        ordered = np.sort(self.triangles, axis=1)
+        rows = ordered[np.lexsort(ordered.T[::-1])]
+        duplicate = int(np.count_nonzero(np.all(rows[1:] == rows[:-1], axis=1)))
+        edges = np.concatenate([ordered[:, [0, 1]], ordered[:, [1, 2]], ordered[:, [0, 2]]])
+        keys = edges[:, 0] * len(self.vertices) + edges[:, 1]
+        _, sharing = np.unique(keys, return_counts=True)
+        return MeshCounts(
+            zero_area=int(np.count_nonzero(self.areas <= self._smallest_area)),
+            duplicate=duplicate,
+            boundary_edges=int(np.count_nonzero(sharing == 1)),
+            nonmanifold_edges=int(np.count_nonzero(sharing > 2)),
+        )
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the vertices and triangles, in hexadecimal."""
+        digest = hashlib.sha256()
+        for array in (self.vertices, self.triangles):
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
+        return digest.hexdigest()
+
+    @cached_property
+    def _smallest_area(self) -> NDArray[np.float64]:
+        longest: NDArray[np.float64] = self.edge_lengths.max(axis=1)
+        return _AREA_RESOLUTION * longest**2
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+    def __reduce__(self) -> tuple[type[Mesh], tuple[NDArray[np.float64], NDArray[np.int64]]]:
+        return Mesh, (self.vertices, self.triangles)
+
+
+def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
+    found = np.asarray(vertices)
+    if found.dtype.kind not in "fiu":
+        raise MeshError(f"vertices must be real numbers, found dtype {found.dtype}")
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise MeshError(f"vertices must have shape (n, 3), found {found.shape}")
+    bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    if bad.size:
+        raise MeshError(f"{bad.size} of {len(found)} vertices have NaN or infinite coordinates: {_listed(bad, found)}")
+    return _frozen(np.array(found, dtype=np.float64, order="C"))
+
+
+def _check_triangles(triangles: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
+    found = np.asarray(triangles)
+    if found.size == 0:
+        raise MeshError("the mesh has no triangles")
+    if found.dtype.kind not in "iu":
+        raise MeshError(f"triangles must be integer indices, found dtype {found.dtype}")
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise MeshError(f"triangles must have shape (m, 3), found {found.shape}")
+    bad = np.flatnonzero(((found < 0) | (found >= vertex_count)).any(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"{bad.size} of {len(found)} triangles have indices outside 0..{vertex_count - 1}: {_listed(bad, found)}"
+        )
+    return _frozen(np.array(found, dtype=np.int64, order="C"))
+
+
+def _listed(rows: NDArray[np.intp], values: NDArray[np.generic], limit: int = 3) -> str:
+    shown = ", ".join(f"#{row} = {values[row].tolist()}" for row in rows[:limit])
+    return shown + (", ..." if len(rows) > limit else "")
+
+
+def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,34 @@
+"""Spheres as closed-form surfaces: no mesh stands between them and their transform."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sobolev_batch.errors import InputError
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """The sphere of a radius and centre, in the user's unit of length.
+
+    Raises:
+        InputError: a radius that is not positive and finite, or a centre that is not three finite
+            numbers.
+    """
+
+    radius: float = 1.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.radius) and self.radius > 0):
+            raise InputError(f"a sphere's radius must be positive and finite, found {self.radius}")
+        if len(self.center) != 3 or not all(math.isfinite(x) for x in self.center):
+            raise InputError(f"a sphere's center must be three finite numbers, found {self.center}")
+        object.__setattr__(self, "radius", float(self.radius))
+        object.__setattr__(self, "center", tuple(float(x) for x in self.center))
+
+    @property
+    def area(self) -> float:
+        """Area, in squared units of length."""
+        return 4 * math.pi * self.radius**2

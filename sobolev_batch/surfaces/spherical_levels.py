@@ -1,0 +1,79 @@
+"""The source `spherical-levels`: icosahedral sub-levels of a surface with a spherical map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, SerializeAsAny, field_validator
+from scipy.spatial import ConvexHull
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.generated import Level
+from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Source, parse_source, sole_member
+
+
+class SphericalLevels(NestedSource):
+    """Coarse versions of a surface whose vertices follow an icosahedral refinement.
+
+    The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:
+    the first 10*4^N + 2 form level N. Its map to the sphere has the same vertices in the same order,
+    and the convex hull of the first ones there gives the triangles of the level.
+
+    Attributes:
+        mesh: the surface, as a table that names a source with one member.
+        sphere: its map to the sphere, likewise.
+        levels: the levels N to take.
+    """
+
+    sphere: SerializeAsAny[Source]
+    levels: Annotated[tuple[Level, ...], Field(min_length=1, strict=False)]
+
+    @field_validator("sphere", mode="before")
+    @classmethod
+    def _parse_sphere(cls, table: object) -> object:
+        return cls._parse_mesh(table)
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """One member per level, coarse to fine."""
+        surface, sphere = sole_member(self.mesh, folder), sole_member(self.sphere, folder)
+        return tuple(LevelMember(str(level), level, surface, sphere) for level in sorted(set(self.levels)))
+
+
+@dataclass(frozen=True)
+class LevelMember(Member):
+    """One icosahedral level of a surface."""
+
+    surface: Member
+    sphere: Member
+
+    def load(self) -> Surface:
+        """Take the level's vertices from the surface and its triangles from the sphere's hull."""
+        surface, sphere = self.surface.load(), self.sphere.load()
+        if not (isinstance(surface, Mesh) and isinstance(sphere, Mesh)):
+            raise MeshError("levels can be taken from two meshes only, not from closed-form surfaces")
+        count = 10 * 4**self.level + 2
+        if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
+            raise MeshError(
+                f"level {self.level} needs the first {count} vertices of a surface and of its map to the sphere, "
+                f"found {len(surface.vertices)} and {len(sphere.vertices)}"
+            )
+        hull = ConvexHull(sphere.vertices[:count] - sphere.vertices[:count].mean(axis=0))
+        if len(hull.simplices) != 2 * count - 4:
+            raise MeshError(
+                f"the first {count} vertices of {self.sphere.name} are not in convex position: their hull has "
+                f"{len(hull.simplices)} triangles, expected {2 * count - 4}"
+            )
+        return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
+
+    def fingerprint(self) -> Fingerprint:
+        """The fingerprints of both files, and the level."""
+        return {
+            "spherical level": self.level,
+            "surface": dict(self.surface.fingerprint()),
+            "sphere": dict(self.sphere.fingerprint()),
+        }
