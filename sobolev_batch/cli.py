@@ -1,0 +1,261 @@
+"""The command line: sobolev-batch."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import click
+
+from sobolev_batch.batch.cluster import remote_client
+from sobolev_batch.batch.plan import Plan, make_plan
+from sobolev_batch.batch.run import Progress, Summary, run
+from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study import Study
+from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.plots import plot_store
+from sobolev_batch.results.tables import FORMATS, Format, format_table
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.norms import distance
+from sobolev_batch.surfaces.readers import read_mesh
+from sobolev_batch.surfaces.similarity import Similarity
+
+EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 1, 2, 3, 130
+_DEFAULT_FOLDER = Path("storage")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="sobolev-batch")
+@click.option("--debug", is_flag=True, help="Show tracebacks and every log message.")
+@click.pass_context
+def cli(context: click.Context, debug: bool) -> None:
+    """Sobolev distances of negative order between surface meshes.
+
+    A study file names families of meshes and a reference; `run` stores the Fourier field of every
+    mesh and prints how far each is from the reference.
+
+    Exit status: 0 all done, 2 the input is wrong, 3 some meshes failed, 1 anything else.
+    """
+    context.obj = debug
+    logging.basicConfig(
+        level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    if not debug:
+        # The cluster's own messages at shutdown are of no use to someone who reads a table.
+        logging.getLogger("distributed").setLevel(logging.ERROR)
+
+
+@cli.command("run")
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
+@click.pass_context
+def run_command(
+    context: click.Context, study: Path, store: Path | None, scheduler: str | None, workers: int | None
+) -> None:
+    """Compute what is missing of STUDY, reduce it, print the tables."""
+    if scheduler and workers:
+        raise click.UsageError("--workers is for a cluster on this machine; one with a scheduler has its own")
+    parsed = Study.from_toml(study)
+    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    with _Reporter() as reporter:
+        if scheduler:
+            with remote_client(scheduler) as client:
+                summary = run(parsed, place, client, on_progress=reporter)
+        else:
+            summary = run(parsed, place, workers=workers, on_progress=reporter)
+    click.echo(format_table(open_store(place)))
+    click.echo(_totals(summary))
+    if summary.failed:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("plan")
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--store", type=click.Path(path_type=Path), help="Where results would go. [default: storage/NAME.zarr]")
+def plan_command(study: Path, store: Path | None) -> None:
+    """Show what running STUDY would do: tasks, lattice, bytes, memory, what is already there."""
+    parsed = Study.from_toml(study)
+    plan = make_plan(parsed)
+    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    for name, value in _plan_lines(plan, place):
+        click.echo(f"{name + ':':<14} {value}")
+
+
+@cli.command("status")
+@click.argument("store", type=click.Path(path_type=Path))
+@click.pass_context
+def status_command(context: click.Context, store: Path) -> None:
+    """Show how far STORE is, and what failed and why."""
+    place = Store.open(store)
+    labels, records = place.labels(), place.records()
+    complete = sum(record is not None and record.status == "complete" for record in records)
+    failed = [
+        (label, record)
+        for label, record in zip(labels, records, strict=True)
+        if record is not None and record.status == "failed"
+    ]
+    click.echo(f"{store}: {complete} of {len(labels)} complete, {len(failed)} failed")
+    for label, record in failed:
+        click.echo(f"{label}: {record.reason}")
+    if place.read_table("convergence") is None:
+        click.echo("no tables yet: run the study to its end")
+    if failed:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("table")
+@click.argument("store", type=click.Path(path_type=Path))
+@click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
+@click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
+def table_command(store: Path, style: Format, orders: tuple[float, ...]) -> None:
+    """Print the convergence tables of STORE."""
+    click.echo(format_table(open_store(store), style, orders or None))
+
+
+@cli.command("plot")
+@click.argument("store", type=click.Path(path_type=Path))
+@click.option("--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures.")
+def plot_command(store: Path, output: Path) -> None:
+    """Draw the convergence and the transforms of STORE."""
+    for path in plot_store(open_store(store), output):
+        click.echo(path)
+
+
+@cli.command("compare")
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
+@click.option("--xi-max", type=float, default=5.0, show_default=True, help="Highest frequency per axis.")
+@click.option("--M", "intervals", type=int, default=64, show_default=True, help="Lattice intervals per axis.")
+@click.option("--no-scaling", is_flag=True, help="Keep the files' own unit instead of fitting B into the unit sphere.")
+def compare_command(
+    a: Path, b: Path, orders: tuple[float, ...], xi_max: float, intervals: int, no_scaling: bool
+) -> None:
+    """Print the distance of the mesh files A and B, B being the reference."""
+    lattice = Lattice(xi_max, intervals)
+    first, second = read_mesh(a), read_mesh(b)
+    similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
+    found = distance(similarity.apply(first), similarity.apply(second), orders or (-2.0,), lattice=lattice)
+    click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
+    for order in found["order"].values:
+        click.echo(f"order {order:g}: {found['distance'].sel(order=order).item():.9e}")
+
+
+def main() -> None:
+    """Run the command line; the process ends with its exit status."""
+    debug = "--debug" in sys.argv
+    try:
+        status = cli.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted; the same command goes on from what is stored", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except Exception as error:
+        if debug:
+            raise
+        known = isinstance(error, SobolevBatchError)
+        what = str(error) if known else f"{type(error).__name__}: {error} (--debug shows where)"
+        click.echo(f"error: {what}", err=True)
+        sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
+    sys.exit(status or 0)
+
+
+class _Reporter:
+    """Progress for people: a bar on a terminal, a plain line per step elsewhere; on standard error."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._close()
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.stage == "cluster":
+            click.echo(f"dashboard: {progress.label}", err=True)
+        elif sys.stderr.isatty():
+            self._draw(progress)
+        elif progress.record is not None:
+            outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
+            click.echo(
+                f"[{progress.done}/{progress.total}] {progress.label}: {progress.record.status}, {outcome}", err=True
+            )
+        elif progress.stage == "reduction" and progress.done == progress.total:
+            click.echo("tables reduced", err=True)
+
+    def _draw(self, progress: Progress) -> None:
+        if progress.done == 0:
+            self._close()
+            label = {"fields": "transforms", "reduction": "tables    "}[progress.stage]
+            self._bar = click.progressbar(length=progress.total, label=label, file=sys.stderr, show_pos=True)
+            self._bar.__enter__()
+        else:
+            self._bar.update(1)
+        if progress.done == progress.total:
+            self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(None, None, None)
+            self._bar = None
+
+
+def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
+    study, lattice = plan.study, plan.study.lattice
+    tasks = len(plan.rows) * len(plan.blocks)
+    yield "study", study.title
+    yield "surfaces", f"{len(plan.rows)} in {len(study.families)} families, reference {plan.reference}"
+    yield "similarity", f"scale {plan.similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in plan.similarity.origin)}"
+    yield (
+        "lattice",
+        f"xi_max {lattice.xi_max:g}, M {lattice.M}, spacing {lattice.spacing:g}, half period {lattice.half_period:g}",
+    )
+    yield "orders", ", ".join(f"{order:g}" for order in study.orders)
+    yield (
+        "transform",
+        f"eps {study.transform.accuracy:g}, {study.transform.precision}, quadrature {study.transform.quadrature.method}",
+    )
+    yield "tasks", f"{tasks}, {len(plan.blocks)} per surface"
+    yield "memory", f"{_size(plan.task_memory_bytes)} per task at most, and its mesh"
+    yield "storage", f"{_size(plan.field_bytes)} per surface, {_size(plan.field_bytes * len(plan.rows))} in all"
+    there = _stored_keys(place)
+    done = sum(there.get(row.label) == row.key != "" for row in plan.rows)
+    yield "store", f"{place}, {done} of {len(plan.rows)} already there"
+
+
+def _stored_keys(place: Path) -> dict[str, str]:
+    if not place.exists():
+        return {}
+    store = Store.open(place)
+    return {
+        label: record.key
+        for label, record in zip(store.labels(), store.records(), strict=True)
+        if record is not None and record.status == "complete"
+    }
+
+
+def _size(count: float) -> str:
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def _totals(summary: Summary) -> str:
+    return (
+        f"\n{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
+        f"store: {summary.store}"
+    )

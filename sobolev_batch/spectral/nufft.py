@@ -16,7 +16,7 @@ Precision = Literal["complex128", "complex64"]
 Complexes = NDArray[np.complexfloating[Any, Any]]
 
 # Oversampling of the fine grid. 2 reaches every tolerance down to rounding; 1.25 stalls at 1e-9.
-_OVERSAMPLING = 2.0
+OVERSAMPLING = 2.0
 
 
 def transform_points(
@@ -47,7 +47,7 @@ def transform_points(
     """
     real = np.float32 if precision == "complex64" else np.float64
     plan = finufft.Plan(
-        1, block.shape, eps=eps, isign=-1, dtype=precision, nthreads=threads, upsampfac=_OVERSAMPLING, modeord=0
+        1, block.shape, eps=eps, isign=-1, dtype=precision, nthreads=threads, upsampfac=OVERSAMPLING, modeord=0
     )
     # FINUFFT's modes of an axis of n samples start at -(n // 2). Turning the strengths by the
     # difference to the block's own start moves that window anywhere, at no cost in the FFT.

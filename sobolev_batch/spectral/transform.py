@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
-from sobolev_batch.spectral.nufft import Precision, transform_points
+from sobolev_batch.spectral.nufft import OVERSAMPLING, Precision, transform_points
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.spheres import sphere_block
 from sobolev_batch.surfaces.mesh import Mesh
@@ -134,6 +134,16 @@ def transform_block(
     return transform_points(
         points, lattice, block, eps=settings.accuracy, precision=settings.precision, threads=threads
     )
+
+
+def memory_bytes(block: Block, settings: Transform, batch: int = DEFAULT_BATCH) -> int:
+    """Peak memory of `transform_block`, without the mesh itself, as an upper estimate.
+
+    The oversampled grid, the block and its sum, and a batch's coordinates, angles, strengths,
+    phases and sorting.
+    """
+    item = 16 if settings.precision == "complex128" else 8
+    return int(block.size * item * (OVERSAMPLING**3 * 1.3 + 2)) + batch * 140
 
 
 def require_inside(mesh: Mesh, lattice: Lattice) -> None:

@@ -1,0 +1,65 @@
+"""The cluster a study runs on: one of processes on this machine, or any Dask scheduler."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import dask
+from distributed import Client, LocalCluster
+
+from sobolev_batch.errors import ClusterError
+
+_CONNECT_SECONDS = 15
+
+
+@contextmanager
+def local_client(workers: int | None = None) -> Iterator[Client]:
+    """A client of a new cluster of single-threaded worker processes, reachable from this machine only.
+
+    Args:
+        workers: how many; default one per core that this process may use.
+    """
+    count = workers or available_cores()
+    # Loopback is spelt out for the dashboard too: its own default is every interface.
+    with (
+        dask.config.set({"distributed.worker.memory.pause": 0.9}),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def remote_client(address: str) -> Iterator[Client]:
+    """A client of the scheduler at an address such as tcp://host:8786.
+
+    Raises:
+        ClusterError: nothing answers there.
+    """
+    try:
+        client = Client(address, timeout=_CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise ClusterError(
+            f"no Dask scheduler answers at {address!r} within {_CONNECT_SECONDS} s ({error}); "
+            "start one with: dask scheduler"
+        ) from error
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
+        yield client
+
+
+def available_cores() -> int:
+    """The cores that this process may run on."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        return os.cpu_count() or 1

@@ -1,0 +1,83 @@
+"""Completion records: what says that a mesh is done, written after everything else of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Self
+
+from sobolev_batch.errors import StoreError
+
+Status = Literal["complete", "failed"]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What was found out about a surface when it was transformed.
+
+    Attributes:
+        vertices, triangles: counts; zero for a closed-form surface.
+        area: total area in the study's unit of length, squared.
+        edge_length_mean, edge_length_max: over triangle sides, in the study's unit; NaN without.
+        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: see `MeshCounts`.
+        digest: SHA-256 of vertices and triangles in the study's unit; empty without.
+        points: quadrature points; zero without.
+    """
+
+    vertices: int = 0
+    triangles: int = 0
+    area: float = float("nan")
+    edge_length_mean: float = float("nan")
+    edge_length_max: float = float("nan")
+    zero_area_triangles: int = 0
+    duplicate_triangles: int = 0
+    boundary_edges: int = 0
+    nonmanifold_edges: int = 0
+    digest: str = ""
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """The outcome of one mesh.
+
+    Attributes:
+        key: what went in: the row's key when the mesh was computed.
+        status: "complete" or "failed".
+        reason: why it failed; empty otherwise.
+        facts: what came out.
+        seconds: time spent in its tasks.
+        worker: address of the worker that finished it.
+        backend: what computed the transform.
+    """
+
+    key: str
+    status: Status
+    reason: str = ""
+    facts: Facts = Facts()
+    seconds: float = 0.0
+    worker: str = ""
+    backend: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self | None:
+        """The record that a line holds, or None where nothing was written.
+
+        Raises:
+            StoreError: the line is not a record.
+        """
+        if not text:
+            return None
+        try:
+            values: dict[str, Any] = json.loads(text)
+            return cls(**{**values, "facts": Facts(**values["facts"])})
+        except (ValueError, TypeError, KeyError) as error:
+            raise StoreError(f"a completion record is damaged ({error}): {text[:80]!r}") from error
+
+    def completes(self, key: str) -> bool:
+        """Whether a field with this key need not be computed."""
+        return self.status == "complete" and bool(key) and self.key == key

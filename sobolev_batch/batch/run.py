@@ -1,0 +1,246 @@
+"""Running a study: what is missing becomes tasks, and what is stored becomes tables."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from distributed import Client, Future, as_completed
+from numpy.typing import NDArray
+
+from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.plan import Plan, Row, make_plan
+from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.reduction import Reducer
+from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
+
+_log = logging.getLogger(__name__)
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step forward.
+
+    Attributes:
+        stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
+            tables are made.
+        done, total: steps of the stage.
+        label: of the mesh that was finished, or the address of the cluster's dashboard; else empty.
+        record: of that mesh.
+    """
+
+    stage: Literal["cluster", "fields", "reduction"]
+    done: int
+    total: int
+    label: str = ""
+    record: Record | None = None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run did.
+
+    Attributes:
+        store: the path of the store.
+        computed: labels of the meshes whose fields were computed now.
+        reused: labels of those that were already there.
+        failed: the reason for each mesh that could not be computed.
+    """
+
+    store: str
+    computed: tuple[str, ...]
+    reused: tuple[str, ...]
+    failed: Mapping[str, str]
+
+
+def run(
+    study: Study,
+    store: str | Path,
+    client: Client | None = None,
+    *,
+    workers: int | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Summary:
+    """Compute what a store lacks of a study, then its norms, distances and convergence tables.
+
+    Args:
+        study: what to compute.
+        store: path of a new or existing store; the workers must reach it under the same path.
+        client: of the cluster to compute on. Without one, a cluster of single-threaded processes on
+            this machine serves for the time of the call; a script that relies on it must guard its
+            main part by ``if __name__ == "__main__"``, as all that starts processes must. Where
+            nothing is missing, none is started.
+        workers: of the cluster on this machine; default one per core.
+        on_progress: called in this thread at each step.
+
+    Returns:
+        What was computed, what was there, what failed. A mesh that fails does not raise.
+
+    Raises:
+        StudyError, MeshError, LatticeError: the study cannot be carried out.
+        StoreError: the store cannot be written or belongs to another study.
+    """
+    plan = make_plan(study)
+    place = Store.prepare(store, plan)
+    rows = rows_of(place, plan)
+    records = place.records()
+    notify = on_progress or (lambda progress: None)
+    missing = [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
+    if missing or not _is_reduced(place, plan, rows, records):
+        with nullcontext(client) if client is not None else local_client(workers) as active:
+            notify(Progress("cluster", 0, 0, active.dashboard_link))
+            _compute_fields(active, place, plan, rows, missing, notify)
+            _reduce(active, place, plan, rows, notify)
+    records = place.records()
+    failed = {
+        row.label: record.reason if record else "not computed"
+        for row, record in zip(rows, records, strict=True)
+        if record is None or record.status == "failed"
+    }
+    todo = set(missing)
+    return Summary(
+        place.path,
+        tuple(rows[i].label for i in missing if rows[i].label not in failed),
+        tuple(row.label for i, row in enumerate(rows) if i not in todo),
+        failed,
+    )
+
+
+def rows_of(store: Store, plan: Plan) -> tuple[Row, ...]:
+    """The plan's rows in the order in which the store holds them."""
+    by_label = {row.label: row for row in plan.rows}
+    return tuple(by_label[label] for label in store.labels())
+
+
+def _compute_fields(
+    client: Client, store: Store, plan: Plan, rows: Sequence[Row], missing: Sequence[int], notify: Callable[[Progress], None]
+) -> None:
+    notify(Progress("fields", 0, len(missing)))
+    futures: dict[Future, int] = {}
+    for i in missing:
+        row = rows[i]
+        job = Job(
+            store, i, row.label, row.key, row.member, plan.similarity, plan.study.lattice, plan.study.transform
+        )
+        futures[_submit(client, job, plan)] = i
+    for done, future in enumerate(as_completed(list(futures)), 1):
+        i = futures.pop(future)
+        row = rows[i]
+        if future.status == "error":
+            # The task itself reports bad meshes; what arrives here is a worker that died or a store
+            # that cannot be written any more.
+            error = future.exception()
+            record = Record(key=row.key, status="failed", reason=f"{type(error).__name__}: {error}")
+            _log.error("%s: %s", row.label, record.reason)
+            store.write_record(i, record)
+        else:
+            record = future.result()
+        notify(Progress("fields", done, len(missing), row.label, record))
+
+
+def _submit(client: Client, job: Job, plan: Plan) -> Future:
+    if len(plan.blocks) == 1:
+        return client.submit(compute_mesh, job, plan.blocks, pure=False)
+    parts = [client.submit(compute_blocks, job, [block], pure=False) for block in plan.blocks]
+    return client.submit(finish_mesh, job, parts, pure=False)
+
+
+def _reduce(
+    client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Callable[[Progress], None]
+) -> None:
+    records = store.records()
+    if _is_reduced(store, plan, rows, records):
+        return
+    complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
+    reference = next(i for i, row in enumerate(rows) if row.label == plan.reference)
+    orders = plan.study.orders
+    center = reference if reference in complete else None
+    reducer = Reducer(store, plan.study.lattice, plan.blocks, orders, center)
+    norms, to_reference = (np.full((len(orders), len(rows)), np.nan) for _ in range(2))
+    every_pair = plan.study.pairs == "all"
+    others = range(len(rows)) if every_pair else [reference]
+    distances = np.full((len(orders), len(rows), len(others)), np.nan)
+
+    tiles = list(_slices(complete, reducer.rows_per_tile()))
+    jobs: dict[Future, tuple[Sequence[int], Sequence[int] | None]] = {
+        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in tiles
+    }
+    if every_pair:
+        for k, tile in enumerate(tiles):
+            for other in tiles[k:]:
+                jobs[client.submit(reducer.tile, tile, other, pure=False)] = (tile, other)
+    notify(Progress("reduction", 0, len(jobs)))
+    for done, future in enumerate(as_completed(list(jobs)), 1):
+        tile, other = jobs.pop(future)
+        if other is None:
+            norms[:, tile], to_reference[:, tile] = future.result()
+        else:
+            found = future.result()
+            distances[:, np.array(tile)[:, None], np.array(other)] = found
+            distances[:, np.array(other)[:, None], np.array(tile)] = np.swapaxes(found, 1, 2)
+        notify(Progress("reduction", done, done + len(jobs)))
+    if every_pair:
+        # The direct sums are the more exact ones, and the same numbers in both tables.
+        distances[:, :, reference] = distances[:, reference, :] = to_reference
+    else:
+        distances[:, :, 0] = to_reference
+    _write_tables(store, plan, rows, records, norms, to_reference, distances, [rows[j] for j in others])
+
+
+def _write_tables(
+    store: Store,
+    plan: Plan,
+    rows: Sequence[Row],
+    records: Sequence[Record | None],
+    norms: Reals,
+    to_reference: Reals,
+    distances: Reals,
+    others: Sequence[Row],
+) -> None:
+    orders = plan.study.orders
+    reference = [row.label for row in rows].index(plan.reference)
+    meshes = meshes_dataset(rows, records)
+    sizes = meshes["edge_length_mean"].to_numpy()
+    convergence = convergence_dataset(rows, orders, to_reference, norms[:, reference], sizes, plan.reference)
+    store.write_table("meshes", meshes)
+    store.write_table("norms", norms_dataset(rows, orders, norms))
+    store.write_table("distances", distances_dataset(rows, others, orders, distances))
+    # Written last: its digest says that all tables belong to the fields that are there.
+    digest = _reduction_digest(plan, rows, records)
+    store.write_table("convergence", convergence.assign_attrs(digest=digest))
+    store.consolidate()
+
+
+def _is_reduced(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
+    tables = store.read_table("convergence")
+    return tables is not None and tables.attrs.get("digest") == _reduction_digest(plan, rows, records)
+
+
+def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
+    parts = {
+        "rows": [
+            [row.label, row.family, record.key if record else "", record.status if record else "", record.reason if record else ""]
+            for row, record in zip(rows, records, strict=True)
+        ],
+        "orders": plan.study.orders,
+        "pairs": plan.study.pairs,
+        "reference": plan.reference,
+    }
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _slices(items: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]

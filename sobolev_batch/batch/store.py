@@ -1,0 +1,267 @@
+"""The store: one zarr hierarchy with the fields, records and tables of a study.
+
+The driver lays out all arrays before any task starts; tasks fill whole chunks of them and nothing
+else, so no two writers ever meet in one chunk. docs/store.md describes the layout for readers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec
+
+from sobolev_batch.batch.plan import Plan
+from sobolev_batch.batch.records import Record
+from sobolev_batch.errors import StoreError
+from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.surfaces.similarity import Similarity
+
+SCHEMA_VERSION = 1
+
+_FIELD = "fourier/fourier"
+_RECORD = "records/record"
+_RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
+
+
+class Store:
+    """An existing store, by its path. Cheap to make and to pickle; every call opens what it needs."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = str(path)
+
+    @classmethod
+    def prepare(cls, path: str | Path, plan: Plan) -> Self:
+        """Create the store of a plan, or open it if it is already there and take up new meshes.
+
+        Raises:
+            StoreError: the place cannot be written, holds something else, or a store of another
+                study; nothing is changed then.
+        """
+        store = cls(path)
+        try:
+            if store._is_new():
+                store._create(plan)
+            else:
+                store._check_same_study(plan)
+                store._extend(plan)
+                store._update_attributes(plan)
+            store.consolidate()
+        except OSError as error:
+            raise StoreError(f"{path}: the store cannot be written: {error.strerror or error}") from error
+        return store
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open a store that exists.
+
+        Raises:
+            StoreError: there is none, or it has another schema.
+        """
+        store = cls(path)
+        store.attributes()
+        return store
+
+    def attributes(self) -> dict[str, Any]:
+        """The attributes of the root: title, study, similarity, versions.
+
+        Raises:
+            StoreError: no store of this package's schema is there.
+        """
+        try:
+            found = dict(zarr.open_group(self.path, mode="r").attrs)
+        except (OSError, ValueError, KeyError) as error:
+            raise StoreError(f"{self.path}: no store of a study is there ({type(error).__name__}: {error})") from error
+        if "schema_version" not in found or "study" not in found:
+            raise StoreError(f"{self.path}: a zarr store, but not one of a study")
+        if found["schema_version"] != SCHEMA_VERSION:
+            raise StoreError(
+                f"{self.path}: its schema has version {found['schema_version']}, this program reads {SCHEMA_VERSION}"
+            )
+        return found
+
+    def labels(self) -> tuple[str, ...]:
+        """The label of each row."""
+        return tuple(str(label) for label in zarr.open_array(self.path, path="fourier/mesh", mode="r")[:])
+
+    def records(self) -> tuple[Record | None, ...]:
+        """The completion record of each row, None where there is none."""
+        lines = zarr.open_array(self.path, path=_RECORD, mode="r")[:]
+        return tuple(Record.from_json(str(line)) for line in lines)
+
+    def write_record(self, row: int, record: Record) -> None:
+        """Write the completion record of a row: one chunk, replaced as a whole."""
+        zarr.open_array(self.path, path=_RECORD, mode="r+")[row] = record.to_json()
+
+    def write_field(self, row: int, place: Sequence[slice], values: NDArray[Any]) -> None:
+        """Write one block of a row's field, which must be whole chunks."""
+        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        array = zarr.open_array(self.path, path=_FIELD, mode="r+", config={"write_empty_chunks": True})
+        array[(row, *place)] = values
+
+    def read_fields(self, rows: Sequence[int], place: Sequence[slice]) -> NDArray[Any]:
+        """One block of several rows' fields, complex (len(rows), ...).
+
+        Raises:
+            StoreError: a chunk is damaged; the message names its row.
+        """
+        array = zarr.open_array(self.path, path=_FIELD, mode="r")
+        values = np.empty((len(rows), *(part.stop - part.start for part in place)), dtype=array.dtype)
+        for i, row in enumerate(rows):
+            try:
+                values[i] = array[(row, *place)]
+            except (OSError, ValueError) as error:
+                raise StoreError(
+                    f"{self.path}: the field of {self.labels()[row]} is damaged ({error}); "
+                    "remove the store's record of it and run the study again"
+                ) from error
+        return values
+
+    def write_table(self, group: str, dataset: xr.Dataset) -> None:
+        """Replace a group of small arrays, each in one chunk."""
+        dataset.to_zarr(
+            self.path, group=group, mode="w", zarr_format=3, consolidated=False, encoding=_table_encoding(dataset)
+        )
+
+    def read_table(self, group: str) -> xr.Dataset | None:
+        """A group of small arrays, or None where it was not written yet."""
+        try:
+            with xr.open_zarr(self.path, group=group, consolidated=False, chunks=None) as dataset:
+                return dataset.load()
+        except (FileNotFoundError, KeyError):
+            return None
+
+    def consolidate(self) -> None:
+        """Collect the metadata of all groups at the root, so that one read opens everything."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
+            zarr.consolidate_metadata(self.path)
+
+    def _is_new(self) -> bool:
+        place = Path(self.path)
+        if not place.exists():
+            return True
+        if not place.is_dir():
+            raise StoreError(f"{self.path}: a file is there; name a folder that is new or holds a store")
+        if not any(place.iterdir()):
+            return True
+        if not (place / "zarr.json").exists():
+            raise StoreError(f"{self.path}: the folder is not empty and holds no store; name another")
+        return False
+
+    def _create(self, plan: Plan) -> None:
+        nearest = next(folder for folder in [Path(self.path), *Path(self.path).absolute().parents] if folder.exists())
+        if not os.access(nearest, os.W_OK):
+            raise StoreError(f"{self.path}: the store cannot be written: no permission in {nearest}")
+        labels = [row.label for row in plan.rows]
+        lattice = plan.study.lattice
+        chunk = plan.blocks[0].shape
+        root = zarr.create_group(self.path, zarr_format=3)
+        root.create_array(
+            _FIELD,
+            shape=(len(labels), *lattice.shape),
+            dtype=plan.study.transform.precision,
+            chunks=(1, *chunk),
+            compressors=(Crc32cCodec(),),
+            fill_value=complex(np.nan, np.nan),
+            dimension_names=("mesh", *AXES),
+            attributes={"long_name": "Fourier transform of the area measure, xi_z >= 0 half"},
+        )
+        units = {"units": "cycles per unit length"}
+        coordinates: dict[str, Any] = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
+        coordinates["mesh"] = ("mesh", np.array(labels, dtype=object))
+        axes = xr.Dataset(coords=coordinates)
+        axes.to_zarr(
+            self.path, group="fourier", mode="a", zarr_format=3, consolidated=False, encoding=_table_encoding(axes)
+        )
+        root.create_array(
+            _RECORD,
+            shape=(len(labels),),
+            dtype=str,
+            chunks=(1,),
+            compressors=(Crc32cCodec(),),
+            dimension_names=("mesh",),
+            fill_value="",
+        )
+        # The attributes come last: a folder without them is not taken for a store.
+        self._update_attributes(plan)
+
+    def _check_same_study(self, plan: Plan) -> None:
+        found = self.attributes()
+        study = found["study"]
+        differences = [
+            f"{what} {old!r}, not {new!r}"
+            for what, old, new in (
+                ("the study", study["name"], plan.study.name),
+                ("the lattice", study["lattice"], _lattice_entry(plan.study.lattice)),
+                ("dtype", study["dtype"], plan.study.transform.precision),
+            )
+            if old != new
+        ]
+        removed = set(self.labels()) - {row.label for row in plan.rows}
+        if removed:
+            differences.append(f"meshes that this study lacks, such as {min(removed)!r}")
+        if differences:
+            raise StoreError(
+                f"{self.path}: a store of another study is there, with {'; '.join(differences)}. "
+                "Name another store, or remove this one"
+            )
+
+    def _extend(self, plan: Plan) -> None:
+        """Append rows for meshes that the study has gained; the rows that are there stay."""
+        there = self.labels()
+        known = set(there)
+        added = [row.label for row in plan.rows if row.label not in known]
+        if not added:
+            return
+        for name in (_RECORD, _FIELD, "fourier/mesh"):
+            array = zarr.open_array(self.path, path=name, mode="r+")
+            array.resize((len(there) + len(added), *array.shape[1:]))
+            if name == "fourier/mesh":
+                array[len(there) :] = np.array(added, dtype=object)
+
+    def _update_attributes(self, plan: Plan) -> None:
+        study = plan.study
+        zarr.open_group(self.path, mode="r+").attrs.update(
+            {
+                "title": study.title,
+                "schema_version": SCHEMA_VERSION,
+                "study": {
+                    "name": study.name,
+                    "lattice": _lattice_entry(study.lattice),
+                    "dtype": study.transform.precision,
+                    "eps": study.transform.accuracy,
+                    "orders": list(study.orders),
+                    "reference": plan.reference,
+                    "table": dict(study.table),
+                },
+                "similarity": _similarity_entry(plan.similarity),
+                "versions": {name: version(name) for name in _RECORDED_VERSIONS},
+            }
+        )
+
+
+def _lattice_entry(lattice: Lattice) -> dict[str, float | int]:
+    return {"xi_max": lattice.xi_max, "M": lattice.M}
+
+
+def _similarity_entry(similarity: Similarity) -> dict[str, Any]:
+    return {"scale": similarity.scale, "origin": list(similarity.origin)}
+
+
+def _table_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """One chunk per array, with a checksum."""
+    return {
+        str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}
+        for name, variable in dataset.variables.items()
+        if variable.ndim
+    }

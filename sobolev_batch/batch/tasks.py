@@ -1,0 +1,115 @@
+"""What runs on a worker: a mesh's source becomes its stored Fourier field and a completion record.
+
+Each task is a pure function of its arguments that writes whole chunks, so running it again, or
+twice at once, leaves the same store.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from distributed import get_worker
+
+from sobolev_batch.batch.records import Facts, Record
+from sobolev_batch.batch.store import Store
+from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Similarity, Surface
+from sobolev_batch.surfaces.sources import Member
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that the field of one row depends on, and where it goes."""
+
+    store: Store
+    row: int
+    label: str
+    key: str
+    member: Member
+    similarity: Similarity
+    lattice: Lattice
+    transform: Transform
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one task did for a mesh; ``error`` is empty unless it failed."""
+
+    facts: Facts
+    seconds: float
+    error: str = ""
+
+
+def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
+    """Compute and store the whole field of a mesh, then its completion record."""
+    return finish_mesh(job, [compute_blocks(job, blocks)])
+
+
+def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
+    """Compute and store some blocks of a mesh's field.
+
+    A mesh that cannot be made or transformed does not raise: the reason is part of the outcome, so
+    that one bad mesh stops nothing else.
+    """
+    started = time.perf_counter()
+    try:
+        surface = job.similarity.apply(job.member.load())
+        facts = _facts(surface, job.lattice, job.transform)
+        for block in blocks:
+            values = transform_block(surface, job.lattice, block, job.transform, threads=1)
+            job.store.write_field(job.row, job.lattice.place(block), values)
+    except Exception as error:
+        _log.exception("%s failed", job.label)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return Part(Facts(), time.perf_counter() - started, reason)
+    return Part(facts, time.perf_counter() - started)
+
+
+def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
+    """Write the completion record of a mesh whose blocks are all stored, or that failed."""
+    errors = [part.error for part in parts if part.error]
+    record = Record(
+        key=job.key,
+        status="failed" if errors else "complete",
+        reason=errors[0] if errors else "",
+        facts=Facts() if errors else parts[0].facts,
+        seconds=sum(part.seconds for part in parts),
+        worker=_worker_address(),
+        backend="finufft",
+    )
+    job.store.write_record(job.row, record)
+    _log.info("%s: %s in %.2f s by %s", job.label, record.status, record.seconds, record.backend)
+    return record
+
+
+def _facts(surface: Surface, lattice: Lattice, transform: Transform) -> Facts:
+    if not isinstance(surface, Mesh):
+        return Facts(area=surface.area)
+    lengths, counts = surface.edge_lengths, surface.counts
+    return Facts(
+        vertices=len(surface.vertices),
+        triangles=len(surface.triangles),
+        area=surface.area,
+        edge_length_mean=float(lengths.mean()),
+        edge_length_max=float(lengths.max()),
+        zero_area_triangles=counts.zero_area,
+        duplicate_triangles=counts.duplicate,
+        boundary_edges=counts.boundary_edges,
+        nonmanifold_edges=counts.nonmanifold_edges,
+        digest=surface.digest,
+        points=transform.quadrature.point_count(surface, lattice.highest_frequency, transform.accuracy),
+    )
+
+
+def _worker_address() -> str:
+    try:
+        return str(get_worker().address)
+    except ValueError:  # called outside a cluster
+        return "local"

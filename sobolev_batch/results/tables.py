@@ -1,0 +1,118 @@
+"""Convergence tables: per family and level, the distance to the reference and the observed rate."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from tabulate import tabulate
+
+from sobolev_batch.errors import InputError
+
+Format = Literal["text", "csv", "json", "markdown", "latex"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+_HEADERS = ("mesh", "triangles", "edge length", "distance", "relative", "rate")
+
+
+def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) -> pd.DataFrame:
+    """The convergence table of a store in long form: one line per mesh and order.
+
+    Args:
+        tree: an open store.
+        orders: which of the store's orders; default all.
+
+    Returns:
+        Columns order, mesh, family, name, level, status, reason, triangles, edge_length, distance,
+        relative, rate. Lengths are in the study's unit. A mesh that failed has NaN, never a number.
+
+    Raises:
+        InputError: no tables in the store yet, or an order that it was not reduced for.
+    """
+    if "convergence" not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    convergence = tree["convergence"].to_dataset().load()
+    meshes = tree["meshes"].to_dataset().load()
+    lines = []
+    for order in _chosen(convergence, orders):
+        for i, label in enumerate(convergence["mesh"].values.tolist()):
+            if label == convergence.attrs["reference"]:
+                continue
+            here = convergence.isel(mesh=i).sel(order=order)
+            about = meshes.isel(mesh=i)
+            lines.append(
+                {
+                    "order": order,
+                    "mesh": label,
+                    **{key: about[key].item() for key in ("family", "name", "level", "status", "reason", "triangles")},
+                    **{key: here[key].item() for key in ("edge_length", "distance", "relative", "rate")},
+                }
+            )
+    return pd.DataFrame(lines)
+
+
+def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """The convergence table of a store as text for people (text, markdown, latex) or programs (csv, json).
+
+    Raises:
+        InputError: as for `convergence_frame`.
+    """
+    frame = convergence_frame(tree, orders)
+    if style == "csv":
+        return frame.to_csv(index=False, lineterminator="\n").rstrip("\n")
+    if style == "json":
+        records = frame.replace({np.nan: None}).to_dict(orient="records")
+        return json.dumps(records, indent=2, allow_nan=False)
+    reference = tree["convergence"].attrs["reference"]
+    parts = []
+    for order, group in frame.groupby("order", sort=False):
+        cells = [_cells(line) for line in group.itertuples(index=False)]
+        caption = f"Sobolev distance of order {order:g} to {reference}"
+        table = tabulate(
+            cells,
+            headers=_HEADERS,
+            tablefmt=_TABULATE_FORMATS[style],
+            disable_numparse=True,
+            colalign=("left", *["right"] * (len(_HEADERS) - 1)),
+        )
+        parts.append(f"% {caption}\n{table}" if style == "latex" else f"{caption}\n\n{table}")
+    failures = frame.drop_duplicates("mesh").query("status != 'complete'")
+    notes = [f"{line.mesh} is {line.status}: {line.reason}" for line in failures.itertuples(index=False)]
+    if notes:
+        parts.append("\n".join(f"% {note}" if style == "latex" else note for note in notes))
+    return "\n\n".join(parts)
+
+
+def _chosen(convergence: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
+    there: list[float] = convergence["order"].values.tolist()
+    if orders is None:
+        return there
+    for order in orders:
+        if order not in there:
+            known = ", ".join(f"{s:g}" for s in there)
+            raise InputError(f"the store has no order {order:g}, only {known}; add it to the study and run it again")
+    return list(orders)
+
+
+def _cells(line: object) -> list[str]:
+    values = {name: getattr(line, name) for name in ("triangles", "edge_length", "distance", "relative", "rate")}
+    if getattr(line, "status") != "complete":
+        return [getattr(line, "mesh"), *["missing"] * 5]
+    return [
+        getattr(line, "mesh"),
+        f"{values['triangles']:,}" if values["triangles"] else "",
+        _number(values["edge_length"], ".4g"),
+        _number(values["distance"], ".6e"),
+        _number(values["relative"], ".6e"),
+        _number(values["rate"], ".3f"),
+    ]
+
+
+def _number(value: float, spec: str) -> str:
+    return "" if math.isnan(value) else format(value, spec)
