@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -44,7 +43,9 @@ def cli(context: click.Context, debug: bool) -> None:
     """
     context.obj = debug
     logging.basicConfig(
-        level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+        level=logging.DEBUG if debug else logging.WARNING,
+        format="%(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
     )
     if not debug:
         # The cluster's own messages at shutdown are of no use to someone who reads a table.
@@ -122,7 +123,9 @@ def table_command(store: Path, style: Format, orders: tuple[float, ...]) -> None
 
 @cli.command("plot")
 @click.argument("store", type=click.Path(path_type=Path))
-@click.option("--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures.")
+@click.option(
+    "--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures."
+)
 def plot_command(store: Path, output: Path) -> None:
     """Draw the convergence and the transforms of STORE."""
     for path in plot_store(open_store(store), output):
@@ -179,7 +182,9 @@ class _Reporter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._close()
 
     def __call__(self, progress: Progress) -> None:
@@ -213,11 +218,15 @@ class _Reporter:
 
 
 def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
-    study, lattice = plan.study, plan.study.lattice
+    study, lattice, transform = plan.study, plan.study.lattice, plan.study.transform
+    origin = " ".join(f"{x:.9g}" for x in plan.similarity.origin)
     tasks = len(plan.rows) * len(plan.blocks)
     yield "study", study.title
     yield "surfaces", f"{len(plan.rows)} in {len(study.families)} families, reference {plan.reference}"
-    yield "similarity", f"scale {plan.similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in plan.similarity.origin)}"
+    yield (
+        "similarity",
+        f"scale {plan.similarity.scale:.9g}, origin {origin}",
+    )
     yield (
         "lattice",
         f"xi_max {lattice.xi_max:g}, M {lattice.M}, spacing {lattice.spacing:g}, half period {lattice.half_period:g}",
@@ -225,7 +234,7 @@ def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
     yield (
         "transform",
-        f"eps {study.transform.accuracy:g}, {study.transform.precision}, quadrature {study.transform.quadrature.method}",
+        f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
     )
     yield "tasks", f"{tasks}, {len(plan.blocks)} per surface"
     yield "memory", f"{_size(plan.task_memory_bytes)} per task at most, and its mesh"

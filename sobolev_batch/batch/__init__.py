@@ -1,0 +1,1 @@
+"""A study becomes tasks: study file, plan, store, worker tasks, reduction, run."""

@@ -40,10 +40,7 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     for name in ("worker", "backend", "key"):
         columns[name] = _strings([getattr(record, name) for record in known])
     return xr.Dataset(
-        {
-            name: ("mesh", values, {"units": _UNITS[name]} if name in _UNITS else {})
-            for name, values in columns.items()
-        },
+        {name: ("mesh", values, {"units": _UNITS[name]} if name in _UNITS else {}) for name, values in columns.items()},
         coords={"mesh": _labels(rows)},
     )
 

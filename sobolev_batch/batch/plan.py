@@ -133,10 +133,8 @@ def _similarity(study: Study, member: Member) -> Similarity:
         surface = member.load()
     except InputError as error:
         raise MeshError(f"the reference cannot be made: {error}") from error
-    if study.scaling.mode == "reference":
-        similarity = Similarity.to_unit_ball(surface)
-    else:
-        similarity = study.scaling.fixed
+    by_reference = study.scaling.mode == "reference"
+    similarity = Similarity.to_unit_ball(surface) if by_reference else study.scaling.fixed
     scaled = similarity.apply(surface)
     if isinstance(scaled, Mesh):
         require_inside(scaled, study.lattice)

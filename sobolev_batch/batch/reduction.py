@@ -14,6 +14,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.norms import shell_sums, shell_weights
 
 Reals = NDArray[np.float64]
+Place = tuple[slice, slice, slice]
 
 # Fields that a task holds at a time, in all.
 _TILE_BYTES = 256 << 20
@@ -75,7 +76,9 @@ class Reducer:
             found[:, i, j] = self._direct(rows[i], others[j])
         return np.sqrt(found)
 
-    def _differences(self, rows: Sequence[int], place: Sequence[slice], center: Reals | float) -> NDArray[np.complex128]:
+    def _differences(
+        self, rows: Sequence[int], place: Place, center: NDArray[np.complex128] | float
+    ) -> NDArray[np.complex128]:
         values = self.store.read_fields(rows, place).astype(np.complex128, copy=False)
         values -= center
         return values.reshape(len(rows), -1)

@@ -48,6 +48,9 @@ class Progress:
     record: Record | None = None
 
 
+Notify = Callable[[Progress], None]
+
+
 @dataclass(frozen=True)
 class Summary:
     """What a run did.
@@ -71,7 +74,7 @@ def run(
     client: Client | None = None,
     *,
     workers: int | None = None,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Notify | None = None,
 ) -> Summary:
     """Compute what a store lacks of a study, then its norms, distances and convergence tables.
 
@@ -125,15 +128,18 @@ def rows_of(store: Store, plan: Plan) -> tuple[Row, ...]:
 
 
 def _compute_fields(
-    client: Client, store: Store, plan: Plan, rows: Sequence[Row], missing: Sequence[int], notify: Callable[[Progress], None]
+    client: Client,
+    store: Store,
+    plan: Plan,
+    rows: Sequence[Row],
+    missing: Sequence[int],
+    notify: Notify,
 ) -> None:
     notify(Progress("fields", 0, len(missing)))
     futures: dict[Future, int] = {}
     for i in missing:
         row = rows[i]
-        job = Job(
-            store, i, row.label, row.key, row.member, plan.similarity, plan.study.lattice, plan.study.transform
-        )
+        job = Job(store, i, row.label, row.key, row.member, plan.similarity, plan.study.lattice, plan.study.transform)
         futures[_submit(client, job, plan)] = i
     for done, future in enumerate(as_completed(list(futures)), 1):
         i = futures.pop(future)
@@ -157,9 +163,7 @@ def _submit(client: Client, job: Job, plan: Plan) -> Future:
     return client.submit(finish_mesh, job, parts, pure=False)
 
 
-def _reduce(
-    client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Callable[[Progress], None]
-) -> None:
+def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify) -> None:
     records = store.records()
     if _is_reduced(store, plan, rows, records):
         return
@@ -179,8 +183,8 @@ def _reduce(
     }
     if every_pair:
         for k, tile in enumerate(tiles):
-            for other in tiles[k:]:
-                jobs[client.submit(reducer.tile, tile, other, pure=False)] = (tile, other)
+            for partner in tiles[k:]:
+                jobs[client.submit(reducer.tile, tile, partner, pure=False)] = (tile, partner)
     notify(Progress("reduction", 0, len(jobs)))
     for done, future in enumerate(as_completed(list(jobs)), 1):
         tile, other = jobs.pop(future)
@@ -231,7 +235,13 @@ def _is_reduced(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence
 def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
     parts = {
         "rows": [
-            [row.label, row.family, record.key if record else "", record.status if record else "", record.reason if record else ""]
+            [
+                row.label,
+                row.family,
+                record.key if record else "",
+                record.status if record else "",
+                record.reason if record else "",
+            ]
             for row, record in zip(rows, records, strict=True)
         ],
         "orders": plan.study.orders,

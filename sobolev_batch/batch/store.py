@@ -6,7 +6,6 @@ else, so no two writers ever meet in one chunk. docs/store.md describes the layo
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from collections.abc import Sequence
@@ -27,6 +26,8 @@ from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.surfaces.similarity import Similarity
 
 SCHEMA_VERSION = 1
+
+Place = tuple[slice, slice, slice]
 
 _FIELD = "fourier/fourier"
 _RECORD = "records/record"
@@ -91,24 +92,24 @@ class Store:
 
     def labels(self) -> tuple[str, ...]:
         """The label of each row."""
-        return tuple(str(label) for label in zarr.open_array(self.path, path="fourier/mesh", mode="r")[:])
+        return tuple(map(str, np.asarray(zarr.open_array(self.path, path="fourier/mesh", mode="r")[:]).tolist()))
 
     def records(self) -> tuple[Record | None, ...]:
         """The completion record of each row, None where there is none."""
-        lines = zarr.open_array(self.path, path=_RECORD, mode="r")[:]
+        lines = np.asarray(zarr.open_array(self.path, path=_RECORD, mode="r")[:]).tolist()
         return tuple(Record.from_json(str(line)) for line in lines)
 
     def write_record(self, row: int, record: Record) -> None:
         """Write the completion record of a row: one chunk, replaced as a whole."""
         zarr.open_array(self.path, path=_RECORD, mode="r+")[row] = record.to_json()
 
-    def write_field(self, row: int, place: Sequence[slice], values: NDArray[Any]) -> None:
+    def write_field(self, row: int, place: Place, values: NDArray[Any]) -> None:
         """Write one block of a row's field, which must be whole chunks."""
         # Chunks of zeros are data too: they must exist, or they would read as never computed.
         array = zarr.open_array(self.path, path=_FIELD, mode="r+", config={"write_empty_chunks": True})
         array[(row, *place)] = values
 
-    def read_fields(self, rows: Sequence[int], place: Sequence[slice]) -> NDArray[Any]:
+    def read_fields(self, rows: Sequence[int], place: Place) -> NDArray[Any]:
         """One block of several rows' fields, complex (len(rows), ...).
 
         Raises:
@@ -136,7 +137,8 @@ class Store:
         """A group of small arrays, or None where it was not written yet."""
         try:
             with xr.open_zarr(self.path, group=group, consolidated=False, chunks=None) as dataset:
-                return dataset.load()
+                table: xr.Dataset = dataset.load()
+                return table
         except (FileNotFoundError, KeyError):
             return None
 

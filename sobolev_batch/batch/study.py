@@ -23,7 +23,10 @@ from sobolev_batch.surfaces.sources import Source, parse_source
 REFERENCE_LABEL = "reference"
 
 # One line of printable text. Names become labels in the store and never paths or keys.
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\s/\\\x00-\x1f\x7f]([^/\\\x00-\x1f\x7f]*[^\s/\\\x00-\x1f\x7f])?$")]
+Name = Annotated[
+    str,
+    Field(min_length=1, max_length=100, pattern=r"^[^\s/\\\x00-\x1f\x7f]([^/\\\x00-\x1f\x7f]*[^\s/\\\x00-\x1f\x7f])?$"),
+]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 

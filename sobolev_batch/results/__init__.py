@@ -1,0 +1,1 @@
+"""What people read: an opened store, tables, plots."""

@@ -78,11 +78,11 @@ def transform_figure(tree: xr.DataTree) -> Figure:
         rows = np.flatnonzero(complete & (meshes["family"].values == family) & (meshes["mesh"].values != reference))
         spread = np.unique(np.linspace(0, len(rows) - 1, min(_MOST_CURVES, len(rows))).round().astype(int))
         for row in rows[spread]:
-            values = along.isel(mesh=int(row)).values.real
+            values = np.real(along.isel(mesh=int(row)).to_numpy())
             axes.plot(along["xi_x"], values, linewidth=1, label=str(meshes["mesh"].values[row]))
         place = meshes["mesh"].values.tolist().index(reference)
         if complete[place]:
-            values = along.isel(mesh=place).values.real
+            values = np.real(along.isel(mesh=place).to_numpy())
             axes.plot(along["xi_x"], values, "k--", linewidth=1.2, label=str(reference))
         axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
         axes.set_ylabel("Re of the transform")

@@ -65,14 +65,14 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     """
     frame = convergence_frame(tree, orders)
     if style == "csv":
-        return frame.to_csv(index=False, lineterminator="\n").rstrip("\n")
+        return str(frame.to_csv(index=False, lineterminator="\n")).rstrip("\n")
     if style == "json":
         records = frame.replace({np.nan: None}).to_dict(orient="records")
         return json.dumps(records, indent=2, allow_nan=False)
     reference = tree["convergence"].attrs["reference"]
     parts = []
     for order, group in frame.groupby("order", sort=False):
-        cells = [_cells(line) for line in group.itertuples(index=False)]
+        cells = [_cells(line) for line in group.to_dict(orient="records")]
         caption = f"Sobolev distance of order {order:g} to {reference}"
         table = tabulate(
             cells,
@@ -100,17 +100,16 @@ def _chosen(convergence: xr.Dataset, orders: Sequence[float] | None) -> list[flo
     return list(orders)
 
 
-def _cells(line: object) -> list[str]:
-    values = {name: getattr(line, name) for name in ("triangles", "edge_length", "distance", "relative", "rate")}
-    if getattr(line, "status") != "complete":
-        return [getattr(line, "mesh"), *["missing"] * 5]
+def _cells(line: dict[str, Any]) -> list[str]:
+    if line["status"] != "complete":
+        return [line["mesh"], *["missing"] * 5]
     return [
-        getattr(line, "mesh"),
-        f"{values['triangles']:,}" if values["triangles"] else "",
-        _number(values["edge_length"], ".4g"),
-        _number(values["distance"], ".6e"),
-        _number(values["relative"], ".6e"),
-        _number(values["rate"], ".3f"),
+        line["mesh"],
+        f"{line['triangles']:,}" if line["triangles"] else "",
+        _number(line["edge_length"], ".4g"),
+        _number(line["distance"], ".6e"),
+        _number(line["relative"], ".6e"),
+        _number(line["rate"], ".3f"),
     ]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +24,7 @@ def observed_rates(errors: Reals, sizes: Reals) -> Reals:
     rates = np.full(len(errors), np.nan)
     usable = np.flatnonzero(np.isfinite(errors) & np.isfinite(sizes) & (errors > 0) & (sizes > 0))
     ordered = usable[np.argsort(-sizes[usable], kind="stable")]
-    for coarse, fine in zip(ordered[:-1], ordered[1:], strict=True):
+    for coarse, fine in pairwise(ordered):
         if sizes[coarse] > sizes[fine]:
             rates[fine] = np.log(errors[coarse] / errors[fine]) / np.log(sizes[coarse] / sizes[fine])
     return rates

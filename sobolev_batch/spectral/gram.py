@@ -29,8 +29,10 @@ def gram_blocks(first: Complexes, second: Complexes, lattice: Lattice, block: Bl
     """Inner products Re <a_i, b_j>_s of the parts of fields on one block of the half lattice.
 
     Args:
-        first, second: complex128 (m, block.size) and (n, block.size).
-        lattice, block: where the samples lie.
+        first: a, complex128 (m, block.size).
+        second: b, complex128 (n, block.size).
+        lattice: where the samples lie.
+        block: which part of it they are.
         orders: s, each.
 
     Returns:
@@ -55,12 +57,14 @@ def squared_distances(products: Reals, first: Reals, second: Reals) -> tuple[Rea
 
     Args:
         products: (orders, m, n) inner products of the differences to the center.
-        first, second: (orders, m) and (orders, n) squared distances to the center.
+        first: squared distances of a to the center, (orders, m).
+        second: those of b, (orders, n).
 
     Returns:
         (orders, m, n) squared distances, not negative; and whether any order of a pair (m, n) has
         lost more than about six digits.
     """
     sums = first[:, :, None] + second[:, None, :]
-    squares = np.maximum(sums - 2 * products, 0.0)
-    return squares, (squares < _CANCELLATION * sums).any(axis=0)
+    squares: Reals = np.maximum(sums - 2 * products, 0.0)
+    cancelled: NDArray[np.bool_] = np.any(squares < _CANCELLATION * sums, axis=0)
+    return squares, cancelled

@@ -97,7 +97,7 @@ class Lattice:
 
     def frequencies(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Frequencies along the three axes of a block, in cycles per unit length."""
-        x, y, z = (self.spacing * block.indices(axis) for axis in range(3))
+        x, y, z = (self.spacing * block.indices(axis).astype(np.float64) for axis in range(3))
         return x, y, z
 
     def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
@@ -106,9 +106,7 @@ class Lattice:
         The end samples of each axis count half; samples with xi_z > 0 count twice, for themselves
         and for their conjugates. The factor h^3 is included.
         """
-        x, y, z = (
-            np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3)
-        )
+        x, y, z = (np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3))
         z = z * np.where(block.indices(2) > 0, 2.0, 1.0)
         weights: NDArray[np.float64] = x[:, None, None] * y[:, None] * z
         return weights

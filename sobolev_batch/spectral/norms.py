@@ -8,6 +8,7 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -22,6 +23,7 @@ from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
+Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
 # Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
@@ -68,8 +70,8 @@ def distance(
     """The Sobolev distance ||a - b||_s of two surfaces' area measures.
 
     Args:
-        a, b: fields on the same lattice, or surfaces. Two spheres without a lattice are answered in
-            closed form.
+        a: a field, or a surface. Two spheres without a lattice are answered in closed form.
+        b: a field on the same lattice, or a surface.
         order: one order s < -1/2, or several.
         lattice: where surfaces are to be transformed; a field brings its own.
 
@@ -103,13 +105,16 @@ def check_orders(order: Orders) -> tuple[float, ...]:
     return orders
 
 
-def shell_sums(values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block) -> Reals:
+def shell_sums(
+    values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block
+) -> Reals:
     """Trapezoidal sums of Re(a conj b) over each shell of one block of the half lattice.
 
     Args:
         values: a, complex (block.shape).
         others: b, likewise; None stands for a itself.
-        lattice, block: where the values lie.
+        lattice: where the values lie.
+        block: which part of it they are.
 
     Returns:
         float64 (lattice.shell_count,): indexed by |k|². The sums of all blocks add up to those of
@@ -120,7 +125,9 @@ def shell_sums(values: NDArray[np.complexfloating], others: NDArray[np.complexfl
     else:
         products = values.real.astype(np.float64) * others.real + values.imag.astype(np.float64) * others.imag
     products *= lattice.trapezoid_weights(block)
-    return np.bincount(lattice.shells(block).ravel(), weights=products.ravel(), minlength=lattice.shell_count)
+    shells = lattice.shells(block).ravel()
+    sums: Reals = np.bincount(shells, weights=products.ravel(), minlength=lattice.shell_count).astype(np.float64)
+    return sums
 
 
 def shell_weights(lattice: Lattice, orders: Sequence[float]) -> Reals:
@@ -144,7 +151,7 @@ def _squared_distances(a: xr.DataArray, b: xr.DataArray, lattice: Lattice, order
     return shell_weights(lattice, orders) @ sums
 
 
-def _read(field: xr.DataArray, lattice: Lattice, block: Block) -> NDArray[np.complexfloating]:
+def _read(field: xr.DataArray, lattice: Lattice, block: Block) -> Complexes:
     places = dict(zip(AXES, lattice.place(block), strict=True))
     return np.asarray(field.isel(places).transpose(*AXES).values)
 

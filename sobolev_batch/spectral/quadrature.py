@@ -114,7 +114,7 @@ class _Group:
 
     @property
     def point_count(self) -> int:
-        return len(self.members) * self.rule.size * 4**self.splits
+        return len(self.members) * self.rule.size << 2 * self.splits
 
     def cut(self, largest: int) -> Iterator[_Group]:
         step = max(1, largest // 4**self.splits)

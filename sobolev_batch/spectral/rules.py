@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import modepy
 import numpy as np
@@ -38,7 +38,7 @@ class TriangleRule:
         return len(self.weights)
 
 
-@lru_cache(maxsize=None)
+@cache
 def symmetric_rule(degree: int) -> TriangleRule:
     """The fully symmetric rule of a degree from 1 to 50 with positive weights and interior nodes.
 
@@ -51,7 +51,7 @@ def symmetric_rule(degree: int) -> TriangleRule:
     return TriangleRule(degree, np.stack([1 - second - third, second, third], axis=1), weights / weights.sum())
 
 
-@lru_cache(maxsize=None)
+@cache
 def gauss_rule(points: int = 8) -> TriangleRule:
     """The product of two Gauss-Legendre rules, collapsed onto the triangle: points² nodes.
 
@@ -107,7 +107,9 @@ def _error_table() -> tuple[Reals, Reals]:
     second = -largest * np.tile(fractions, len(sizes))
     phases = np.stack([largest, second, -largest - second])
     e = np.exp(1j * phases)
-    exact = 2 * second_difference((e[0], e[1], e[2]), phases[1] - phases[0], phases[2] - phases[0], phases[2] - phases[1])
+    exact = 2 * second_difference(
+        (e[0], e[1], e[2]), phases[1] - phases[0], phases[2] - phases[0], phases[2] - phases[1]
+    )
     errors = np.empty((HIGHEST_DEGREE, len(sizes)))
     for degree in range(1, HIGHEST_DEGREE + 1):
         rule = symmetric_rule(degree)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +69,7 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
         kinks = sorted(t for t in (-near / apart, -far / apart) if -1 < t < 1)
         edges = [-1.0, *kinks, 1.0]
         mean = 0.5 * sum(
-            quad(integrand, low, high, epsabs=0, epsrel=1e-13, limit=200)[0]
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
+            quad(integrand, low, high, epsabs=0, epsrel=1e-13, limit=200)[0] for low, high in pairwise(edges)
         )
     value = 8 * math.pi * radii[0] * radii[1] * mean
     if not math.isfinite(value):

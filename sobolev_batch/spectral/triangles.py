@@ -58,13 +58,17 @@ def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
     return values
 
 
-def second_difference(exponentials: tuple[Complexes, Complexes, Complexes], ab: Reals, ac: Reals, bc: Reals) -> Complexes:
+def second_difference(
+    exponentials: tuple[Complexes, Complexes, Complexes], ab: Reals, ac: Reals, bc: Reals
+) -> Complexes:
     """The second divided difference of exp at three imaginary nodes iα, iβ, iγ.
 
     Args:
         exponentials: exp(iα), exp(iβ), exp(iγ), each (n,).
-        ab, ac, bc: the gaps β - α, γ - α, γ - β in radians, each (n,); passed apart from the
-            exponentials since they keep their relative accuracy only if formed from edge vectors.
+        ab: the gap β - α in radians, (n,).
+        ac: the gap γ - α, likewise.
+        bc: the gap γ - β, likewise. The gaps are passed apart from the exponentials since they keep
+            their relative accuracy only if they are formed from edge vectors.
 
     Returns:
         complex128 (n,); 1/2 where the three nodes coincide at zero.

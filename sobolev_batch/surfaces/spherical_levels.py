@@ -14,7 +14,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.generated import Level
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Source, parse_source, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Source, sole_member
 
 
 class SphericalLevels(NestedSource):
