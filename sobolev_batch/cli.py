@@ -18,7 +18,6 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.opening import open_store
-from sobolev_batch.results.plots import plot_store
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.norms import distance
@@ -128,6 +127,9 @@ def table_command(store: Path, style: Format, orders: tuple[float, ...]) -> None
 )
 def plot_command(store: Path, output: Path) -> None:
     """Draw the convergence and the transforms of STORE."""
+    # Imported here: it takes as long as everything that the other commands do at their start.
+    from sobolev_batch.results.plots import plot_store
+
     for path in plot_store(open_store(store), output):
         click.echo(path)
 

@@ -131,19 +131,24 @@ class Study:
             raise StudyError(f"family names must differ by more than case, found {', '.join(map(repr, twins))} twice")
         if REFERENCE_LABEL in folded:
             raise StudyError(f"no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
-        return cls(
-            name=document.study.name,
-            title=document.study.title or document.study.name,
-            lattice=Lattice(document.lattice.xi_max, document.lattice.M),
-            transform=document.transform.settings(),
-            orders=_distinct(check_orders(document.norm.orders)),
-            pairs=document.norm.pairs,
-            families=families,
-            reference=_reference(document.reference, families),
-            scaling=document.scaling.settings(),
-            folder=Path(folder),
-            table=json.loads(json.dumps(table, default=str)),
-        )
+        try:
+            return cls(
+                name=document.study.name,
+                title=document.study.title or document.study.name,
+                lattice=Lattice(document.lattice.xi_max, document.lattice.M),
+                transform=document.transform.settings(),
+                orders=_distinct(check_orders(document.norm.orders)),
+                pairs=document.norm.pairs,
+                families=families,
+                reference=_reference(document.reference, families),
+                scaling=document.scaling.settings(),
+                folder=Path(folder),
+                table=json.loads(json.dumps(table, default=str)),
+            )
+        except StudyError:
+            raise
+        except InputError as error:
+            raise StudyError(str(error)) from error
 
 
 class _Section(BaseModel):

@@ -15,6 +15,7 @@ from distributed import get_worker
 
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.mesh import Mesh
@@ -65,8 +66,10 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
         for block in blocks:
             values = transform_block(surface, job.lattice, block, job.transform, threads=1)
             job.store.write_field(job.row, job.lattice.place(block), values)
+    except InputError as error:
+        return Part(Facts(), time.perf_counter() - started, str(error))
     except Exception as error:
-        _log.exception("%s failed", job.label)
+        _log.exception("%s failed for a reason that is not its mesh's", job.label)
         reason = " ".join(str(error).split()) or type(error).__name__
         return Part(Facts(), time.perf_counter() - started, reason)
     return Part(facts, time.perf_counter() - started)

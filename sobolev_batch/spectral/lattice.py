@@ -130,9 +130,9 @@ class Lattice:
         """
         shape = list(self.shape)
         for axis in range(3):
-            rest = math.prod(shape[axis + 1 :])
-            parts = math.ceil(shape[axis] * rest / largest_size)
-            shape[axis] = math.ceil(shape[axis] / min(parts, shape[axis]))
+            most = max(1, largest_size // math.prod(shape[axis + 1 :]))
+            parts = math.ceil(shape[axis] / most)
+            shape[axis] = math.ceil(shape[axis] / parts)
             if math.prod(shape) <= largest_size:
                 break
         return tuple(self._blocks((shape[0], shape[1], shape[2])))

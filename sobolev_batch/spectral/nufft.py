@@ -46,8 +46,17 @@ def transform_points(
     library based on an exponential of semicircle kernel" (2019), doi:10.1137/18M120885X.
     """
     real = np.float32 if precision == "complex64" else np.float64
+    # Its warnings speak of thread counts and of tolerances, which are checked before they get here.
     plan = finufft.Plan(
-        1, block.shape, eps=eps, isign=-1, dtype=precision, nthreads=threads, upsampfac=OVERSAMPLING, modeord=0
+        1,
+        block.shape,
+        eps=eps,
+        isign=-1,
+        dtype=precision,
+        modeord=0,
+        nthreads=threads,
+        upsampfac=OVERSAMPLING,
+        showwarn=0,
     )
     # FINUFFT's modes of an axis of n samples start at -(n // 2). Turning the strengths by the
     # difference to the block's own start moves that window anywhere, at no cost in the FFT.

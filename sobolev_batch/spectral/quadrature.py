@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
-from sobolev_batch.spectral.triangles import Corners
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]
 
@@ -68,28 +69,18 @@ class Quadrature:
                 cycles per unit length.
             tolerance: largest quadrature error at any such frequency, relative to the area; "auto"
                 keeps it, the others ignore it.
-            capacity: bound on the points of one batch.
+            capacity: bound on the points of one batch, 8 times the largest rule (3,624) or more.
         """
-        pieces = [
-            piece
-            for group in self._groups(mesh, highest_frequency, tolerance)
-            for piece in group.cut(max(1, min(_SLICE, capacity // group.rule.size)))
-        ]
-        total = sum(piece.point_count for piece in pieces)
-        target = -(-total // -(-total // capacity))
-        waiting: list[_Group] = []
-        filled = 0
-        for piece in pieces:
-            if waiting and filled + piece.point_count > capacity:
-                yield _join(mesh, waiting)
-                waiting, filled = [], 0
-            waiting.append(piece)
-            filled += piece.point_count
-            if filled >= target:
-                yield _join(mesh, waiting)
-                waiting, filled = [], 0
-        if waiting:
-            yield _join(mesh, waiting)
+        most = capacity // 8
+        groups = self._groups(mesh, highest_frequency, tolerance)
+        pieces = [piece for group in groups for piece in group.cut(most)]
+        ends = np.cumsum([piece.point_count for piece in pieces])
+        total = int(ends[-1])
+        count = -(-total // (capacity - most))
+        # A piece goes where it starts, so a batch ends at most one piece after its share of the points.
+        batch_of = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
+        for _, batch in groupby(zip(batch_of, pieces, strict=True), key=itemgetter(0)):
+            yield _join(mesh, [piece for _, piece in batch])
 
     def point_count(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
         """How many points `batches` makes in all."""
@@ -106,26 +97,38 @@ class Quadrature:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Triangles that share a rule, each cut into 4^splits similar ones first."""
+    """Triangles that share a rule, each cut into 4^splits similar ones first.
+
+    ``path`` names the quarter of a quarter ... of each triangle that is meant; empty for all of it.
+    """
 
     rule: TriangleRule
     splits: int
     members: NDArray[np.int64]
+    path: tuple[int, ...] = ()
 
     @property
     def point_count(self) -> int:
         return len(self.members) * self.rule.size << 2 * self.splits
 
-    def cut(self, largest: int) -> Iterator[_Group]:
-        step = max(1, largest // 4**self.splits)
+    def cut(self, most: int) -> Iterator[_Group]:
+        """Parts of at most ``most`` points, or of one undivided triangle."""
+        each = self.rule.size << 2 * self.splits
+        if each > most and self.splits:
+            for quarter in range(4):
+                yield from _Group(self.rule, self.splits - 1, self.members, (*self.path, quarter)).cut(most)
+            return
+        step = max(1, min(_SLICE, most // each))
         for first in range(0, len(self.members), step):
-            yield _Group(self.rule, self.splits, self.members[first : first + step])
+            yield _Group(self.rule, self.splits, self.members[first : first + step], self.path)
 
     def points(self, mesh: Mesh) -> WeightedPoints:
-        a, b, c = (corner[self.members] for corner in mesh.corners)
-        areas = mesh.areas[self.members]
+        a, b, c = mesh.corners(self.members)
+        areas = mesh.areas[self.members] / 4 ** len(self.path)
+        for quarter in self.path:
+            a, b, c = _quarters((a, b, c))[quarter]
         for _ in range(self.splits):
-            a, b, c = _quarter((a, b, c))
+            a, b, c = (np.concatenate(parts) for parts in zip(*_quarters((a, b, c)), strict=True))
             areas = np.tile(areas / 4, 4)
         rule = self.rule
         coordinates = np.empty((3, rule.size, len(areas)))
@@ -153,15 +156,11 @@ def _smallest_rules(mesh: Mesh, wavenumber: float, tolerance: float) -> list[_Gr
     ]
 
 
-def _quarter(corners: Corners) -> Corners:
-    """Each triangle cut into four similar ones at its edge midpoints; children of one kind stay together."""
+def _quarters(corners: Corners) -> tuple[Corners, Corners, Corners, Corners]:
+    """Each triangle cut into four similar ones at its edge midpoints."""
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    return (
-        np.concatenate([a, ab, ca, ab]),
-        np.concatenate([ab, b, bc, bc]),
-        np.concatenate([ca, bc, c, ca]),
-    )
+    return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
 
 
 def _join(mesh: Mesh, groups: list[_Group]) -> WeightedPoints:

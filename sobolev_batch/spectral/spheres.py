@@ -60,7 +60,8 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
     near, far = radii[0] - radii[1], radii[0] + radii[1]
 
     def integrand(t: float) -> float:
-        return _matern_difference(nu, abs(near + apart * t), abs(far + apart * t))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _matern_difference(nu, abs(near + apart * t), abs(far + apart * t))
 
     if apart == 0:
         mean = integrand(0.0)
@@ -102,7 +103,7 @@ def _matern_difference(nu: float, shorter: float, longer: float) -> float:
     C(b) = √π (b/2)^ν K_ν(b) / Γ(ν+1/2), and d/db [b^ν K_ν(b)] = -b^ν K_{ν-1}(b).
     """
     low, high = 2 * math.pi * shorter, 2 * math.pi * longer
-    factor = math.sqrt(math.pi) / (2**nu * gamma(nu + 0.5))
+    factor = math.sqrt(math.pi) / (np.exp2(nu) * gamma(nu + 0.5))
     if max(low, high) < 1:
         rise, _ = quad(lambda b: b**nu * kv(nu - 1, b) if b > 0 else 0.0, low, high, epsabs=0, epsrel=1e-13, limit=200)
         return float(factor * rise)
@@ -111,5 +112,5 @@ def _matern_difference(nu: float, shorter: float, longer: float) -> float:
 
 def _matern(nu: float, b: float) -> float:
     """b^ν K_ν(b), with its limit 2^(ν-1) Γ(ν) at zero."""
-    value = b**nu * kv(nu, b) if b > 0 else math.inf
-    return float(value) if math.isfinite(value) else float(2 ** (nu - 1) * gamma(nu))
+    value = np.power(b, nu) * kv(nu, b) if b > 0 else math.inf
+    return float(value) if math.isfinite(value) else float(np.exp2(nu - 1) * gamma(nu))

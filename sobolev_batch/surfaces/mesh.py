@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -12,7 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import MeshError
 
+Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_EVERYTHING = slice(None)
+# Triangles whose corners are spread out at a time: 19 MB.
+_SLICE = 1 << 18
 
 # Twice the rounding error of a cross product, relative to the squared longest edge: an area below
 # this is not distinguishable from zero in double precision.
@@ -65,26 +71,22 @@ class Mesh:
                 "the mesh has coordinates so large that its area overflows double precision: "
                 f"largest absolute coordinate {np.abs(checked_vertices).max():.3g}; rescale it"
             )
-        if not np.any(self.areas > self._smallest_area):
+        if not np.any(self.areas > self._smallest_areas()):
             raise MeshError(
                 f"the total area of the {len(checked_triangles)} triangles is zero: every one is "
                 "degenerate, so there is no surface measure to compare"
             )
 
-    @cached_property
-    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """The first, second and third corners of all triangles, each (m, 3)."""
-        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
-        return a, b, c
+    def corners(self, part: slice | NDArray[np.int64] = _EVERYTHING) -> Corners:
+        """The first, second and third corners of all or some triangles, each (k, 3)."""
+        chosen = self.triangles[part]
+        return self.vertices[chosen[:, 0]], self.vertices[chosen[:, 1]], self.vertices[chosen[:, 2]]
 
     @cached_property
     def areas(self) -> NDArray[np.float64]:
         """Area of each triangle (m,), in squared units of length."""
-        a, b, c = self.corners
         with np.errstate(over="ignore", invalid="ignore"):
-            normals = np.cross(b - a, c - a)
-            areas = 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        return _frozen(areas)
+            return self._per_triangle(_areas)
 
     @cached_property
     def area(self) -> float:
@@ -94,36 +96,44 @@ class Mesh:
     @cached_property
     def edge_lengths(self) -> NDArray[np.float64]:
         """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
-        a, b, c = self.corners
-        return _frozen(np.stack([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))], 1))
+        return self._per_triangle(_side_lengths)
 
     @cached_property
     def centroid_radii(self) -> NDArray[np.float64]:
         """Distance from each triangle's centroid to its farthest corner (m,)."""
-        a, b, c = self.corners
-        centroids = (a + b + c) / 3
-        radii = [np.linalg.norm(corner - centroids, axis=1) for corner in (a, b, c)]
-        return _frozen(np.maximum.reduce(radii))
+        return self._per_triangle(_centroid_radii)
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper corner of the bounding box of the vertices that triangles use, (3,) each."""
-        lower = np.minimum.reduce([corner.min(axis=0) for corner in self.corners])
-        upper = np.maximum.reduce([corner.max(axis=0) for corner in self.corners])
-        return _frozen(lower), _frozen(upper)
+        used = self.vertices[self.used_vertices]
+        return _frozen(used.min(axis=0)), _frozen(used.max(axis=0))
+
+    @cached_property
+    def used_vertices(self) -> NDArray[np.int64]:
+        """Indices of the vertices that triangles use, in ascending order."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.triangles] = True
+        return _frozen(np.flatnonzero(used).astype(np.int64))
 
     @cached_property
     def counts(self) -> MeshCounts:
         """How many triangles and edges are degenerate, duplicate, open or non-manifold."""
         ordered = np.sort(self.triangles, axis=1)
-        rows = ordered[np.lexsort(ordered.T[::-1])]
-        duplicate = int(np.count_nonzero(np.all(rows[1:] == rows[:-1], axis=1)))
-        edges = np.concatenate([ordered[:, [0, 1]], ordered[:, [1, 2]], ordered[:, [0, 2]]])
-        keys = edges[:, 0] * len(self.vertices) + edges[:, 1]
-        _, sharing = np.unique(keys, return_counts=True)
+        low, middle, high = ordered.T
+        order = np.lexsort((high, middle, low))
+        duplicate = np.ones(len(order) - 1, dtype=bool)
+        for column in (low, middle, high):
+            duplicate &= np.diff(column[order]) == 0
+        del order
+        count = len(self.vertices)
+        edges = np.concatenate([low * count + middle, middle * count + high, low * count + high])
+        edges.sort()
+        starts = np.flatnonzero(np.diff(edges, prepend=-1))
+        sharing = np.diff(starts, append=len(edges))
         return MeshCounts(
-            zero_area=int(np.count_nonzero(self.areas <= self._smallest_area)),
-            duplicate=duplicate,
+            zero_area=int(np.count_nonzero(self.areas <= self._smallest_areas())),
+            duplicate=int(np.count_nonzero(duplicate)),
             boundary_edges=int(np.count_nonzero(sharing == 1)),
             nonmanifold_edges=int(np.count_nonzero(sharing > 2)),
         )
@@ -137,16 +147,45 @@ class Mesh:
             digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
         return digest.hexdigest()
 
-    @cached_property
-    def _smallest_area(self) -> NDArray[np.float64]:
-        longest: NDArray[np.float64] = self.edge_lengths.max(axis=1)
+    def _smallest_areas(self) -> NDArray[np.float64]:
+        """The area of each triangle (m,) that could as well be zero, given the rounding of its sides."""
+        longest: NDArray[np.float64] = self._per_triangle(_longest_sides)
         return _AREA_RESOLUTION * longest**2
+
+    def _per_triangle(self, measure: Callable[[Corners], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """A measure of all triangles, taken slice by slice: corners of millions at once take gigabytes."""
+        parts = [
+            measure(self.corners(slice(first, first + _SLICE))) for first in range(0, len(self.triangles), _SLICE)
+        ]
+        return _frozen(np.concatenate(parts))
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
 
     def __reduce__(self) -> tuple[type[Mesh], tuple[NDArray[np.float64], NDArray[np.int64]]]:
         return Mesh, (self.vertices, self.triangles)
+
+
+def _areas(corners: Corners) -> NDArray[np.float64]:
+    a, b, c = corners
+    normals = np.cross(b - a, c - a)
+    return 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
+
+
+def _side_lengths(corners: Corners) -> NDArray[np.float64]:
+    a, b, c = corners
+    return np.stack([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=1)
+
+
+def _longest_sides(corners: Corners) -> NDArray[np.float64]:
+    longest: NDArray[np.float64] = _side_lengths(corners).max(axis=1)
+    return longest
+
+
+def _centroid_radii(corners: Corners) -> NDArray[np.float64]:
+    centroids = sum(corners) / 3
+    radii: NDArray[np.float64] = np.maximum.reduce([np.linalg.norm(corner - centroids, axis=1) for corner in corners])
+    return radii
 
 
 def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ class Similarity:
             return cls(1 / surface.radius, surface.center)
         lower, upper = surface.bounds
         center = lower + (upper - lower) / 2
-        radius = max(float(np.linalg.norm(corner - center, axis=1).max()) for corner in surface.corners)
+        radius = float(np.linalg.norm(surface.vertices[surface.used_vertices] - center, axis=1).max())
         return cls(1 / radius, (float(center[0]), float(center[1]), float(center[2])))
 
     @property

@@ -1,0 +1,180 @@
+"""Runs of whole studies on a cluster of processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from distributed import Client
+
+from sobolev_batch import Mesh, Sphere, StoreError, Study, distance, fourier_transform, icosphere, open_store, run
+from sobolev_batch.batch import plan as plan_module
+from sobolev_batch.batch.run import Progress
+from sobolev_batch.batch.store import Store
+from tests.batch.conftest import small_table
+
+
+def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
+    tree = open_store(finished_store)
+    study = Study.from_table(small_table())
+    sphere = fourier_transform(Sphere(), study.lattice)
+    for level in range(4):
+        field = tree["fourier"]["fourier"].sel(mesh=f"ico/{level}").drop_vars("mesh")
+        expected = fourier_transform(icosphere(level), study.lattice, threads=1)
+        assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
+        found = tree["convergence"]["distance"].sel(mesh=f"ico/{level}").values
+        assert found == pytest.approx(distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
+        # A field straight from the store serves as an argument too.
+        assert distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
+    matrix = tree["distances"]["distance"].sel(order=-10.0).values
+    assert np.array_equal(matrix, matrix.T)
+    assert (matrix.diagonal() == 0).all()
+    a, b = (fourier_transform(icosphere(level), study.lattice) for level in (2, 3))
+    assert matrix[2, 3] == pytest.approx(distance(a, b, -10.0)["distance"].item(), rel=1e-9)
+    rates = tree["convergence"]["rate"].sel(order=-10.0).values
+    assert np.isnan(rates[[0, 4]]).all()
+    assert rates[3] == pytest.approx(2.0, abs=0.02)
+
+
+def test_mesh_facts_are_recorded(finished_store: Path) -> None:
+    meshes = open_store(finished_store)["meshes"].to_dataset()
+    row = meshes.sel(mesh="ico/2")
+    mesh = icosphere(2)
+    assert row["triangles"].item() == 320
+    assert row["vertices"].item() == 162
+    assert row["area"].item() == pytest.approx(mesh.area)
+    assert row["digest"].item() == mesh.digest
+    assert row["edge_length_max"].item() == pytest.approx(mesh.edge_lengths.max())
+    assert row["status"].item() == "complete"
+    assert row["worker"].item().startswith("tcp://127.0.0.1:")
+    assert row["backend"].item() == "finufft"
+    assert meshes["level"].values.tolist() == [0, 1, 2, 3, -1]
+
+
+def test_a_second_run_computes_nothing(client: Client, study: Study, store_path: Path) -> None:
+    first = run(study, store_path, client)
+    assert len(first.computed) == 5
+    assert first.reused == ()
+    stamps = {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
+    steps: list[Progress] = []
+    second = run(study, store_path, client, on_progress=steps.append)
+    assert second.computed == ()
+    assert second.reused == first.computed
+    assert steps == []
+    assert stamps == {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
+
+
+def test_only_what_changed_is_computed_again(client: Client, tmp_path: Path, store_path: Path) -> None:
+    for name in ("a", "b"):
+        trimesh.creation.box().export(tmp_path / f"{name}.off")
+    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+
+    def go(**changes: object) -> tuple[str, ...]:
+        table = small_table(family=family, **changes)
+        return run(Study.from_table(table, folder=tmp_path), store_path, client).computed
+
+    assert go() == ("f/a", "f/b", "reference")
+    trimesh.creation.box((1.0, 1.0, 0.5)).export(tmp_path / "b.off")
+    assert go() == ("f/b",)
+    assert go(norm={"orders": [-7.0]}) == ()
+    assert open_store(store_path)["convergence"]["order"].values.tolist() == [-7.0]
+    assert go(transform={"eps": 1e-7}) == ("f/a", "f/b", "reference")
+
+
+def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path, store_path: Path) -> None:
+    trimesh.creation.box().export(tmp_path / "good.off")
+    (tmp_path / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
+    trimesh.creation.box((9.0, 1.0, 1.0)).export(tmp_path / "large.off")
+    family = [{"name": "f", "source": "files", "paths": ["*.off", "missing.ply"]}]
+    study = Study.from_table(small_table(family=family), folder=tmp_path)
+    summary = run(study, store_path, client)
+    assert summary.computed == ("f/good", "reference")
+    assert set(summary.failed) == {"f/bad", "f/large", "f/missing"}
+    assert "1 of 3 vertices have NaN" in summary.failed["f/bad"]
+    assert "holds only |coordinate| <" in summary.failed["f/large"]
+    assert "cannot be read" in summary.failed["f/missing"]
+    tree = open_store(store_path)
+    assert np.isnan(tree["convergence"]["distance"].sel(mesh=["f/bad", "f/large", "f/missing"]).values).all()
+    assert np.isfinite(tree["convergence"]["distance"].sel(mesh="f/good").values).all()
+    assert np.isnan(tree["distances"]["distance"].sel(mesh="f/good", other="f/bad").values).all()
+    assert tree["meshes"]["status"].sel(mesh="f/bad").item() == "failed"
+    # Mended, it is computed, and nothing else is.
+    trimesh.creation.box().export(tmp_path / "bad.off")
+    assert run(study, store_path, client).computed == ("f/bad",)
+
+
+def test_meshes_added_to_a_study_join_its_store(client: Client, store_path: Path) -> None:
+    table = small_table(lattice={"xi_max": 3.0, "M": 40})
+    run(Study.from_table(table), store_path, client)
+    more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
+    summary = run(Study.from_table({**table, "family": more}), store_path, client)
+    assert summary.computed == ("late/sphere",)
+    tree = open_store(store_path)
+    assert tree["convergence"]["distance"].sizes["mesh"] == 6
+    exact = distance(Sphere(0.5), Sphere(), -10.0)["distance"].item()
+    found = tree["convergence"]["distance"].sel(mesh="late/sphere", order=-10.0).item()
+    assert found == pytest.approx(exact, rel=1e-6)
+
+
+def test_lattices_of_several_chunks(
+    client: Client, study: Study, finished_store: Path, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_module, "_LARGEST_CHUNK_BYTES", 8_000)
+    run(study, store_path, client)
+    chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))
+    assert len(chunks) > 1
+    blocks, whole = open_store(store_path), open_store(finished_store)
+    assert np.allclose(blocks["fourier"]["fourier"].values, whole["fourier"]["fourier"].values, rtol=0, atol=1e-8)
+    for group, name in (("convergence", "distance"), ("norms", "norm"), ("distances", "distance")):
+        assert np.allclose(blocks[group][name].values, whole[group][name].values, rtol=1e-6, atol=1e-9)
+
+
+def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
+    table = small_table(norm={"orders": [-10.0, -3.0], "pairs": "reference"})
+    run(Study.from_table(table), store_path, client)
+    found = open_store(store_path)["distances"]["distance"]
+    assert found["other"].values.tolist() == ["reference"]
+    whole = open_store(finished_store)["distances"]["distance"].sel(other=["reference"])
+    assert np.allclose(found.values, whole.values, rtol=1e-12, atol=0)
+
+
+def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path: Path) -> None:
+    mesh = icosphere(2)
+    for name, factor in (("a", 1.0), ("b", 1.0 + 1e-7)):
+        moved = Mesh(mesh.vertices * np.array([factor, 1, 1]), mesh.triangles)
+        np.savetxt(tmp_path / f"{name}.v", moved.vertices)
+        lines = ["OFF", f"{len(moved.vertices)} {len(moved.triangles)} 0"]
+        lines += [" ".join(map(repr, map(float, v))) for v in moved.vertices]
+        lines += ["3 " + " ".join(map(str, t)) for t in moved.triangles]
+        (tmp_path / f"{name}.off").write_text("\n".join(lines) + "\n")
+    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+    table = small_table(family=family, transform={"eps": 1e-13}, norm={"orders": [-3.0]})
+    run(Study.from_table(table, folder=tmp_path), store_path, client)
+    found = open_store(store_path)["distances"]["distance"].sel(mesh="f/a", other="f/b", order=-3.0).item()
+    # Twins apart by 1e-7 against the same pair apart by 1e-4, where nothing cancels.
+    lattice = Study.from_table(table).lattice
+    wide = Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)
+    expected = 1e-3 * distance(mesh, wide, -3.0, lattice=lattice)["distance"].item()
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_progress_counts_every_mesh(client: Client, study: Study, store_path: Path) -> None:
+    steps: list[Progress] = []
+    run(study, store_path, client, on_progress=steps.append)
+    assert steps[0].stage == "cluster"
+    fields = [step for step in steps if step.stage == "fields"]
+    assert [step.done for step in fields] == list(range(6))
+    assert {step.label for step in fields[1:]} == {"ico/0", "ico/1", "ico/2", "ico/3", "reference"}
+    reduction = [step for step in steps if step.stage == "reduction"]
+    assert reduction[-1].done == reduction[-1].total > 0
+    assert len({step.total for step in reduction}) == 1
+
+
+def test_a_store_of_another_study_stays_as_it_is(client: Client, study: Study, store_path: Path) -> None:
+    run(study, store_path, client)
+    before = Store.open(store_path).attributes()
+    with pytest.raises(StoreError, match="another study"):
+        run(Study.from_table(small_table(study={"name": "other"})), store_path, client)
+    assert Store.open(store_path).attributes() == before

@@ -1,0 +1,85 @@
+"""The lattice, its half, and blocks of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sobolev_batch import Lattice, LatticeError, Sphere, fourier_transform
+
+
+def test_frequencies_run_over_the_half_lattice_with_both_ends() -> None:
+    lattice = Lattice(5.0, 128)
+    x, y, z = lattice.axes
+    assert lattice.shape == (129, 129, 65)
+    assert lattice.spacing == pytest.approx(0.078125, abs=0)
+    assert (x[0], x[64], x[-1]) == (-5.0, 0.0, 5.0)
+    assert np.array_equal(x, y)
+    assert (z[0], z[-1]) == (0.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("xi_max", "intervals"), [(0.0, 8), (-1.0, 8), (np.nan, 8), (np.inf, 8), (5.0, 7), (5.0, 0), (5.0, 4096)]
+)
+def test_refuses_malformed_lattices(xi_max: float, intervals: int) -> None:
+    with pytest.raises(LatticeError, match=r"must be"):
+        Lattice(xi_max, intervals)
+
+
+def test_refuses_sizes_that_are_not_integers() -> None:
+    with pytest.raises(LatticeError, match="even integer"):
+        Lattice(5.0, 8.0)  # type: ignore[arg-type]
+
+
+def test_trapezoid_weights_of_the_half_integrate_the_whole_cube() -> None:
+    lattice = Lattice(3.0, 6)
+    x, y, z = lattice.axes
+    # Of even integrands, and exactly of 1 and of products of piecewise linear |x|.
+    weights = lattice.trapezoid_weights(lattice.half)
+    assert weights.sum() == pytest.approx(6.0**3, rel=1e-14)
+    product = np.abs(x)[:, None, None] * np.abs(y)[:, None] * np.abs(z)
+    assert (weights * product).sum() == pytest.approx(9.0**3, rel=1e-14)
+
+
+def test_shells_are_squared_index_lengths() -> None:
+    lattice = Lattice(2.0, 4)
+    shells = lattice.shells(lattice.half)
+    assert shells[0, 0, 2] == 12
+    assert shells[2, 2, 0] == 0
+    assert shells.max() == lattice.shell_count - 1
+
+
+@pytest.mark.parametrize("largest", [1, 7, 50, 300, 10_000])
+def test_blocks_cover_the_half_once_and_respect_their_bound(largest: int) -> None:
+    lattice = Lattice(1.0, 8)
+    seen = np.zeros(lattice.shape, dtype=int)
+    blocks = lattice.split(largest)
+    for block in blocks:
+        assert block.size <= largest
+        seen[lattice.place(block)] += 1
+        frequencies = lattice.frequencies(block)
+        for axis, part in enumerate(lattice.place(block)):
+            assert np.array_equal(frequencies[axis], lattice.axes[axis][part])
+    assert (seen == 1).all()
+
+
+def test_block_shapes_are_those_of_a_regular_chunk_grid() -> None:
+    lattice = Lattice(1.0, 12)
+    first = lattice.split(40)[0].shape
+    for block in lattice.split(40):
+        for axis, part in enumerate(lattice.place(block)):
+            assert part.start % first[axis] == 0
+            assert block.shape[axis] == first[axis] or part.stop == lattice.shape[axis]
+
+
+def test_a_field_tells_its_lattice() -> None:
+    lattice = Lattice(2.5, 16)
+    assert Lattice.of(fourier_transform(Sphere(), lattice)) == lattice
+
+
+def test_parts_of_fields_are_not_taken_for_fields() -> None:
+    field = fourier_transform(Sphere(), Lattice(2.5, 16))
+    with pytest.raises(LatticeError, match="select whole fields"):
+        Lattice.of(field.isel(xi_z=slice(0, 5)))
+    with pytest.raises(LatticeError, match="needs the coordinates"):
+        Lattice.of(field.drop_vars("xi_x"))

@@ -1,0 +1,77 @@
+"""Triangle rules: exactness, positivity, and how far each one reaches."""
+
+from __future__ import annotations
+
+from math import factorial
+
+import numpy as np
+import pytest
+
+from sobolev_batch import Mesh
+from sobolev_batch.spectral.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
+from sobolev_batch.spectral.triangles import exact_transform
+
+
+def monomial_error(rule: TriangleRule, degree: int) -> float:
+    """Largest error over the barycentric monomials of a degree: their means are a! b! c! 2! / (a+b+c+2)!."""
+    errors = []
+    for a in range(degree + 1):
+        for b in range(degree + 1 - a):
+            c = degree - a - b
+            found = rule.weights @ np.prod(rule.barycentric ** np.array([a, b, c]), axis=1)
+            exact = 2 * factorial(a) * factorial(b) * factorial(c) / factorial(degree + 2)
+            errors.append(abs(found - exact))
+    return max(errors)
+
+
+@pytest.mark.parametrize("degree", range(1, HIGHEST_DEGREE + 1))
+def test_symmetric_rules_are_exact_positive_and_interior(degree: int) -> None:
+    rule = symmetric_rule(degree)
+    assert rule.weights.sum() == pytest.approx(1.0, abs=1e-15)
+    assert (rule.weights > 0).all()
+    assert (rule.barycentric > 0).all()
+    assert monomial_error(rule, degree) < 3e-15
+
+
+def test_the_papers_rule_has_64_points_of_degree_14() -> None:
+    rule = gauss_rule(8)
+    assert rule.size == 64
+    assert rule.degree == 14
+    assert monomial_error(rule, 14) < 3e-16
+    assert monomial_error(rule, 16) > 1e-15
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9, 1e-12])
+def test_no_triangle_within_reach_exceeds_the_tolerance(tolerance: float) -> None:
+    rng = np.random.default_rng(11)
+    rules, reach = reaches(tolerance)
+    assert (np.diff(reach) > 0).all()
+    assert (np.diff([rule.size for rule in rules]) > 0).all()
+    for rule, limit in zip(rules, reach, strict=True):
+        if limit == 0:
+            continue
+        for _ in range(8):
+            corners = rng.normal(size=(3, 3))
+            corners[2] = corners[0] + rng.uniform(0.01, 1.0) * (corners[2] - corners[0])
+            mesh = Mesh(corners, [[0, 1, 2]])
+            frequency = rng.normal(size=3)
+            frequency *= limit / (2 * np.pi * mesh.centroid_radii[0] * np.linalg.norm(frequency))
+            found = mesh.area * rule.weights @ np.exp(-2j * np.pi * (rule.barycentric @ corners @ frequency))
+            exact = exact_transform(mesh, frequency[None, :])[0]
+            assert abs(found - exact) <= max(tolerance, 1e-14) * mesh.area
+
+
+def test_rules_are_not_wastefully_far_within_the_tolerance() -> None:
+    # A quarter beyond its reach, the worst direction must break the tolerance: the table is sharp.
+    rules, reach = reaches(1e-9)
+    for rule, limit in zip(rules[2:12], reach[2:12], strict=True):
+        worst = 0.0
+        for fraction in np.linspace(0.5, 1, 21):
+            phases = 1.25 * limit * np.array([1.0, -fraction, fraction - 1.0])
+            corners = np.zeros((3, 3))
+            corners[:, 0] = -phases / (2 * np.pi)
+            corners[:, 1] = [0.0, 0.0, 1e-3]
+            mesh = Mesh(corners, [[0, 1, 2]])
+            exact = exact_transform(mesh, np.array([[1.0, 0.0, 0.0]]))[0] / mesh.area
+            worst = max(worst, abs(rule.weights @ np.exp(1j * rule.barycentric @ phases) - exact))
+        assert worst > 1e-9

@@ -1,0 +1,101 @@
+"""Closed forms of spheres."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+
+from sobolev_batch import Lattice, OrderError, Sphere, distance, icosphere, norm
+from sobolev_batch.spectral.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
+from sobolev_batch.surfaces.similarity import Similarity
+
+
+@pytest.mark.parametrize(
+    ("order", "squared"),
+    [(-1, 39.478279929599566), (-2, 19.738274928783976), (-5, 10.77576620890553), (-10, 7.160757451355634)],
+)
+def test_squared_norms_of_the_unit_sphere(order: float, squared: float) -> None:
+    assert norm(Sphere(), order)["norm"].item() ** 2 == pytest.approx(squared, rel=1e-14)
+
+
+def radial_integral(first: Sphere, second: Sphere, order: float) -> float:
+    """The inner product as an integral over |ξ|, in 25 digits; for orders at which it converges fast."""
+    apart = math.dist(first.center, second.center)
+    with mpmath.workdps(25):
+        two_pi = 2 * mpmath.pi
+
+        def integrand(r: mpmath.mpf) -> mpmath.mpf:
+            sines = mpmath.sin(two_pi * first.radius * r) * mpmath.sin(two_pi * second.radius * r)
+            mean = mpmath.sincpi(2 * apart * r) if apart else mpmath.mpf(1)
+            return 16 * mpmath.pi * first.radius * second.radius * (1 + r * r) ** order * sines * mean
+
+        return float(mpmath.quad(integrand, [k * mpmath.mpf(0.5) for k in range(60)]))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (Sphere(), Sphere()),
+        (Sphere(), Sphere(0.9)),
+        (Sphere(), Sphere(0.9, (0.3, 0.0, 0.0))),
+        (Sphere(0.5, (0.0, 1.0, 0.0)), Sphere(2.0, (0.0, 0.0, 1.0))),
+        (Sphere(), Sphere(1.0, (1e-3, 0.0, 0.0))),
+        (Sphere(1e-4), Sphere(2e-4, (1e-4, 0.0, 0.0))),
+        (Sphere(0.05), Sphere(0.05)),
+    ],
+)
+@pytest.mark.parametrize("order", [-7.25, -10.0])
+def test_inner_products_against_the_radial_integral(first: Sphere, second: Sphere, order: float) -> None:
+    assert sphere_inner_product(first, second, order) == pytest.approx(radial_integral(first, second, order), rel=1e-12)
+
+
+def test_transform_is_the_closed_form_at_every_frequency() -> None:
+    rng = np.random.default_rng(1)
+    sphere = Sphere(0.7, (0.1, -0.2, 0.3))
+    frequencies = np.vstack([np.zeros(3), rng.normal(size=(5, 3))])
+    values = sphere_transform(sphere, frequencies)
+    assert values[0] == pytest.approx(4 * math.pi * 0.49, rel=1e-15)
+    for value, frequency in zip(values[1:], frequencies[1:], strict=True):
+        length = 0.7 * np.linalg.norm(frequency)
+        unit = 2 * math.sin(2 * math.pi * length) / length
+        expected = 0.49 * unit * np.exp(-2j * np.pi * frequency @ np.array(sphere.center))
+        assert value == pytest.approx(expected, rel=1e-13)
+
+
+def test_block_and_pointwise_transform_agree() -> None:
+    lattice, sphere = Lattice(2.0, 8), Sphere(0.7, (0.1, -0.2, 0.3))
+    grid = np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
+    assert np.allclose(sphere_block(sphere, lattice, lattice.half), sphere_transform(sphere, grid), rtol=0, atol=1e-14)
+
+
+def test_distance_of_two_spheres_is_that_of_fine_meshes_of_them() -> None:
+    lattice = Lattice(5.0, 64)
+    fine = icosphere(6)
+    shrunk = Similarity(0.9, (-0.3 / 0.9, 0.0, 0.0)).apply(fine)
+    for order in (-5.0, -10.0):
+        exact = distance(Sphere(), Sphere(0.9, (0.3, 0.0, 0.0)), order)["distance"].item()
+        meshed = distance(fine, shrunk, order, lattice=lattice)["distance"].item()
+        assert exact == sphere_distance(Sphere(), Sphere(0.9, (0.3, 0.0, 0.0)), order)
+        assert meshed == pytest.approx(exact, rel=3e-4)  # O(h²): h = 0.019
+
+
+def test_scaling_follows_the_area() -> None:
+    # As the radius goes to zero, the sphere becomes 4πR² times a Dirac mass.
+    order, radius = -4.0, 1e-5
+    dirac = 4 * math.pi * float(mpmath.quad(lambda r: r * r * (1 + r * r) ** order, [0, 1, mpmath.inf]))
+    expected = (4 * math.pi * radius**2) * math.sqrt(dirac)
+    assert norm(Sphere(radius), order)["norm"].item() == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("order", [-0.5, 0.0, 3.0, float("nan")])
+def test_refuses_orders_without_a_norm(order: float) -> None:
+    with pytest.raises(OrderError, match="below -1/2"):
+        sphere_inner_product(Sphere(), Sphere(), order)
+
+
+def test_says_when_its_functions_overflow() -> None:
+    with pytest.raises(OrderError, match="too low"):
+        sphere_inner_product(Sphere(), Sphere(), -1000.0)

@@ -1,0 +1,216 @@
+"""The command line as a process: output, errors in one line, exit status."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from sobolev_batch import icosphere
+
+STUDY = """
+[study]
+name = "cli"
+[lattice]
+xi_max = 3.0
+M = 16
+[norm]
+orders = [-10.0, -3.0]
+[reference]
+source = "sphere"
+[[family]]
+name = "ico"
+source = "icosphere"
+levels = [0, 1]
+"""
+COMMAND = [sys.executable, "-m", "sobolev_batch"]
+
+
+def call(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=folder, timeout=120, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a study that has been run once."""
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "study.toml").write_text(STUDY)
+    done = call("run", "study.toml", "--workers", "1", folder=folder)
+    assert done.returncode == 0, done.stderr
+    (folder / "run.out").write_text(done.stdout)
+    (folder / "run.err").write_text(done.stderr)
+    return folder
+
+
+def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
+    output, errors = (folder / "run.out").read_text(), (folder / "run.err").read_text()
+    assert "Sobolev distance of order -10 to reference" in output
+    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d +\S+e-\d\d +\d\.\d{3}\n", output)
+    assert "3 computed, 0 reused, 0 failed; store: storage/cli.zarr" in output
+    assert re.search(r"dashboard: http://127\.0\.0\.1:\d+/status", errors)
+    assert re.search(r"\[3/3\] \S+: complete, \d+\.\d\d s", errors)
+    assert max(map(len, output.splitlines())) <= 80
+
+
+def test_a_second_run_reuses_everything_and_starts_no_cluster(folder: Path) -> None:
+    done = call("run", "study.toml", folder=folder)
+    assert done.returncode == 0
+    assert "0 computed, 3 reused, 0 failed" in done.stdout
+    assert "dashboard" not in done.stderr
+
+
+def test_plan_and_status(folder: Path) -> None:
+    plan = call("plan", "study.toml", folder=folder)
+    assert plan.returncode == 0
+    assert "3 in 1 families, reference reference" in plan.stdout
+    assert "xi_max 3, M 16, spacing 0.375, half period 1.33333" in plan.stdout
+    assert "41.6 kB per surface, 125 kB in all" in plan.stdout
+    assert "storage/cli.zarr, 3 of 3 already there" in plan.stdout
+    fresh = call("plan", "study.toml", "--store", "elsewhere.zarr", folder=folder)
+    assert "elsewhere.zarr, 0 of 3 already there" in fresh.stdout
+    assert not (folder / "elsewhere.zarr").exists()
+    status = call("status", "storage/cli.zarr", folder=folder)
+    assert status.stdout == "storage/cli.zarr: 3 of 3 complete, 0 failed\n"
+
+
+def test_tables_in_every_format(folder: Path) -> None:
+    outputs = {
+        style: call("table", "storage/cli.zarr", "--format", style, "--order", "-3", folder=folder).stdout
+        for style in ("text", "csv", "json", "markdown", "latex")
+    }
+    records = json.loads(outputs["json"])
+    assert [record["mesh"] for record in records] == ["ico/0", "ico/1"]
+    assert {record["order"] for record in records} == {-3.0}
+    distance = f"{records[1]['distance']:.6e}"
+    for style in ("text", "markdown", "latex"):
+        assert distance in outputs[style], style
+    assert outputs["csv"].splitlines()[0].startswith("order,mesh,family,name,level,status,reason,triangles")
+    assert float(outputs["csv"].splitlines()[2].split(",")[9]) == records[1]["distance"]
+    assert records[0]["rate"] is None
+    assert r"\toprule" in outputs["latex"]
+    assert "| ico/1" in outputs["markdown"]
+
+
+def test_plot_draws_both_pictures(folder: Path) -> None:
+    done = call("plot", "storage/cli.zarr", "--output", "pictures", folder=folder)
+    assert done.stdout.split() == ["pictures/convergence.png", "pictures/transform.png"]
+    for name in done.stdout.split():
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_compare_two_files(folder: Path) -> None:
+    for level in (1, 3):
+        mesh = icosphere(level)
+        trimesh.Trimesh(2.0 * mesh.vertices, mesh.triangles, process=False).export(folder / f"{level}.off")
+    done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert re.match(r"scale 0\.5\d*, origin \S+ \S+ \S+\norder -4: \S+e-01\norder -2: \S+e\+00\n$", done.stdout)
+
+
+BAD = [
+    (("run", "no.toml"), "no.toml: cannot be read: No such file or directory"),
+    (("run", "broken.toml"), "unknown key lattice.m"),
+    (("run", "order.toml"), "orders below -1/2, found -0.5"),
+    (("run", "odd.toml"), "M must be an even integer"),
+    (("run", "outside.toml"), "holds only |coordinate| < 1/(2h) = 0.666667"),
+    (("run", "study.toml", "--store", "taken"), "not empty and holds no store"),
+    (("run", "study.toml", "--store", "/proc/x.zarr"), "/proc/x.zarr: the store cannot be written"),
+    (("run", "other.toml", "--store", "storage/cli.zarr"), "a store of another study is there"),
+    (("status", "nothing.zarr"), "no store of a study is there"),
+    (("table", "nothing.zarr"), "no store of a study is there"),
+    (("table", "storage/cli.zarr", "--order", "-7"), "the store has no order -7, only -10, -3"),
+    (("compare", "a.ply", "b.ply"), "a.ply: cannot be read"),
+    (("compare", "nan.off", "nan.off"), "nan.off: 1 of 3 vertices have NaN"),
+    (("plot", "storage/cli.zarr", "--output", "study.toml"), "study.toml: pictures cannot be written there"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[str, ...], message: str) -> None:
+    (folder / "broken.toml").write_text(STUDY.replace("M = 16", "m = 16"))
+    (folder / "order.toml").write_text(STUDY.replace("-3.0", "-0.5"))
+    (folder / "odd.toml").write_text(STUDY.replace("M = 16", "M = 17"))
+    outside = STUDY.replace("M = 16", "M = 8").replace('"sphere"', '"icosphere"\nlevels = [1]')
+    (folder / "outside.toml").write_text(outside)
+    (folder / "other.toml").write_text(STUDY.replace('"cli"', '"other"'))
+    (folder / "taken").mkdir(exist_ok=True)
+    (folder / "taken" / "precious").write_text("text")
+    (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
+    done = call(*arguments, folder=folder)
+    assert done.returncode == 2, done.stderr
+    assert message in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+    assert (folder / "taken" / "precious").read_text() == "text"
+
+
+def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path) -> None:
+    (folder / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
+    study = STUDY.replace('"cli"', '"partly"') + '\n[[family]]\nname = "f"\nsource = "files"\npaths = ["bad.off"]\n'
+    (folder / "partly.toml").write_text(study)
+    done = call("run", "partly.toml", "--workers", "1", folder=folder)
+    assert done.returncode == 3
+    assert re.search(r"f/bad +missing +missing +missing +missing +missing\n", done.stdout)
+    assert "f/bad is failed: " in done.stdout
+    assert "1 of 3 vertices have NaN" in done.stdout
+    assert "Traceback" not in done.stderr
+    status = call("status", "storage/partly.zarr", folder=folder)
+    assert status.returncode == 3
+    assert "3 of 4 complete, 1 failed\nf/bad: " in status.stdout
+
+
+def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
+    done = call("run", "study.toml", "--store", "new.zarr", "--scheduler", "tcp://127.0.0.1:9", folder=folder)
+    assert done.returncode == 1
+    assert "error: no Dask scheduler answers" in done.stderr
+    assert not (folder / "new.zarr").exists()
+
+
+def test_usage_errors_have_status_2(folder: Path) -> None:
+    for arguments in (("run",), ("fly",), ("table", "storage/cli.zarr", "--format", "xml"), ("run", "study.toml", "--workers", "0")):
+        done = call(*arguments, folder=folder)
+        assert done.returncode == 2
+        assert "Usage:" in done.stderr
+
+
+def test_debug_shows_the_traceback(folder: Path) -> None:
+    done = call("--debug", "run", "no.toml", folder=folder)
+    assert "Traceback" in done.stderr
+    assert done.returncode == 1
+
+
+def test_a_terminal_gets_a_bar(folder: Path) -> None:
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [*COMMAND, "run", "study.toml", "--store", "bar.zarr", "--workers", "1"],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=slave,
+        env={**os.environ, "COLUMNS": "80", "TERM": "xterm"},
+    )
+    os.close(slave)
+    shown = b""
+    while select.select([master], [], [], 60)[0]:
+        try:
+            data = os.read(master, 4096)
+        except OSError:  # the other end was closed
+            break
+        if not data:
+            break
+        shown += data
+    os.close(master)
+    assert process.wait(60) == 0
+    assert b"transforms" in shown
+    assert b"3/3" in shown
+    assert b"[3/3] " not in shown
