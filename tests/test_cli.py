@@ -178,7 +178,12 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
 
 
 def test_usage_errors_have_status_2(folder: Path) -> None:
-    for arguments in (("run",), ("fly",), ("table", "storage/cli.zarr", "--format", "xml"), ("run", "study.toml", "--workers", "0")):
+    for arguments in (
+        ("run",),
+        ("fly",),
+        ("table", "storage/cli.zarr", "--format", "xml"),
+        ("run", "study.toml", "--workers", "0"),
+    ):
         done = call(*arguments, folder=folder)
         assert done.returncode == 2
         assert "Usage:" in done.stderr

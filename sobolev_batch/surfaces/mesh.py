@@ -154,9 +154,7 @@ class Mesh:
 
     def _per_triangle(self, measure: Callable[[Corners], NDArray[np.float64]]) -> NDArray[np.float64]:
         """A measure of all triangles, taken slice by slice: corners of millions at once take gigabytes."""
-        parts = [
-            measure(self.corners(slice(first, first + _SLICE))) for first in range(0, len(self.triangles), _SLICE)
-        ]
+        parts = [measure(self.corners(slice(first, first + _SLICE))) for first in range(0, len(self.triangles), _SLICE)]
         return _frozen(np.concatenate(parts))
 
     def __repr__(self) -> str:

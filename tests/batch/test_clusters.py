@@ -57,8 +57,9 @@ def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
 
 
 def test_no_scheduler_there() -> None:
-    with pytest.raises(ClusterError, match="no Dask scheduler answers at 'tcp://127.0.0.1:9'"), remote_client(
-        "tcp://127.0.0.1:9"
+    with (
+        pytest.raises(ClusterError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"),
+        remote_client("tcp://127.0.0.1:9"),
     ):
         pass
 

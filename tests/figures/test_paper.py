@@ -41,9 +41,10 @@ def test_figure_3b_icospheres_converge_with_second_order() -> None:
     lattice = Lattice(5.0, 128)
     sphere = fourier_transform(Sphere(), lattice)
     meshes = [icosphere(level) for level in range(8)]
-    errors = np.array(
-        [distance(fourier_transform(mesh, lattice), sphere, -10.0)["distance"].item() for mesh in meshes]
-    ) / norm(sphere, -10.0)["norm"].item()
+    errors = (
+        np.array([distance(fourier_transform(mesh, lattice), sphere, -10.0)["distance"].item() for mesh in meshes])
+        / norm(sphere, -10.0)["norm"].item()
+    )
     assert errors == pytest.approx(FIGURE_3B, rel=1e-6)
     lengths = np.array([mesh.edge_lengths.mean() for mesh in meshes])
     slope = np.polyfit(np.log(lengths[3:]), np.log(errors[3:]), 1)[0]

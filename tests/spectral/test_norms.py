@@ -130,9 +130,7 @@ def test_single_precision_fields_are_summed_in_double() -> None:
 
 def test_shell_sums_of_blocks_add_up() -> None:
     field = fourier_transform(BOX, LATTICE)
-    parts = sum(
-        shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000)
-    )
+    parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
     whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
     assert np.allclose(parts, whole, rtol=1e-13, atol=0)
     assert shell_weights(LATTICE, [-2.0]) @ whole == pytest.approx(norm(field, -2)["norm"].item() ** 2, rel=1e-14)

@@ -73,7 +73,7 @@ def test_parts_of_a_mesh_add_up() -> None:
     lattice, mesh = Lattice(3.0, 16), icosphere(2)
     halves = [Mesh(mesh.vertices, mesh.triangles[i::2]) for i in range(2)]
     added = sum(fourier_transform(half, lattice, 1e-12) for half in halves)
-    assert np.abs((added - fourier_transform(mesh, lattice, 1e-12))).max() < 1e-11 * mesh.area
+    assert np.abs(added - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
 
 
 def test_batches_change_nothing_but_rounding() -> None:
@@ -89,7 +89,9 @@ def test_weighted_points_against_the_direct_sum() -> None:
     lattice = Lattice(3.0, 12)
     points = WeightedPoints(rng.uniform(-0.9, 0.9, size=(3, 200)), rng.normal(size=200))
     found = transform_points([points], lattice, lattice.half, eps=1e-13)
-    x, y, z = (np.exp(-2j * np.pi * np.outer(axis, row)) for axis, row in zip(lattice.axes, points.coordinates, strict=True))
+    x, y, z = (
+        np.exp(-2j * np.pi * np.outer(axis, row)) for axis, row in zip(lattice.axes, points.coordinates, strict=True)
+    )
     direct = np.einsum("ap,bp,cp,p->abc", x, y, z, points.weights)
     assert np.abs(found - direct).max() < 1e-11 * np.abs(points.weights).sum()
 
@@ -120,9 +122,7 @@ def test_translation_rotation_order_and_subdivision() -> None:
 
     middle = mesh.vertices[mesh.triangles[0]].mean(axis=0)
     a, b, c = mesh.triangles[0]
-    split = Mesh(
-        np.vstack([mesh.vertices, middle]), np.vstack([mesh.triangles[1:], [[a, b, 8], [b, c, 8], [c, a, 8]]])
-    )
+    split = Mesh(np.vstack([mesh.vertices, middle]), np.vstack([mesh.triangles[1:], [[a, b, 8], [b, c, 8], [c, a, 8]]]))
     assert np.abs(fourier_transform(split, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 import pickle
 import re
 from collections.abc import Callable
@@ -228,6 +227,14 @@ def test_ply_files_may_have_more_elements(read: Read, encoding: str) -> None:
     assert soup(read(".ply", content)) == soup(box())
 
 
+def test_ply_faces_may_come_first(read: Read) -> None:
+    lines = ply(BOX_VERTICES, BOX_TRIANGLES).splitlines(keepends=True)
+    vertex_header, face_header = lines[3:7], lines[7:9]
+    assert (vertex_header[0], face_header[0]) == (b"element vertex 8\n", b"element face 12\n")
+    content = [*lines[:3], *face_header, *vertex_header, lines[9], *lines[18:], *lines[10:18]]
+    assert soup(read(".ply", b"".join(content))) == soup(box())
+
+
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".off", ".stl"])
 def test_lines_may_end_as_on_windows(read: Read, ending: str) -> None:
     content = next(content for found, content in BOXES.values() if found == ending)
@@ -242,8 +249,11 @@ def test_obj_corners_may_count_backwards_from_the_line_they_stand_on(read: Read)
     assert mesh.counts == MeshCounts(zero_area=0, duplicate=0, boundary_edges=6, nonmanifold_edges=0)
 
 
-def test_obj_corners_may_count_backwards_at_the_end_of_the_file(read: Read) -> None:
-    mesh = read(".obj", obj(BOX_VERTICES, BOX_TRIANGLES, lambda vertex, _: str(vertex - 9)))
+@pytest.mark.parametrize("rest", ["", "/-1", "/-1/-1", "//-1"])
+def test_obj_corners_may_count_backwards_at_the_end_of_the_file(read: Read, rest: str) -> None:
+    content = obj(BOX_VERTICES, BOX_TRIANGLES, lambda vertex, _: f"{vertex - 9}{rest}")
+    mesh = read(".obj", b"vt 0 0\nvn 0 0 1\n" + content)
+    assert mesh.vertices.tolist() == BOX_VERTICES.tolist()
     assert mesh.triangles.tolist() == BOX_TRIANGLES
 
 
@@ -289,7 +299,7 @@ OBJ_BOX = obj(BOX_VERTICES, BOX_TRIANGLES)
         OBJ_BOX.replace(b"v 1.0 2.0 4.0\n", b"v 1e+0 20.E-1 .4e1\n"),
         OBJ_BOX + b"p 1\nl 1 2 8\n",
         b"".join(sorted(OBJ_BOX.splitlines(keepends=True)[8:])) + b"".join(OBJ_BOX.splitlines(keepends=True)[:8]),
-        OBJ_BOX.replace(b"f 1 2 4\n", b"f 1/ 2/ 4/\n") if False else OBJ_BOX.rstrip(),
+        OBJ_BOX.rstrip(),
     ],
     ids=[
         "comments",
@@ -341,7 +351,7 @@ def test_stl_files_may_hold_several_solids(read: Read, names: tuple[str, str]) -
     assert mesh.counts == CLOSED
 
 
-@pytest.mark.parametrize("name", ["", "a solid box", "vertex", "facet", "facet normal", "endsolid"])
+@pytest.mark.parametrize("name", ["", "a solid box", "vertex", "facet", "facet normal"])
 def test_stl_solids_may_have_any_name(read: Read, name: str) -> None:
     assert soup(read(".stl", stl_text(BOX_VERTICES, BOX_TRIANGLES, name))) == soup(box())
 
@@ -692,7 +702,11 @@ BAD: dict[str, tuple[str, bytes, str]] = {
         "",
     ),
     "ply, index 8": (".ply", ply(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 8]]), r"indices outside 0\.\.7.*\[0, 1, 8\]"),
-    "ply binary, index 2^32 - 1": (".ply", ply(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 2**32 - 1]], BIG, index="uint"), ""),
+    "ply binary, index 2^32 - 1": (
+        ".ply",
+        ply(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 2**32 - 1]], BIG, index="uint"),
+        "",
+    ),
     "ply, index with a fraction": (".ply", changed(PLY_BOX, b"3 0 1 3\n", b"3 0 1 2.5\n"), ""),
     "ply, index that is no number": (".ply", changed(PLY_BOX, b"3 0 1 3\n", b"3 0 1 x\n"), ""),
     "ply, no faces": (".ply", ply(BOX_VERTICES, []), "no faces|no triangles"),
@@ -830,9 +844,7 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "gifti text, a triangle too many": (".gii", changed(GII_TEXT, b'Dim0="12"', b'Dim0="13"'), ""),
     "gifti, pairs of indices": (
         ".gii",
-        changed(GII_BOX, b'Dim0="12" Dim1="3"', b'Dim0="18" Dim1="2"')
-        if b'Dim0="12" Dim1="3"' in GII_BOX
-        else gifti(BOX_VERTICES, INT_TRIANGLES.reshape(-1, 2)),
+        gifti(BOX_VERTICES, INT_TRIANGLES.reshape(-1, 2)),
         r"\(18, 2\)",
     ),
     "gifti, an array that is not there": (
@@ -891,17 +903,16 @@ def test_content_that_is_no_mesh_is_refused(tmp_path: Path, ending: str, content
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("name", BOXES)
-def test_a_mesh_under_another_format_s_name_is_refused(tmp_path: Path, ending: str, name: str) -> None:
+def test_a_mesh_under_another_format_s_name_is_refused(tmp_path: Path, name: str) -> None:
     own, content = BOXES[name]
-    if ending == own or {ending, own} == {".gltf", ".glb"}:
-        pytest.skip("its own name")
-    path = tmp_path / f"scan{ending}"
-    path.write_bytes(content)
-    with pytest.raises(MeshError) as caught:
-        read_mesh(path)
-    assert str(caught.value).startswith(f"{path}: ")
+    # The two forms of glTF can be told apart by their first bytes.
+    for ending in set(FORMATS) - ({".gltf", ".glb"} if own in (".gltf", ".glb") else {own}):
+        path = tmp_path / f"scan{ending}"
+        path.write_bytes(content)
+        with pytest.raises(MeshError) as caught:
+            read_mesh(path)
+        assert str(caught.value).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize("ending", [*FORMATS, ".ply.gz", ".off.gz"])
@@ -996,9 +1007,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", BOXES)
-@settings(
-    derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_random_damage_raises_nothing_but_mesh_errors(tmp_path: Path, name: str, data: st.DataObject) -> None:
     ending, content = BOXES[name]
@@ -1006,7 +1015,9 @@ def test_random_damage_raises_nothing_but_mesh_errors(tmp_path: Path, name: str,
     changed = bytearray(content)
     for _ in range(data.draw(st.integers(1, 4))):
         # Digits into digits would make counts of many gigabytes, which are another test's matter.
-        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255).filter(lambda x: not 48 <= x < 58))
+        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(
+            st.integers(0, 255).filter(lambda x: not 48 <= x < 58)
+        )
     path.write_bytes(bytes(changed))
     try:
         mesh = read_mesh(path)
@@ -1016,8 +1027,3 @@ def test_random_damage_raises_nothing_but_mesh_errors(tmp_path: Path, name: str,
         assert np.isfinite(mesh.vertices).all()
         assert mesh.triangles.min() >= 0
         assert mesh.triangles.max() < len(mesh.vertices)
-
-
-def test_what_a_file_says_of_itself_is_json_free_of_surprises() -> None:
-    # A guard of this module: the scenes above are built from one tree, which tests change.
-    assert json.loads(box_scene().gltf())["accessors"][1]["count"] == 36

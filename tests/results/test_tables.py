@@ -1,0 +1,132 @@
+"""Tables and pictures from a store put together by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sobolev_batch import InputError, StoreError, open_store
+from sobolev_batch.results.plots import convergence_figure, plot_store, transform_figure
+from sobolev_batch.results.tables import convergence_frame, format_table
+
+MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
+
+
+@pytest.fixture
+def tree() -> xr.DataTree:
+    """Two levels, a failed one, and the reference; distances 0.4 and 0.1 at edge lengths 0.2 and 0.1."""
+    distance = np.array([[0.4, 0.8], [0.1, 0.2], [np.nan, np.nan], [0.0, 0.0]])
+    rate = np.array([[np.nan, np.nan], [2.0, 2.0], [np.nan, np.nan], [np.nan, np.nan]])
+    convergence = xr.Dataset(
+        {
+            "distance": (("mesh", "order"), distance),
+            "relative": (("mesh", "order"), distance / 4),
+            "rate": (("mesh", "order"), rate),
+            "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan]),
+        },
+        coords={"mesh": MESHES, "order": [-10.0, -2.5]},
+        attrs={"reference": "reference"},
+    )
+    meshes = xr.Dataset(
+        {
+            "family": ("mesh", ["f_1", "f_1", "f_1", "reference"]),
+            "name": ("mesh", ["0", "1", "2", "reference"]),
+            "level": ("mesh", [0, 1, 2, -1]),
+            "status": ("mesh", ["complete", "complete", "failed", "complete"]),
+            "reason": ("mesh", ["", "", "no 50% of it | is <there>", ""]),
+            "triangles": ("mesh", [20, 1280, 0, 0]),
+        },
+        coords={"mesh": MESHES},
+    )
+    axis = np.linspace(-2, 2, 5)
+    values = np.arange(4 * 5 * 5 * 3).reshape(4, 5, 5, 3) + 0j
+    fourier = xr.Dataset(
+        {"fourier": (("mesh", "xi_x", "xi_y", "xi_z"), values)},
+        coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:]},
+    )
+    return xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
+
+
+def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
+    text = format_table(tree, "text", [-2.5])
+    assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
+    rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
+    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "2.000000e-01"]
+    assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "5.000000e-02", "2.000"]
+    assert rows[2] == ["f_1/2", *["missing"] * 5]
+    assert text.endswith("f_1/2 is failed: no 50% of it | is <there>")
+
+
+def test_every_order_gets_a_table(tree: xr.DataTree) -> None:
+    for style in ("text", "markdown", "latex"):
+        text = format_table(tree, style)  # type: ignore[arg-type]
+        assert text.index("order -10") < text.index("order -2.5")
+        assert text.count("f\\_1" if style == "latex" else "f_1") >= 6
+
+
+def test_programs_get_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) -> None:
+    records = json.loads(format_table(tree, "json", [-10.0]))
+    assert records[2]["distance"] is None
+    assert records[2]["reason"] == "no 50% of it | is <there>"
+    assert records[1]["rate"] == 2.0
+    lines = format_table(tree, "csv", [-10.0]).splitlines()
+    assert len(lines) == 4
+    assert lines[3].endswith(",,,,")
+
+
+def test_latex_escapes_labels(tree: xr.DataTree) -> None:
+    assert r"f\_1/0" in format_table(tree, "latex")
+
+
+def test_frame_is_long_and_leaves_the_reference_out(tree: xr.DataTree) -> None:
+    frame = convergence_frame(tree)
+    assert len(frame) == 6
+    assert set(frame["mesh"]) == set(MESHES[:3])
+    assert frame.query("order == -10 and level == 1")["relative"].item() == pytest.approx(0.025)
+
+
+def test_unknown_orders_and_unfinished_stores(tree: xr.DataTree) -> None:
+    with pytest.raises(InputError, match=r"no order -3, only -10, -2\.5"):
+        format_table(tree, "text", [-3.0])
+    with pytest.raises(InputError, match="no tables yet"):
+        format_table(xr.DataTree())
+
+
+def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTree) -> None:
+    figure = convergence_figure(tree)
+    assert [axes.get_title() for axes in figure.axes] == ["order -10", "order -2.5"]
+    axes = figure.axes[0]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
+    assert labels == ["f_1", "slope 2"]
+    data = axes.lines[0].get_xydata()
+    assert np.allclose(data, [[0.1, 0.025], [0.2, 0.1]])
+    slope = np.asarray(axes.lines[1].get_xydata())
+    assert np.log(slope[1, 1] / slope[0, 1]) / np.log(2) == pytest.approx(2.0)
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+
+
+def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
+    axes = transform_figure(tree).axes[0]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
+    assert labels == ["f_1/0", "f_1/1", "reference"]
+    data = np.asarray(axes.lines[1].get_xydata())
+    assert np.array_equal(data[:, 0], [0.0, 1.0, 2.0])
+    # Row 1, xi_y = xi_z = 0: strides of 75, 15, 3 and 1.
+    assert np.array_equal(data[:, 1], 75 + 15 * np.array([2, 3, 4]) + 6)
+
+
+def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:
+    for path in plot_store(tree, tmp_path / "new" / "folder"):
+        assert path.read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="pictures cannot be written there"):
+        plot_store(tree, tmp_path / "file")
+
+
+def test_opening_nothing(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no store of a study is there"):
+        open_store(tmp_path)

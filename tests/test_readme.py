@@ -1,0 +1,43 @@
+"""The README's examples run as they stand."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import sobolev_batch as sb
+
+ROOT = Path(__file__).parents[1]
+
+
+def blocks(path: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / path).read_text(encoding="utf-8"), re.M | re.S)
+
+
+def test_the_study_file_is_valid(tmp_path: Path) -> None:
+    (study,) = blocks("README.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert sb.Study.from_toml(tmp_path / "study.toml").orders == (-2.0, -4.0)
+
+
+def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
+    (example,) = blocks("README.md", "python")
+    small = (ROOT / "workflows" / "icosphere.toml").read_text().replace("M = 128", "M = 32")
+    (tmp_path / "workflows").mkdir()
+    (tmp_path / "workflows" / "icosphere.toml").write_text(small.replace("3, 4, 5, 6, 7]", "3]"))
+    # The first block of store.md opens the store, the others query it.
+    queries = "".join(blocks("docs/store.md", "python"))
+    indented = "".join(f"    {line}\n" for line in queries.splitlines())
+    (tmp_path / "example.py").write_text(example + indented)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "example.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"icosphere/3 +0\.00", done.stdout)
