@@ -17,7 +17,11 @@ import numpy as np
 from nibabel.gifti import GiftiDataArray
 from numpy.typing import ArrayLike
 
+from tests.surfaces.shapes import BOX_TRIANGLES, BOX_VERTICES
+
 Faces = Sequence[Sequence[int]]
+
+LITTLE, BIG = "binary_little_endian", "binary_big_endian"
 
 _STRUCT_CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I"}
 _STRUCT_CODES |= {"float": "f", "double": "d"}
@@ -56,7 +60,7 @@ def ply(
     if encoding == "ascii":
         lines = [numbers(row) for row in rows] + [" ".join(map(str, [len(face), *face])) for face in faces]
         return start + "".join(f"{line}\n" for line in lines).encode()
-    order = "<" if encoding == "binary_little_endian" else ">"
+    order = "<" if encoding == LITTLE else ">"
     body = b"".join(struct.pack(order + _STRUCT_CODES[real] * len(row), *row) for row in rows)
     for face in faces:
         body += struct.pack(f"{order}{_STRUCT_CODES[length]}", len(face))
@@ -216,3 +220,33 @@ def gifti(
             GiftiDataArray(np.asarray(faces), intent="NIFTI_INTENT_TRIANGLE", encoding=encoding, ordering=ordering)
         )
     return bytes(nibabel.GiftiImage(darrays=arrays).to_bytes())
+
+
+# Each as the end of the file's name and its bytes.
+Content = tuple[str, bytes]
+
+
+def box_scene() -> Gltf:
+    """The box as a scene of one node; a fresh one, open to changes."""
+    return Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}])
+
+
+BOXES: dict[str, Content] = {
+    "ply ascii float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES)),
+    "ply ascii double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, real="double")),
+    "ply little float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE)),
+    "ply little double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, real="double", index="uint")),
+    "ply big float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, index="ushort")),
+    "ply big double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, real="double", length="int")),
+    "obj": (".obj", obj(BOX_VERTICES, BOX_TRIANGLES)),
+    "off": (".off", off(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl ascii": (".stl", stl_text(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl binary": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl binary that starts with solid": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES, b"solid box")),
+    "gltf": (".gltf", box_scene().gltf()),
+    "glb": (".glb", box_scene().glb()),
+    "gifti gzipped": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))),
+    "gifti base64": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_B64BIN")),
+    "gifti ascii": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII")),
+    "gifti by columns": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), ordering="F")),
+}

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.surfaces.mesh import MeshCounts
 
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -24,10 +25,14 @@ BOX_QUADS: list[list[int]] = [
     [1, 5, 7, 3],
 ]
 BOX_TRIANGLES: list[list[int]] = [[q[0], q[i], q[i + 1]] for q in BOX_QUADS for i in (1, 2)]
+# Three sides of the box in one piece, three in two.
+BOX_MIXED: list[list[int]] = [*BOX_QUADS[:3], *BOX_TRIANGLES[6:]]
 BOX_AREA = 28.0
 
 # The same box with coordinates that need all digits of double precision.
 AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
+
+CLOSED = MeshCounts(zero_area=0, duplicate=0, boundary_edges=0, nonmanifold_edges=0)
 
 TETRAHEDRON_VERTICES: Reals = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=np.float64)
 TETRAHEDRON_TRIANGLES: list[list[int]] = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]

@@ -36,7 +36,7 @@ def test_the_surface_is_closed_and_lies_on_the_sphere(level: int) -> None:
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 4 * np.finfo(float).eps
     # Symmetric about the origin.
     assert np.abs(mesh.vertices.mean(axis=0)).max() < 1e-15
-    a, b, c = mesh.corners
+    a, b, c = mesh.corners()
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
     assert (np.sign(volumes) == np.sign(volumes[0])).all()
     assert abs(volumes.sum()) < 4 / 3 * math.pi

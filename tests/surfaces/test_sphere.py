@@ -40,7 +40,8 @@ def test_a_center_must_be_three_finite_numbers(center: Any) -> None:
 
 def test_numbers_of_any_kind_become_floats() -> None:
     given: Any = np.array([1, 2, 3], dtype=np.int8)
-    sphere = Sphere(np.float32(2), given)
+    radius: Any = np.float32(2)
+    sphere = Sphere(radius, given)
     assert sphere == Sphere(2.0, (1.0, 2.0, 3.0))
     assert type(sphere.radius) is float
     assert type(sphere.center) is tuple
