@@ -58,19 +58,23 @@ class Reducer:
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> Reals:
         """Distances of rows to other rows, (orders, rows, others)."""
+        same = tuple(rows) == tuple(others)
         products = np.zeros((len(self.orders), len(rows), len(others)))
         squares = np.zeros((2, len(self.orders), max(len(rows), len(others))))
         for block in self.blocks:
             place = self.lattice.place(block)
             center = 0.0 if self.center is None else self.store.read_fields([self.center], place)
             first = self._differences(rows, place, center)
-            second = first if tuple(rows) == tuple(others) else self._differences(others, place, center)
+            second = first if same else self._differences(others, place, center)
             products += gram_blocks(first, second, self.lattice, block, self.orders)
             weights = shell_weights(self.lattice, self.orders)
             for side, fields in enumerate((first, second)):
                 for i, field in enumerate(fields):
                     sums = shell_sums(field.reshape(block.shape), None, self.lattice, block)
                     squares[side, :, i] += weights @ sums
+        if same:
+            # Each half of a weighted product rounds in its own way; a distance matrix is symmetric.
+            products = (products + np.swapaxes(products, 1, 2)) / 2
         found, cancelled = squared_distances(products, squares[0][:, : len(rows)], squares[1][:, : len(others)])
         for i, j in np.argwhere(cancelled).tolist():
             found[:, i, j] = self._direct(rows[i], others[j])
