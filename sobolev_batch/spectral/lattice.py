@@ -100,14 +100,18 @@ class Lattice:
         x, y, z = (self.spacing * block.indices(axis).astype(np.float64) for axis in range(3))
         return x, y, z
 
-    def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
-        """Weights of the trapezoidal rule over the whole cube, for a block of its half, (block.shape).
+    def axis_weights(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Weights of the trapezoidal rule along the three axes of a block, h included.
 
-        The end samples of each axis count half; samples with xi_z > 0 count twice, for themselves
-        and for their conjugates. The factor h^3 is included.
+        Their products integrate over the whole cube from a block of its half: the end samples of
+        each axis count half; samples with xi_z > 0 count twice, for themselves and their conjugates.
         """
         x, y, z = (np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3))
-        z = z * np.where(block.indices(2) > 0, 2.0, 1.0)
+        return x, y, z * np.where(block.indices(2) > 0, 2.0, 1.0)
+
+    def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
+        """The products of the `axis_weights` at each sample of a block, (block.shape)."""
+        x, y, z = self.axis_weights(block)
         weights: NDArray[np.float64] = x[:, None, None] * y[:, None] * z
         return weights
 

@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.readers import read_mesh
+from sobolev_batch.surfaces.readers import companion_files, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, file_digest
 
@@ -28,7 +28,7 @@ class Files(Source):
     """
 
     paths: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False)]
-    distribution: str | None = None
+    distribution: Annotated[str, Field(min_length=1)] | None = None
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """One member per file, sorted by path; named by the file's stem where that tells them apart."""
@@ -64,24 +64,26 @@ class FileMember(Member):
         return read_mesh(self.path)
 
     def fingerprint(self) -> Fingerprint:
-        """The digest of the file's bytes, and its format."""
-        return {"file": file_digest(self.path), "format": "".join(self.path.suffixes).lower()}
+        """The digests of the file's bytes and of those it refers to, and its format."""
+        beside = [file_digest(path) for path in companion_files(self.path)]
+        return {"file": file_digest(self.path), "beside": beside, "format": mesh_format(self.path)}
 
 
 def _matches(folder: Path, path: str) -> list[Path]:
-    if not glob.has_magic(path):
+    # A file may have wildcard characters in its name: one that is there is meant.
+    if not glob.has_magic(path) or (folder / path).is_file():
         return [folder / path]
-    found = [Path(match) for match in glob.glob(str(folder / path), recursive=True) if Path(match).is_file()]
+    found = [folder / match for match in glob.glob(path, root_dir=folder, recursive=True)]
+    found = [match for match in found if match.is_file()]
     if not found:
         raise StudyError(f"the glob {path!r} matches no file below {folder.resolve()}")
     return found
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """Stems, or file names where stems collide, or whole paths where file names do too."""
-    stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
-    same_stem, same_name = Counter(stems), Counter(path.name for path in paths)
-    return [
-        stem if same_stem[stem] == 1 else path.name if same_name[path.name] == 1 else path.as_posix()
-        for stem, path in zip(stems, paths, strict=True)
-    ]
+    """Stems; file names where stems collide, and whole paths where these collide with any other name."""
+    stems = [mesh_stem(path) for path in paths]
+    counts = Counter(stems)
+    names = [stem if counts[stem] == 1 else path.name for stem, path in zip(stems, paths, strict=True)]
+    counts = Counter(names)
+    return [name if counts[name] == 1 else path.as_posix() for name, path in zip(names, paths, strict=True)]

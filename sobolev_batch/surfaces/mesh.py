@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,7 +127,14 @@ class Mesh:
             duplicate &= np.diff(column[order]) == 0
         del order
         count = len(self.vertices)
-        edges = np.concatenate([low * count + middle, middle * count + high, low * count + high])
+        # A triangle that repeats a vertex has fewer than three edges, each once.
+        edges = np.concatenate(
+            [
+                (low * count + middle)[low != middle],
+                (middle * count + high)[middle != high],
+                (low * count + high)[(low != middle) & (middle != high)],
+            ]
+        )
         edges.sort()
         starts = np.flatnonzero(np.diff(edges, prepend=-1))
         sharing = np.diff(starts, append=len(edges))
@@ -149,8 +156,9 @@ class Mesh:
 
     def _smallest_areas(self) -> NDArray[np.float64]:
         """The area of each triangle (m,) that could as well be zero, given the rounding of its sides."""
-        longest: NDArray[np.float64] = self._per_triangle(_longest_sides)
-        return _AREA_RESOLUTION * longest**2
+        with np.errstate(over="ignore"):
+            longest: NDArray[np.float64] = self._per_triangle(_longest_sides)
+            return np.asarray(_AREA_RESOLUTION * longest**2)
 
     def _per_triangle(self, measure: Callable[[Corners], NDArray[np.float64]]) -> NDArray[np.float64]:
         """A measure of all triangles, taken slice by slice: corners of millions at once take gigabytes."""
@@ -186,20 +194,31 @@ def _centroid_radii(corners: Corners) -> NDArray[np.float64]:
     return radii
 
 
+def _array(values: ArrayLike, name: str) -> NDArray[Any]:
+    if np.ma.is_masked(values):
+        raise MeshError(f"{name} have masked entries")
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
+
+
 def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
-    found = np.asarray(vertices)
+    found = _array(vertices, "vertices")
     if found.dtype.kind not in "fiu":
         raise MeshError(f"vertices must be real numbers, found dtype {found.dtype}")
     if found.ndim != 2 or found.shape[1] != 3:
         raise MeshError(f"vertices must have shape (n, 3), found {found.shape}")
-    bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    with np.errstate(over="ignore"):
+        converted = np.array(found, dtype=np.float64, order="C")
+    bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
     if bad.size:
         raise MeshError(f"{bad.size} of {len(found)} vertices have NaN or infinite coordinates: {_listed(bad, found)}")
-    return _frozen(np.array(found, dtype=np.float64, order="C"))
+    return _frozen(converted)
 
 
 def _check_triangles(triangles: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
-    found = np.asarray(triangles)
+    found = _array(triangles, "triangles")
     if found.size == 0:
         raise MeshError("the mesh has no triangles")
     if found.dtype.kind not in "iu":

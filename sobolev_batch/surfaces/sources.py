@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points, version
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +89,18 @@ def file_digest(path: Path) -> str:
 
 
 def library_version(distribution: str) -> str:
-    """The installed version of a library whose output is part of a surface."""
-    return version(distribution)
+    """The installed version of a library whose output is part of a surface.
+
+    Raises:
+        MeshError: it is not installed.
+    """
+    try:
+        return version(distribution)
+    except PackageNotFoundError as error:
+        raise MeshError(
+            f"this source needs the library {distribution}, which is not installed; "
+            "the extra has it: pip install 'sobolev-batch[studies]'"
+        ) from error
 
 
 class NestedSource(Source):
@@ -126,7 +136,7 @@ def parse_source(table: Mapping[str, Any]) -> Source:
         raise StudyError(f"no source is named {name!r}; known are {', '.join(sorted(registry))}")
     try:
         source_type = registry[name].load()
-    except ImportError as error:
+    except (ImportError, AttributeError) as error:
         raise StudyError(f"the source {name!r} cannot be loaded: {error}") from error
     if not (isinstance(source_type, type) and issubclass(source_type, Source)):
         raise StudyError(f"the entry point of the source {name!r} is not a subclass of Source: {registry[name].value}")

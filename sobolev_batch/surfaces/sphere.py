@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 from sobolev_batch.errors import InputError
+
+# The square of a larger one overflows.
+_LARGEST_RADIUS = 1e150
+
+
+def is_finite_number(value: object) -> bool:
+    """Whether a value is a finite real number, and no truth value."""
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -21,9 +30,11 @@ class Sphere:
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.radius) and self.radius > 0):
+        if not (is_finite_number(self.radius) and self.radius > 0):
             raise InputError(f"a sphere's radius must be positive and finite, found {self.radius}")
-        if len(self.center) != 3 or not all(math.isfinite(x) for x in self.center):
+        if float(self.radius) > _LARGEST_RADIUS:
+            raise InputError(f"a sphere's radius must be at most {_LARGEST_RADIUS:g}, found {self.radius}")
+        if len(self.center) != 3 or not all(map(is_finite_number, self.center)):
             raise InputError(f"a sphere's center must be three finite numbers, found {self.center}")
         object.__setattr__(self, "radius", float(self.radius))
         object.__setattr__(self, "center", tuple(float(x) for x in self.center))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, run
@@ -30,6 +31,11 @@ def small_table(**changes: Any) -> dict[str, Any]:
         "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]}],
     }
     return {**table, **changes}
+
+
+def variable(tree: xr.DataTree, group: str, name: str) -> xr.DataArray:
+    """A variable of one group of a store."""
+    return tree[group].to_dataset()[name]
 
 
 @pytest.fixture

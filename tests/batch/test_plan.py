@@ -70,7 +70,7 @@ def test_keys_follow_what_a_field_depends_on(box_file: Path) -> None:
         family = {"name": "f", "source": "files", "paths": ["box.off"]}
         reference = {"source": "sphere", "radius": 20.0}
         plan = plan_of(**{"family": [family], "reference": reference, **changes}, folder=box_file.parent)
-        return next(row.key for row in plan.rows if row.label == "f/box")
+        return str(next(row.key for row in plan.rows if row.label == "f/box"))
 
     before = key()
     assert key(norm={"orders": [-7.0]}) == before

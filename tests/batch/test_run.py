@@ -13,7 +13,7 @@ from sobolev_batch import Mesh, Sphere, StoreError, Study, distance, fourier_tra
 from sobolev_batch.batch import plan as plan_module
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
-from tests.batch.conftest import small_table
+from tests.batch.conftest import small_table, variable
 
 
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
@@ -21,19 +21,19 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     study = Study.from_table(small_table())
     sphere = fourier_transform(Sphere(), study.lattice)
     for level in range(4):
-        field = tree["fourier"]["fourier"].sel(mesh=f"ico/{level}").drop_vars("mesh")
+        field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars("mesh")
         expected = fourier_transform(icosphere(level), study.lattice, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
-        found = tree["convergence"]["distance"].sel(mesh=f"ico/{level}").values
+        found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
         assert found == pytest.approx(distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
         # A field straight from the store serves as an argument too.
         assert distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
-    matrix = tree["distances"]["distance"].sel(order=-10.0).values
+    matrix = variable(tree, "distances", "distance").sel(order=-10.0).values
     assert np.array_equal(matrix, matrix.T)
     assert (matrix.diagonal() == 0).all()
     a, b = (fourier_transform(icosphere(level), study.lattice) for level in (2, 3))
     assert matrix[2, 3] == pytest.approx(distance(a, b, -10.0)["distance"].item(), rel=1e-9)
-    rates = tree["convergence"]["rate"].sel(order=-10.0).values
+    rates = variable(tree, "convergence", "rate").sel(order=-10.0).values
     assert np.isnan(rates[[0, 4]]).all()
     assert rates[3] == pytest.approx(2.0, abs=0.02)
 
@@ -79,7 +79,7 @@ def test_only_what_changed_is_computed_again(client: Client, tmp_path: Path, sto
     trimesh.creation.box((1.0, 1.0, 0.5)).export(tmp_path / "b.off")
     assert go() == ("f/b",)
     assert go(norm={"orders": [-7.0]}) == ()
-    assert open_store(store_path)["convergence"]["order"].values.tolist() == [-7.0]
+    assert variable(open_store(store_path), "convergence", "order").values.tolist() == [-7.0]
     assert go(transform={"eps": 1e-7}) == ("f/a", "f/b", "reference")
 
 
@@ -96,10 +96,10 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     assert "holds only |coordinate| <" in summary.failed["f/large"]
     assert "cannot be read" in summary.failed["f/missing"]
     tree = open_store(store_path)
-    assert np.isnan(tree["convergence"]["distance"].sel(mesh=["f/bad", "f/large", "f/missing"]).values).all()
-    assert np.isfinite(tree["convergence"]["distance"].sel(mesh="f/good").values).all()
-    assert np.isnan(tree["distances"]["distance"].sel(mesh="f/good", other="f/bad").values).all()
-    assert tree["meshes"]["status"].sel(mesh="f/bad").item() == "failed"
+    assert np.isnan(variable(tree, "convergence", "distance").sel(mesh=["f/bad", "f/large", "f/missing"]).values).all()
+    assert np.isfinite(variable(tree, "convergence", "distance").sel(mesh="f/good").values).all()
+    assert np.isnan(variable(tree, "distances", "distance").sel(mesh="f/good", other="f/bad").values).all()
+    assert variable(tree, "meshes", "status").sel(mesh="f/bad").item() == "failed"
     # Mended, it is computed, and nothing else is.
     trimesh.creation.box().export(tmp_path / "bad.off")
     assert run(study, store_path, client).computed == ("f/bad",)
@@ -112,9 +112,9 @@ def test_meshes_added_to_a_study_join_its_store(client: Client, store_path: Path
     summary = run(Study.from_table({**table, "family": more}), store_path, client)
     assert summary.computed == ("late/sphere",)
     tree = open_store(store_path)
-    assert tree["convergence"]["distance"].sizes["mesh"] == 6
+    assert variable(tree, "convergence", "distance").sizes["mesh"] == 6
     exact = distance(Sphere(0.5), Sphere(), -10.0)["distance"].item()
-    found = tree["convergence"]["distance"].sel(mesh="late/sphere", order=-10.0).item()
+    found = variable(tree, "convergence", "distance").sel(mesh="late/sphere", order=-10.0).item()
     assert found == pytest.approx(exact, rel=1e-6)
 
 
@@ -126,18 +126,22 @@ def test_lattices_of_several_chunks(
     chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))
     assert len(chunks) > 1
     blocks, whole = open_store(store_path), open_store(finished_store)
-    assert np.allclose(blocks["fourier"]["fourier"].values, whole["fourier"]["fourier"].values, rtol=0, atol=1e-8)
+    assert np.allclose(
+        variable(blocks, "fourier", "fourier").values, variable(whole, "fourier", "fourier").values, rtol=0, atol=1e-8
+    )
     for group, name in (("convergence", "distance"), ("norms", "norm"), ("distances", "distance")):
-        assert np.allclose(blocks[group][name].values, whole[group][name].values, rtol=1e-6, atol=1e-9)
+        assert np.allclose(
+            variable(blocks, group, name).values, variable(whole, group, name).values, rtol=1e-6, atol=1e-9
+        )
 
 
 def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
     table = small_table(norm={"orders": [-10.0, -3.0], "pairs": "reference"})
     run(Study.from_table(table), store_path, client)
-    found = open_store(store_path)["distances"]["distance"]
+    found = variable(open_store(store_path), "distances", "distance")
     assert found["other"].values.tolist() == ["reference"]
-    whole = open_store(finished_store)["distances"]["distance"].sel(other=["reference"])
-    assert np.allclose(found.values, whole.values, rtol=1e-12, atol=0)
+    whole = variable(open_store(finished_store), "distances", "distance").sel(other=["reference"])
+    assert np.allclose(found.to_numpy(), whole.to_numpy(), rtol=1e-12, atol=0)
 
 
 def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path: Path) -> None:
@@ -152,7 +156,7 @@ def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path
     family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
     table = small_table(family=family, transform={"eps": 1e-13}, norm={"orders": [-3.0]})
     run(Study.from_table(table, folder=tmp_path), store_path, client)
-    found = open_store(store_path)["distances"]["distance"].sel(mesh="f/a", other="f/b", order=-3.0).item()
+    found = variable(open_store(store_path), "distances", "distance").sel(mesh="f/a", other="f/b", order=-3.0).item()
     # Twins apart by 1e-7 against the same pair apart by 1e-4, where nothing cancels.
     lattice = Study.from_table(table).lattice
     wide = Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)

@@ -63,7 +63,7 @@ def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
 
 def test_every_order_gets_a_table(tree: xr.DataTree) -> None:
     for style in ("text", "markdown", "latex"):
-        text = format_table(tree, style)  # type: ignore[arg-type]
+        text = format_table(tree, style)
         assert text.index("order -10") < text.index("order -2.5")
         assert text.count("f\\_1" if style == "latex" else "f_1") >= 6
 

@@ -7,13 +7,14 @@ import pytest
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.gram import gram_blocks, squared_distances
+from sobolev_batch.surfaces.similarity import Surface
 
 LATTICE = Lattice(4.0, 24)
 ORDERS = (-2.0, -7.5)
 
 
 def test_blocks_of_products_give_every_distance() -> None:
-    surfaces = [icosphere(0), icosphere(1), icosphere(3), Sphere(0.9)]
+    surfaces: list[Surface] = [icosphere(0), icosphere(1), icosphere(3), Sphere(0.9)]
     fields = [fourier_transform(surface, LATTICE) for surface in surfaces]
     center = fourier_transform(Sphere(), LATTICE)
     products = np.zeros((2, 4, 4))

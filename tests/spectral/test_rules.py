@@ -21,7 +21,7 @@ def monomial_error(rule: TriangleRule, degree: int) -> float:
             found = rule.weights @ np.prod(rule.barycentric ** np.array([a, b, c]), axis=1)
             exact = 2 * factorial(a) * factorial(b) * factorial(c) / factorial(degree + 2)
             errors.append(abs(found - exact))
-    return max(errors)
+    return float(max(errors))
 
 
 @pytest.mark.parametrize("degree", range(1, HIGHEST_DEGREE + 1))

@@ -1,0 +1,219 @@
+"""glTF 2.0 scenes, text and binary, as far as they are about triangles.
+
+Read here since the library at hand leaves out primitives, placements and encodings in silence. What
+this module does not understand it refuses. Specification: Khronos Group, "glTF 2.0" (2021).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.polygons import merge_coincident
+
+Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Required extensions that leave the positions of vertices as they stand in the accessors.
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "KHR_xmp")
+
+
+def parse_gltf(data: bytes, path: Path) -> Raw:
+    """Vertices and triangles of the default scene, in its own frame; coinciding vertices are merged.
+
+    Args:
+        data: the file, .gltf or .glb.
+        path: where it lies; buffers in files of their own are found from there.
+
+    Raises:
+        MeshError: a damaged file, a buffer outside the file's folder, or something that this reader
+            does not understand.
+    """
+    tree, binary = _document(data)
+    required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
+    if required:
+        raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
+    buffers = _Buffers(tree, binary, path)
+    parts = [
+        (vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles)
+        for matrix, mesh in _placed_meshes(tree)
+        for vertices, triangles in _primitives(tree["meshes"][mesh], buffers)
+    ]
+    if not parts:
+        raise MeshError("the file's scene has no faces")
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    triangles = np.concatenate([part[1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
+    return merge_coincident(np.concatenate([vertices for vertices, _ in parts]), triangles)
+
+
+def buffer_paths(data: bytes, path: Path) -> list[Path]:
+    """The files beside a glTF file that hold its buffers.
+
+    Raises:
+        MeshError: a damaged file, or a buffer outside the file's folder.
+    """
+    tree, _ = _document(data)
+    uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
+    return [_beside(path, uri) for uri in uris if uri is not None and not uri.startswith("data:")]
+
+
+class _Buffers:
+    """The accessors of a document, read from buffers that are loaded when first needed."""
+
+    def __init__(self, tree: dict[str, Any], binary: bytes | None, path: Path) -> None:
+        self._tree, self._binary, self._path = tree, binary, path
+        self._loaded: dict[int, bytes] = {}
+
+    def array(self, index: int, kind: str) -> NDArray[Any]:
+        """The values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
+        accessor = self._tree["accessors"][index]
+        if accessor["type"] != kind:
+            raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
+        if "sparse" in accessor or accessor.get("normalized") or "bufferView" not in accessor:
+            raise MeshError(f"accessor {index} is sparse, normalized or without data: not supported, export it plainly")
+        view = self._tree["bufferViews"][accessor["bufferView"]]
+        dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
+        stride = view.get("byteStride", dtype.itemsize * width)
+        offset = accessor.get("byteOffset", 0)
+        needed = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
+        if min(offset, count, stride) < 0 or needed > view["byteLength"]:
+            raise MeshError(
+                f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold"
+            )
+        start = view.get("byteOffset", 0)
+        held = self._bytes(view["buffer"])
+        if start < 0 or start + view["byteLength"] > len(held):
+            raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(held)}")
+        values: NDArray[Any] = np.ndarray((count, width), dtype, held, start + offset, (stride, dtype.itemsize))
+        return values[:, 0] if kind == "SCALAR" else values
+
+    def _bytes(self, index: int) -> bytes:
+        if index not in self._loaded:
+            uri = self._tree["buffers"][index].get("uri")
+            announced = self._tree["buffers"][index]["byteLength"]
+            found = self._load(index, uri)
+            if len(found) < announced:
+                raise MeshError(f"buffer {index} announces {announced} bytes, found {len(found)}")
+            self._loaded[index] = found
+        return self._loaded[index]
+
+    def _load(self, index: int, uri: str | None) -> bytes:
+        if uri is None:
+            if index != 0 or self._binary is None:
+                raise MeshError(f"buffer {index} has no data")
+            return self._binary
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        beside = _beside(self._path, uri)
+        try:
+            return beside.read_bytes()
+        except OSError as error:
+            raise MeshError(f"its buffer {beside.name} cannot be read: {error.strerror}") from error
+
+
+def _beside(path: Path, uri: str) -> Path:
+    name = unquote(uri)
+    if "://" in name or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise MeshError(f"its buffer {uri[:80]!r} lies outside the file's folder")
+    return path.parent / name
+
+
+def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
+    """The JSON of a file and, of a binary one, its second chunk."""
+    binary = None
+    if data[:4] == b"glTF":
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != 2 or length != len(data):
+            raise MeshError(
+                f"a GLB file of version {version} and {length} bytes, found {len(data)}; expected version 2"
+            )
+        size = struct.unpack_from("<I", data, 12)[0]
+        rest = data[20 + size :]
+        if rest:
+            binary_size = struct.unpack_from("<I", rest, 0)[0]
+            binary = rest[8 : 8 + binary_size]
+            if len(binary) != binary_size:
+                raise MeshError(f"a GLB chunk announces {binary_size} bytes, found {len(binary)}")
+        data = data[20 : 20 + size]
+    tree = json.loads(data.decode("utf-8"))
+    if not isinstance(tree, dict):
+        raise MeshError("the file's JSON is not an object")
+    return tree, binary
+
+
+def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[NDArray[np.float64], int]]:
+    """Each mesh of the default scene with the matrix that places it."""
+    nodes = tree.get("nodes", [])
+    scenes = tree.get("scenes")
+    if scenes:
+        roots = scenes[tree.get("scene", 0)].get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in children]
+    waiting = [(index, np.eye(4)) for index in reversed(roots)]
+    seen: set[int] = set()
+    while waiting:
+        index, above = waiting.pop()
+        if index in seen or not 0 <= index < len(nodes):
+            raise MeshError(f"node {index} of the scene is missing or has two parents")
+        seen.add(index)
+        matrix = above @ _matrix(nodes[index])
+        waiting += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
+        if "mesh" in nodes[index]:
+            yield matrix, nodes[index]["mesh"]
+
+
+def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= node.get("scale", (1.0, 1.0, 1.0))
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def _primitives(mesh: dict[str, Any], buffers: _Buffers) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    """Positions and triangles of each primitive that has any; points and lines have no area."""
+    for primitive in mesh["primitives"]:
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode not in (_TRIANGLES, _STRIP, _FAN):
+            continue
+        vertices = buffers.array(primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
+        if "indices" in primitive:
+            corners = buffers.array(primitive["indices"], "SCALAR").astype(np.int64)
+        else:
+            corners = np.arange(len(vertices), dtype=np.int64)
+        triangles = _triangles(corners, mode)
+        bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
+        if bad.size:
+            raise MeshError(
+                f"{bad.size} of {len(triangles)} triangles of a part have indices outside 0..{len(vertices) - 1}"
+            )
+        yield vertices, triangles
+
+
+def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise MeshError(f"{len(corners)} indices make no whole triangles")
+        return corners.reshape(-1, 3)
+    if mode == _STRIP:
+        return np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    return np.stack([np.broadcast_to(corners[:1], len(corners) - 2), corners[1:-1], corners[2:]], axis=1)

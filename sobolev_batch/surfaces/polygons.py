@@ -1,0 +1,55 @@
+"""Polygons into triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sobolev_batch.errors import MeshError
+
+
+def fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones.
+
+    Args:
+        corners: vertex indices of all polygons, one after the other.
+        sizes: the number of corners of each polygon.
+
+    Returns:
+        (m, 3) int64, the triangles of a polygon next to each other.
+
+    Raises:
+        MeshError: no polygons, or one of fewer than three corners.
+    """
+    if not len(sizes):
+        raise MeshError("the file has no faces")
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    starts = np.cumsum(sizes) - sizes
+    polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
+    within = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    first = starts[polygon]
+    return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1)
+
+
+def fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
+    """The same from one sequence of vertex indices per polygon."""
+    if not len(polygons):
+        raise MeshError("the file has no faces")
+    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
+    return fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
+
+
+def merge_coincident(
+    vertices: NDArray[np.floating], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Merge vertices with exactly the same coordinates; for formats that repeat them."""
+    if not np.isfinite(vertices).all():
+        return vertices, triangles  # left for the mesh to refuse, with the entries that are wrong
+    merged, index = np.unique(vertices, axis=0, return_inverse=True)
+    return merged, index.reshape(-1)[triangles]

@@ -1,0 +1,72 @@
+"""STL files, binary and text: a record or a few lines per triangle, read here with every count checked."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.polygons import merge_coincident
+
+Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
+
+_HEADER_BYTES = 84
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def parse_stl(data: bytes) -> Raw:
+    """Vertices and triangles of an STL file; corners that coincide exactly are merged.
+
+    Raises:
+        MeshError: a size that does not fit the announced count, or malformed text.
+    """
+    announced = int.from_bytes(data[80:_HEADER_BYTES], "little")
+    if len(data) >= _HEADER_BYTES and len(data) == _HEADER_BYTES + _RECORD.itemsize * announced:
+        corners = np.frombuffer(data, _RECORD, offset=_HEADER_BYTES)["corners"].reshape(-1, 3)
+    elif data.lstrip()[:5].lower() == b"solid":
+        corners = _text_corners(data)
+    else:
+        held = (len(data) - _HEADER_BYTES) / _RECORD.itemsize
+        raise MeshError(
+            f"a binary STL file of {len(data)} bytes holds {held:.2f} triangles, but its header announces {announced}"
+        )
+    if not len(corners):
+        raise MeshError("the file has no faces")
+    return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+def _text_corners(data: bytes) -> NDArray[np.float64]:
+    corners: list[list[float]] = []
+    facet, within, in_solid = 0, 0, False
+    for line in data.decode("utf-8", errors="replace").split("\n"):
+        words = line.split()
+        match words[0].lower() if words else "":
+            case "":
+                continue
+            case "solid" | "endsolid" as word:
+                in_solid = word == "solid"
+            case "facet":
+                facet, within = facet + 1, 0
+            case "vertex":
+                corners.append(_corner(words[1:], facet))
+                within += 1
+            case "endfacet":
+                if within != 3:
+                    raise MeshError(f"facet {facet} has {within} vertices, expected three")
+                within = 0
+            case "outer" | "endloop":
+                continue
+            case other:
+                raise MeshError(f"after facet {facet}: {other[:40]!r} is no word of an STL file")
+    if in_solid or within:
+        raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
+    return np.array(corners, dtype=np.float64).reshape(-1, 3)
+
+
+def _corner(words: list[str], facet: int) -> list[float]:
+    if len(words) != 3:
+        raise MeshError(f"facet {facet} has a vertex of {len(words)} coordinates, expected three")
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise MeshError(f"facet {facet} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error

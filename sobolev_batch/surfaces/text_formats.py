@@ -1,0 +1,129 @@
+"""OBJ and OFF files, as far as they are about vertices and faces.
+
+Both are read here because the libraries at hand lose or change faces in silence where a line is not
+what they expect; every line and every announced count is checked instead.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.polygons import fans
+
+Raw = tuple[NDArray[np.float64], NDArray[np.int64]]
+
+# x y z, with a weight, a colour, or both.
+_OBJ_VERTEX_SIZES = (3, 4, 6, 7)
+# Numbers per vertex line beside x y z, and per face line behind the corners: a colour or its index.
+_OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
+_OFF_FACE_EXTRAS = (0, 1, 3, 4)
+
+
+def parse_obj(data: bytes) -> Raw:
+    """Vertices (n, 3) and triangles (m, 3) of an OBJ file; all its objects and groups together.
+
+    Raises:
+        MeshError: a vertex or face line that is malformed; the message counts them from 1.
+    """
+    vertices: list[list[float]] = []
+    corners: list[int] = []
+    sizes: list[int] = []
+    for line in _text(data).replace("\\\n", " ").split("\n"):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        if words[0] == "v":
+            if len(words) - 1 not in _OBJ_VERTEX_SIZES:
+                raise MeshError(f"vertex {len(vertices) + 1} has {len(words) - 1} coordinates, expected three")
+            vertices.append(_numbers(words[1:4], f"vertex {len(vertices) + 1}"))
+        elif words[0] == "f":
+            corners += (_obj_corner(word, len(vertices), len(sizes) + 1) for word in words[1:])
+            sizes.append(len(words) - 1)
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), fans(
+        np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
+    )
+
+
+def parse_off(data: bytes) -> Raw:
+    """Vertices (n, 3) and triangles (m, 3) of an OFF file in text.
+
+    Raises:
+        MeshError: counts that do not fit the lines, or a malformed line.
+    """
+    text = _text(data)
+    if text and not text.endswith("\n"):
+        # A last number may have lost digits: nothing else would tell.
+        last = text.rsplit("\n", 1)[-1].partition("#")[0].split()
+        if last and not _complete_face(last):
+            raise MeshError("the OFF file breaks off in its last line")
+    lines = [words for line in text.split("\n") if (words := line.partition("#")[0].split())]
+    kind = re.fullmatch(r"(C?N?)OFF", lines[0][0]) if lines else None
+    if kind is None:
+        raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
+    counts, rows = (lines[0][1:], lines[1:]) if len(lines[0]) > 1 else (lines[1] if lines[1:] else [], lines[2:])
+    if len(counts) not in (2, 3) or not all(count.isdigit() for count in counts):
+        raise MeshError("the OFF header does not announce vertices and faces")
+    vertex_count, face_count = int(counts[0]), int(counts[1])
+    if vertex_count + face_count != len(rows):
+        raise MeshError(
+            f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
+            f"{face_count} for faces, found {len(rows)}"
+        )
+    vertices = [
+        _off_vertex(words, number, 3 + _OFF_EXTRAS[kind[1]]) for number, words in enumerate(rows[:vertex_count], 1)
+    ]
+    polygons = [_off_polygon(words, number) for number, words in enumerate(rows[vertex_count:], 1)]
+    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
+    corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), fans(corners, sizes)
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _numbers(words: list[str], what: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise MeshError(f"{what} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
+
+
+def _integer(word: str, what: str) -> int:
+    try:
+        return int(word)
+    except ValueError as error:
+        raise MeshError(f"{what} has an index that is not an integer: {word[:80]!r}") from error
+
+
+def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
+    """The index from 0 of a corner such as 7, 7/1, 7//3 or -1; negative ones count back from its line."""
+    index = _integer(word.partition("/")[0], f"face {face}")
+    if index == 0:
+        raise MeshError(f"face {face} has the vertex index 0; OBJ counts from 1")
+    if index > 0:
+        return index - 1
+    if index < -vertices_so_far:
+        raise MeshError(f"face {face} counts {-index} vertices back, but only {vertices_so_far} stand before it")
+    return vertices_so_far + index
+
+
+def _off_vertex(words: list[str], number: int, expected: int) -> list[float]:
+    if len(words) != expected:
+        raise MeshError(f"vertex {number} has {len(words)} numbers, expected {expected}")
+    return _numbers(words, f"vertex {number}")[:3]
+
+
+def _off_polygon(words: list[str], number: int) -> list[int]:
+    size = _integer(words[0], f"face {number}")
+    if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
+        raise MeshError(f"face {number} announces {size} corners, but {len(words) - 1} numbers follow")
+    return [_integer(word, f"face {number}") for word in words[1 : 1 + size]]
+
+
+def _complete_face(words: list[str]) -> bool:
+    return words[0].isdigit() and len(words) - 1 - int(words[0]) in _OFF_FACE_EXTRAS
