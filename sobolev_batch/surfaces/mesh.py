@@ -175,7 +175,7 @@ class Mesh:
 def _areas(corners: Corners) -> NDArray[np.float64]:
     a, b, c = corners
     normals = np.cross(b - a, c - a)
-    return 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    return np.asarray(0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals)))
 
 
 def _side_lengths(corners: Corners) -> NDArray[np.float64]:
