@@ -24,6 +24,16 @@ def dask(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
 
 
+def stop(process: subprocess.Popen[str]) -> None:
+    """End a process, by force if it does not go of itself: a worker may wait for a peer that is gone."""
+    process.terminate()
+    try:
+        process.communicate(timeout=20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+
+
 @pytest.fixture
 def tcp_scheduler() -> Iterator[str]:
     """The address of a `dask scheduler` with two `dask worker` processes."""
@@ -39,9 +49,7 @@ def tcp_scheduler() -> Iterator[str]:
         yield address
     finally:
         for process in reversed(processes):
-            process.terminate()
-        for process in processes:
-            process.communicate(timeout=60)
+            stop(process)
 
 
 def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
@@ -75,8 +83,7 @@ def test_a_scheduler_without_workers() -> None:
         with pytest.raises(ClusterError, match="has no workers; start some with: dask worker"), remote_client(address):
             pass
     finally:
-        scheduler.terminate()
-        scheduler.communicate(timeout=60)
+        stop(scheduler)
 
 
 def test_a_local_cluster_listens_on_loopback_only() -> None:
