@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,6 +14,8 @@ from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
+from sobolev_batch.surfaces.files import Files
+from sobolev_batch.surfaces.similarity import Similarity
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]
@@ -40,7 +44,17 @@ def bumpy(rng: np.random.Generator) -> Mesh:
     return Mesh(sphere.vertices * radii[:, None], sphere.triangles)
 
 
-@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy])
+def cortex(rng: np.random.Generator) -> Mesh:
+    pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
+    path = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
+    (member,) = Files(paths=(path,), distribution="nilearn").members(Path())
+    mesh = member.load()
+    scaled = Similarity.to_unit_ball(mesh).apply(mesh)
+    assert isinstance(scaled, Mesh)
+    return scaled
+
+
+@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy, cortex])
 @pytest.mark.parametrize("eps", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
 def test_agrees_with_the_exact_transform_to_a_small_multiple_of_eps(make, eps: float) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(17)
