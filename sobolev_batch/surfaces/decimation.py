@@ -13,7 +13,7 @@ from pydantic import Field
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, library_version, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, installed_version, sole_member
 
 TriangleCounts = Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1, strict=False)]
 
@@ -58,7 +58,7 @@ class DecimatedMember(Member):
         return {
             "decimate": dict(self.original.fingerprint()),
             "triangles": self.triangles,
-            "fast-simplification": library_version("fast-simplification"),
+            "fast-simplification": installed_version("fast-simplification"),
         }
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from sobolev_batch.surfaces.icosphere import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, library_version
+from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, installed_version
 from sobolev_batch.surfaces.sphere import Sphere
 
 Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
@@ -40,7 +40,7 @@ class IcosphereMember(Member):
 
     def fingerprint(self) -> Fingerprint:
         """The level, and the version of the library that subdivides."""
-        return {"icosphere": self.level, "trimesh": library_version("trimesh")}
+        return {"icosphere": self.level, "trimesh": installed_version("trimesh")}
 
 
 class Spheres(Source):

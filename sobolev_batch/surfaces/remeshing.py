@@ -12,7 +12,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.decimation import TriangleCounts, whole_mesh
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, library_version, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, installed_version, sole_member
 
 # Clustering needs several input vertices for each output vertex to make even cells; pyacvd's own
 # advice is to subdivide until there are.
@@ -75,5 +75,5 @@ class RemeshedMember(Member):
         return {
             "remesh": dict(self.original.fingerprint()),
             "triangles": self.triangles,
-            "pyacvd": library_version("pyacvd"),
+            "pyacvd": installed_version("pyacvd"),
         }

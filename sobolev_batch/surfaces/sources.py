@@ -88,7 +88,7 @@ def file_digest(path: Path) -> str:
         raise MeshError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def library_version(distribution: str) -> str:
+def installed_version(distribution: str) -> str:
     """The installed version of a library whose output is part of a surface.
 
     Raises:

@@ -37,7 +37,7 @@ def test_the_fingerprint_of_a_remeshing_names_its_library(monkeypatch: pytest.Mo
     (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
     before = dict(member.fingerprint())
     assert before["triangles"] == 80
-    monkeypatch.setattr("sobolev_batch.surfaces.remeshing.library_version", lambda name: f"{name} 99")
+    monkeypatch.setattr("sobolev_batch.surfaces.remeshing.installed_version", lambda name: f"{name} 99")
     assert "pyacvd 99" in dict(member.fingerprint()).values()
 
 
