@@ -151,7 +151,9 @@ def compare_command(
     found = distance(similarity.apply(first), similarity.apply(second), orders or (-2.0,), lattice=lattice)
     click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
     for order in found["order"].values:
-        click.echo(f"order {order:g}: {found['distance'].sel(order=order).item():.9e}")
+        here = found.sel(order=order)
+        parts = ", ".join(f"{name} {here[name].item():.0e}" for name in ("truncation", "aliasing", "discretisation"))
+        click.echo(f"order {order:g}: {here['distance'].item():.9e} ± {here['error'].item():.0e} ({parts})")
 
 
 def main() -> None:

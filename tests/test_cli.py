@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
     output, errors = (folder / "run.out").read_text(), (folder / "run.err").read_text()
     assert "Sobolev distance of order -10 to reference" in output
-    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d +\S+e-\d\d +\d\.\d{3}\n", output)
+    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \d\.\d{3}\n", output)
     assert "3 computed, 0 reused, 0 failed; store: storage/cli.zarr" in output
     assert re.search(r"dashboard: http://127\.0\.0\.1:\d+/status", errors)
     assert re.search(r"\[3/3\] \S+: complete, \d+\.\d\d s", errors)
@@ -114,7 +114,10 @@ def test_compare_two_files(folder: Path) -> None:
         trimesh.Trimesh(2.0 * mesh.vertices, mesh.triangles, process=False).export(folder / f"{level}.off")
     done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=folder)
     assert done.returncode == 0, done.stderr
-    assert re.match(r"scale 0\.5\d*, origin \S+ \S+ \S+\norder -4: \S+e-01\norder -2: \S+e\+00\n$", done.stdout)
+    assert re.match(
+        r"scale 0\.5\d*, origin \S+ \S+ \S+\norder -4: \S+e-01 ± .*\norder -2: \S+e\+00 ± \S+ \(truncation .*\)\n$",
+        done.stdout,
+    )
 
 
 BAD = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.plan import Row
 from sobolev_batch.batch.records import Facts, Record
+from sobolev_batch.spectral.budget import Assessed
 from sobolev_batch.spectral.convergence import observed_rates
 
 Reals = NDArray[np.float64]
@@ -45,17 +47,17 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     )
 
 
-def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: Reals) -> xr.Dataset:
-    """`norm` (mesh, order) from an array (orders, meshes)."""
-    return xr.Dataset({"norm": (("mesh", "order"), norms.T)}, coords=_coordinates(rows, orders))
+def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: Assessed) -> xr.Dataset:
+    """`norm` (mesh, order) with its error, from values over (orders, meshes)."""
+    return xr.Dataset(_with_errors("norm", ("mesh", "order"), norms), coords=_coordinates(rows, orders))
 
 
 def distances_dataset(
-    rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: Reals
+    rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: Assessed
 ) -> xr.Dataset:
-    """`distance` (mesh, other, order) from an array (orders, meshes, others)."""
+    """`distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
     return xr.Dataset(
-        {"distance": (("mesh", "other", "order"), np.moveaxis(distances, 0, -1))},
+        _with_errors("distance", ("mesh", "other", "order"), distances),
         coords={**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))},
     )
 
@@ -63,39 +65,68 @@ def distances_dataset(
 def convergence_dataset(
     rows: Sequence[Row],
     orders: Sequence[float],
-    to_reference: Reals,
-    reference_norms: Reals,
+    to_reference: Assessed,
+    reference_norms: Assessed,
     sizes: Reals,
     reference: str,
 ) -> xr.Dataset:
-    """Distances to the reference, relative ones, and observed rates within each family.
+    """Distances to the reference, relative ones, and observed rates within each family, all with errors.
 
     Args:
         rows: the meshes.
         orders: s, each.
-        to_reference: (orders, meshes), NaN where missing.
-        reference_norms: (orders,).
+        to_reference: over (orders, meshes), NaN where missing.
+        reference_norms: over (orders,).
         sizes: (meshes,) mean edge lengths.
         reference: label of the reference's row.
     """
-    rates = np.full_like(to_reference, np.nan)
+    distances, errors = to_reference.values, to_reference.errors
+    rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
     for family in dict.fromkeys(row.family for row in rows):
         # Only levels form a sequence; files of one family may be unrelated shapes.
         members = [
             i for i, row in enumerate(rows) if row.family == family and row.member.level >= 0 and row.label != reference
         ]
         for k in range(len(orders)):
-            rates[k, members] = observed_rates(to_reference[k, members], sizes[members])
+            rates[k, members], rate_errors[k, members] = observed_rates(
+                distances[k, members], errors[k, members], sizes[members]
+            )
+    norms, norm_errors = reference_norms.values[:, None], reference_norms.errors[:, None]
+    relative = distances / norms
     return xr.Dataset(
         {
-            "distance": (("mesh", "order"), to_reference.T),
-            "relative": (("mesh", "order"), (to_reference / reference_norms[:, None]).T),
+            **_with_errors("distance", ("mesh", "order"), to_reference),
+            "relative": (("mesh", "order"), relative.T),
+            "relative_error": (("mesh", "order"), (errors / norms + relative * norm_errors / norms).T),
             "rate": (("mesh", "order"), rates.T),
+            "rate_error": (("mesh", "order"), rate_errors.T),
+            "resolved": (("mesh", "order"), (errors < distances).T),
             "edge_length": ("mesh", sizes, {"units": "unit length"}),
         },
         coords=_coordinates(rows, orders),
         attrs={"reference": reference},
     )
+
+
+def _with_errors(name: str, dimensions: tuple[str, ...], found: Assessed) -> dict[str, Any]:
+    """A number, its error and the parts of that; the axis of orders comes last."""
+    parts = {
+        name: found.values,
+        "error": found.errors,
+        "truncation": found.truncation,
+        "aliasing": found.aliasing,
+        "discretisation": found.discretisation,
+    }
+    notes = {
+        "error": f"the true {name} lies within this of the given one",
+        "truncation": f"part of the error: frequencies beyond xi_max, which can only add to the {name}",
+        "aliasing": "part of the error: spacing of the lattice",
+        "discretisation": "part of the error: quadrature and NUFFT",
+    }
+    return {
+        key: (dimensions, np.moveaxis(values, 0, -1), {"description": notes[key]} if key in notes else {})
+        for key, values in parts.items()
+    }
 
 
 def _coordinates(rows: Sequence[Row], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:

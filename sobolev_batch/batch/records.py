@@ -46,6 +46,7 @@ class Record:
         status: "complete" or "failed".
         reason: why it failed; empty otherwise.
         facts: what came out.
+        quality: what the errors of norms need to know of the field, see `Quality.to_json`.
         seconds: time spent in its tasks.
         worker: address of the worker that finished it.
         backend: what computed the transform.
@@ -55,6 +56,7 @@ class Record:
     status: Status
     reason: str = ""
     facts: Facts = Facts()
+    quality: str = ""
     seconds: float = 0.0
     worker: str = ""
     backend: str = ""

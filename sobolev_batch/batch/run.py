@@ -23,6 +23,8 @@ from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
+from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
+from sobolev_batch.spectral.quality import Quality
 
 _log = logging.getLogger(__name__)
 
@@ -139,7 +141,10 @@ def _compute_fields(
     futures: dict[Future, int] = {}
     for i in missing:
         row = rows[i]
-        job = Job(store, i, row.label, row.key, row.member, plan.similarity, plan.study.lattice, plan.study.transform)
+        study = plan.study
+        job = Job(
+            store, i, row.label, row.key, row.member, plan.similarity, study.lattice, study.transform, study.orders
+        )
         futures[_submit(client, job, plan)] = i
     for done, future in enumerate(as_completed(list(futures)), 1):
         i = futures.pop(future)
@@ -171,11 +176,11 @@ def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notif
     reference = next(i for i, row in enumerate(rows) if row.label == plan.reference)
     orders = plan.study.orders
     center = reference if reference in complete else None
-    reducer = Reducer(store, plan.study.lattice, plan.blocks, orders, center)
-    norms, to_reference = (np.full((len(orders), len(rows)), np.nan) for _ in range(2))
+    reducer = _reducer(store, plan, records, center)
+    norms, to_reference = (np.full((4, len(orders), len(rows)), np.nan) for _ in range(2))
     every_pair = plan.study.pairs == "all"
     others = range(len(rows)) if every_pair else [reference]
-    distances = np.full((len(orders), len(rows), len(others)), np.nan)
+    distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
 
     tiles = list(_slices(complete, reducer.rows_per_tile()))
     jobs: dict[Future, tuple[Sequence[int], Sequence[int] | None]] = {
@@ -189,18 +194,33 @@ def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notif
     for done, future in enumerate(as_completed(list(jobs)), 1):
         tile, other = jobs.pop(future)
         if other is None:
-            norms[:, tile], to_reference[:, tile] = future.result()
+            norms[..., tile], to_reference[..., tile] = (np.stack(list(found)) for found in future.result())
         else:
-            found = future.result()
-            distances[:, np.array(tile)[:, None], np.array(other)] = found
-            distances[:, np.array(other)[:, None], np.array(tile)] = np.swapaxes(found, 1, 2)
+            found = np.stack(list(future.result()))
+            distances[..., np.array(tile)[:, None], np.array(other)] = found
+            distances[..., np.array(other)[:, None], np.array(tile)] = np.swapaxes(found, -1, -2)
         notify(Progress("reduction", done, done + len(jobs)))
     if every_pair:
         # The direct sums are the more exact ones, and the same numbers in both tables.
-        distances[:, :, reference] = distances[:, reference, :] = to_reference
+        distances[..., reference] = distances[..., reference, :] = to_reference
     else:
-        distances[:, :, 0] = to_reference
+        distances[..., 0] = to_reference
     _write_tables(store, plan, rows, records, norms, to_reference, distances, [rows[j] for j in others])
+
+
+def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
+    """The reducer of a store, with what the records say of its fields."""
+    lattice, orders = plan.study.lattice, plan.study.orders
+    qualities = {
+        i: Quality.from_json(record.quality)
+        for i, record in enumerate(records)
+        if record is not None and record.status == "complete"
+    }
+    areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
+    for i, quality in qualities.items():
+        areas[i], errors[:, i] = quality.area, quality.probe.norms(lattice, orders)
+    widths = support_widths(list(qualities.values())) if qualities else np.zeros(len(DIRECTIONS))
+    return Reducer(store, lattice, plan.blocks, orders, center, areas, errors, widths)
 
 
 def _write_tables(
@@ -217,10 +237,13 @@ def _write_tables(
     reference = [row.label for row in rows].index(plan.reference)
     meshes = meshes_dataset(rows, records)
     sizes = meshes["edge_length_mean"].to_numpy()
-    convergence = convergence_dataset(rows, orders, to_reference, norms[:, reference], sizes, plan.reference)
+    convergence = convergence_dataset(
+        rows, orders, Assessed(*to_reference), Assessed(*norms[..., reference]), sizes, plan.reference
+    )
+    store.write_qualities([record.quality if record else "" for record in records])
     store.write_table("meshes", meshes)
-    store.write_table("norms", norms_dataset(rows, orders, norms))
-    store.write_table("distances", distances_dataset(rows, others, orders, distances))
+    store.write_table("norms", norms_dataset(rows, orders, Assessed(*norms)))
+    store.write_table("distances", distances_dataset(rows, others, orders, Assessed(*distances)))
     # Written last: its digest says that all tables belong to the fields that are there.
     digest = _reduction_digest(plan, rows, records)
     store.write_table("convergence", convergence.assign_attrs(digest=digest))

@@ -30,6 +30,7 @@ SCHEMA_VERSION = 1
 Place = tuple[slice, slice, slice]
 
 _FIELD = "fourier/fourier"
+_QUALITY = "fourier/quality"
 _RECORD = "records/record"
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
@@ -127,6 +128,10 @@ class Store:
                 ) from error
         return values
 
+    def write_qualities(self, qualities: Sequence[str]) -> None:
+        """Set the coordinate `quality` of all fields."""
+        zarr.open_array(self.path, path=_QUALITY, mode="r+")[:] = np.array(qualities, dtype=object)
+
     def write_table(self, group: str, dataset: xr.Dataset) -> None:
         """Replace a group of small arrays, each in one chunk."""
         dataset.to_zarr(
@@ -176,7 +181,20 @@ class Store:
             compressors=(Crc32cCodec(),),
             fill_value=complex(np.nan, np.nan),
             dimension_names=("mesh", *AXES),
-            attributes={"long_name": "Fourier transform of the area measure, xi_z >= 0 half"},
+            # xarray takes what `coordinates` names for coordinates, so it stays with a selected field.
+            attributes={
+                "long_name": "Fourier transform of the area measure, xi_z >= 0 half",
+                "coordinates": "quality",
+            },
+        )
+        root.create_array(
+            _QUALITY,
+            shape=(len(labels),),
+            dtype=str,
+            chunks=(len(labels),),
+            compressors=(Crc32cCodec(),),
+            fill_value="",
+            dimension_names=("mesh",),
         )
         units = {"units": "cycles per unit length"}
         coordinates: dict[str, Any] = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
@@ -225,7 +243,7 @@ class Store:
         added = [row.label for row in plan.rows if row.label not in known]
         if not added:
             return
-        for name in (_RECORD, _FIELD, "fourier/mesh"):
+        for name in (_RECORD, _FIELD, _QUALITY, "fourier/mesh"):
             array = zarr.open_array(self.path, path=name, mode="r+")
             array.resize((len(there) + len(added), *array.shape[1:]))
             if name == "fourier/mesh":

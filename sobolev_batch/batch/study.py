@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.norms import check_orders
 from sobolev_batch.spectral.nufft import Precision
 from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.surfaces.similarity import Similarity
 from sobolev_batch.surfaces.sources import Source, parse_source

@@ -9,14 +9,18 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 from distributed import get_worker
 
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.probe import Draws, Probe, join
+from sobolev_batch.spectral.quality import Quality, draws_for, probe_mesh
+from sobolev_batch.spectral.shells import Complexes
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity, Surface
@@ -37,6 +41,7 @@ class Job:
     similarity: Similarity
     lattice: Lattice
     transform: Transform
+    orders: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Part:
     facts: Facts
     seconds: float
     error: str = ""
+    quality: Quality | None = None
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
@@ -63,26 +69,31 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     try:
         surface = job.similarity.apply(job.member.load())
         facts = _facts(surface, job.lattice, job.transform)
+        probes: list[Probe] = []
         for block in blocks:
             values = transform_block(surface, job.lattice, block, job.transform, threads=1)
             job.store.write_field(job.row, job.lattice.place(block), values)
+            probes.append(_probe(job, surface, block, values))
     except InputError as error:
         return Part(Facts(), time.perf_counter() - started, str(error))
     except Exception as error:
         _log.exception("%s failed for a reason that is not its mesh's", job.label)
         reason = " ".join(str(error).split()) or type(error).__name__
         return Part(Facts(), time.perf_counter() - started, reason)
-    return Part(facts, time.perf_counter() - started)
+    quality = Quality.of_surface(surface, join(probes))
+    return Part(facts, time.perf_counter() - started, quality=quality)
 
 
 def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
     """Write the completion record of a mesh whose blocks are all stored, or that failed."""
     errors = [part.error for part in parts if part.error]
+    qualities = [part.quality for part in parts if part.quality is not None]
     record = Record(
         key=job.key,
         status="failed" if errors else "complete",
         reason=errors[0] if errors else "",
         facts=Facts() if errors else parts[0].facts,
+        quality="" if errors else _whole(qualities).to_json(),
         seconds=sum(part.seconds for part in parts),
         worker=_worker_address(),
         backend="finufft",
@@ -90,6 +101,21 @@ def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
     job.store.write_record(job.row, record)
     _log.info("%s: %s in %.2f s by %s", job.label, record.status, record.seconds, record.backend)
     return record
+
+
+def _probe(job: Job, surface: Surface, block: Block, values: Complexes) -> Probe:
+    """Probe the part of a mesh's field that lies in one block."""
+    if not isinstance(surface, Mesh):
+        return Probe()
+    draws = draws_for(surface, job.lattice, job.transform.quadrature, job.transform.accuracy, job.orders)
+    offsets = draws.indices - block.start
+    inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
+    here = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
+    return probe_mesh(surface, here, values[tuple(offsets[inside].T)])
+
+
+def _whole(qualities: Sequence[Quality]) -> Quality:
+    return replace(qualities[0], probe=join([quality.probe for quality in qualities]))
 
 
 def _facts(surface: Surface, lattice: Lattice, transform: Transform) -> Facts:

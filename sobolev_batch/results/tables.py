@@ -17,8 +17,26 @@ from sobolev_batch.errors import InputError
 Format = Literal["text", "csv", "json", "markdown", "latex"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
+_NUMBERS = (
+    "edge_length",
+    "distance",
+    "error",
+    "truncation",
+    "aliasing",
+    "discretisation",
+    "relative",
+    "relative_error",
+    "rate",
+    "rate_error",
+    "resolved",
+)
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
-_HEADERS = ("mesh", "triangles", "edge length", "distance", "relative", "rate")
+_HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate")
+_NOTE = """\
+The true distance lies within its error: truncation (beyond xi_max; it can only
+raise the distance), aliasing (spacing of the lattice) and discretisation
+(quadrature and NUFFT) together. Lengths are in the study's unit. A distance
+marked * is not larger than its error; no rate is taken from it."""
 
 
 def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) -> pd.DataFrame:
@@ -30,7 +48,9 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
 
     Returns:
         Columns order, mesh, family, name, level, status, reason, triangles, edge_length, distance,
-        relative, rate. Lengths are in the study's unit. A mesh that failed has NaN, never a number.
+        error, truncation, aliasing, discretisation, relative, relative_error, rate, rate_error,
+        resolved (whether the distance exceeds its error). Lengths are in the study's unit. A mesh
+        that failed has NaN, never a number.
 
     Raises:
         InputError: no tables in the store yet, or an order that it was not reduced for.
@@ -51,7 +71,7 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
                     "order": order,
                     "mesh": label,
                     **{key: about[key].item() for key in ("family", "name", "level", "status", "reason", "triangles")},
-                    **{key: here[key].item() for key in ("edge_length", "distance", "relative", "rate")},
+                    **{key: here[key].item() for key in _NUMBERS},
                 }
             )
     return pd.DataFrame(lines)
@@ -82,6 +102,7 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
             colalign=("left", *["right"] * (len(_HEADERS) - 1)),
         )
         parts.append(f"% {caption}\n{table}" if style == "latex" else f"{caption}\n\n{table}")
+    parts.append("\n".join(f"% {line}" if style == "latex" else line for line in _NOTE.split("\n")))
     failures = frame.drop_duplicates("mesh").query("status != 'complete'")
     notes = [f"{line.mesh} is {line.status}: {line.reason}" for line in failures.itertuples(index=False)]
     if notes:
@@ -107,10 +128,16 @@ def _cells(line: dict[str, Any]) -> list[str]:
         line["mesh"],
         f"{line['triangles']:,}" if line["triangles"] else "",
         _number(line["edge_length"], ".4g"),
-        _number(line["distance"], ".6e"),
-        _number(line["relative"], ".6e"),
-        _number(line["rate"], ".3f"),
+        _with_error(line["distance"], line["error"], ".6e", ".0e") + ("" if line["resolved"] else "*"),
+        _number(line["relative"], ".5e"),
+        _with_error(line["rate"], line["rate_error"], ".3f", ".3f"),
     ]
+
+
+def _with_error(value: float, error: float, spec: str, error_spec: str) -> str:
+    if math.isnan(value):
+        return ""
+    return f"{value:{spec}} ± {'?' if math.isnan(error) else format(error, error_spec)}"
 
 
 def _number(value: float, spec: str) -> str:

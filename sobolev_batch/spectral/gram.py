@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.budget import Sums, outer_windows
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.norms import shell_weights
+from sobolev_batch.spectral.shells import shell_weights
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -23,9 +24,10 @@ Complexes = NDArray[np.complex128]
 _CANCELLATION = 1e-6
 # Columns of one product: 8 rows of a few hundred fields of this many samples stay in cache.
 _COLUMNS = 1 << 15
+_SPARING = 8
 
 
-def gram_blocks(first: Complexes, second: Complexes, lattice: Lattice, block: Block, orders: Sequence[float]) -> Reals:
+def gram_blocks(first: Complexes, second: Complexes, lattice: Lattice, block: Block, orders: Sequence[float]) -> Sums:
     """Inner products Re <a_i, b_j>_s of the parts of fields on one block of the half lattice.
 
     Args:
@@ -36,35 +38,49 @@ def gram_blocks(first: Complexes, second: Complexes, lattice: Lattice, block: Bl
         orders: s, each.
 
     Returns:
-        float64 (orders, m, n); the sum over all blocks of the half lattice is that over the whole.
+        The inner products in the form that `Sums` has for squares: (orders, 4, m, n) and (2, m, n).
+        What all blocks of the half lattice give adds up to the whole. The outer ranges are taken
+        from one sample in eight.
     """
     by_order = shell_weights(lattice, orders)
     shells = lattice.shells(block).ravel()
     trapezoid = lattice.trapezoid_weights(block).ravel()
-    products = np.zeros((len(orders), len(first), len(second)))
-    for start in range(0, block.size, _COLUMNS):
-        part = slice(start, start + _COLUMNS)
-        right = np.ascontiguousarray(second[:, part]).view(np.float64).T
-        left = np.ascontiguousarray(first[:, part])
-        for i in range(len(orders)):
-            weighted = left * (trapezoid[part] * by_order[i][shells[part]])
-            products[i] += weighted.view(np.float64) @ right
-    return products
+    squares = np.zeros((len(orders), 4, len(first), len(second)))
+    for residue in range(4):
+        members = np.flatnonzero(shells % 4 == residue)
+        for start in range(0, len(members), _COLUMNS):
+            part = members[start : start + _COLUMNS]
+            left, right = np.take(first, part, axis=1), np.take(second, part, axis=1).view(np.float64).T
+            for i in range(len(orders)):
+                weighted = left * (trapezoid[part] * by_order[i][shells[part]])
+                squares[i, residue] += weighted.view(np.float64) @ right
+    outer = np.zeros((2, len(first), len(second)))
+    for i, window in enumerate(outer_windows(lattice)):
+        members = np.flatnonzero(window[shells])
+        # Drawn, not strided: strides would follow the lattice's rows. The same for every tile.
+        count = -(-len(members) // _SPARING)
+        part = np.sort(np.random.default_rng(i).choice(members, count, replace=False))
+        weights = trapezoid[part] * window[shells[part]] * (len(members) / max(count, 1))
+        left, right = np.take(first, part, axis=1), np.take(second, part, axis=1).view(np.float64).T
+        outer[i] = (left * weights).view(np.float64) @ right
+    return Sums(squares, outer)
 
 
-def squared_distances(products: Reals, first: Reals, second: Reals) -> tuple[Reals, NDArray[np.bool_]]:
-    """Squared distances of pairs from their inner products, and which of them cancelled.
+def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArray[np.bool_]]:
+    """Squared differences of pairs from their inner products, and which of them cancelled.
 
     Args:
-        products: (orders, m, n) inner products of the differences to the center.
-        first: squared distances of a to the center, (orders, m).
-        second: those of b, (orders, n).
+        products: of the differences to the center, (orders, 4, m, n) and (2, m, n).
+        first: squares of the differences a to the center, (orders, 4, m) and (2, m).
+        second: those of b, (orders, 4, n) and (2, n).
 
     Returns:
-        (orders, m, n) squared distances, not negative; and whether any order of a pair (m, n) has
-        lost more than about six digits.
+        The squares of a - b; and whether any order of a pair (m, n) has lost more than about six
+        digits.
     """
-    sums = first[:, :, None] + second[:, None, :]
-    squares: Reals = np.maximum(sums - 2 * products, 0.0)
-    cancelled: NDArray[np.bool_] = np.any(squares < _CANCELLATION * sums, axis=0)
-    return squares, cancelled
+    sums = first.squares[..., :, None] + second.squares[..., None, :]
+    squares = sums - 2 * products.squares
+    total, scale = squares.sum(axis=1), sums.sum(axis=1)
+    outer = np.maximum(first.outer[:, :, None] + second.outer[:, None, :] - 2 * products.outer, 0.0)
+    cancelled: NDArray[np.bool_] = np.any(total <= _CANCELLATION * scale, axis=0)
+    return Sums(squares, outer), cancelled

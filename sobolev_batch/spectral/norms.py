@@ -8,30 +8,29 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError, LatticeError, OrderError
+from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.shells import Complexes, Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
-from sobolev_batch.spectral.transform import Transform, fourier_transform
+from sobolev_batch.spectral.transform import fourier_transform
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
 
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complexfloating[Any, Any]]
-Orders = float | Sequence[float]
-
+# Relative accuracy of the closed forms of spheres.
+_CLOSED_FORM_ACCURACY = 1e-13
 # Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
 _BLOCK_SAMPLES = 1 << 22
 
 
 def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
-    """The Sobolev norm ||a||_s of a surface's area measure.
+    """The Sobolev norm ||a||_s of a surface's area measure, with its error.
 
     Args:
         a: a field from `fourier_transform` or a store, or a surface. A sphere without a lattice is
@@ -40,7 +39,9 @@ def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = 
         lattice: where a surface is to be transformed; a field brings its own.
 
     Returns:
-        A dataset with `norm` over `order`.
+        A dataset over `order` with `norm`, its `error`, and the parts of that: `truncation` (what
+        lies beyond xi_max; it can only add to the norm), `aliasing` and `discretisation`. The error
+        is NaN for fields that do not say what they were computed from.
 
     Raises:
         OrderError: an order that is not below -1/2.
@@ -48,26 +49,38 @@ def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = 
     """
     orders = check_orders(order)
     if isinstance(a, Sphere) and lattice is None:
-        return _dataset("norm", order, [sphere_norm(a, s) for s in orders])
-    field = _field(a, lattice)
-    return _dataset("norm", order, np.sqrt(_products(field, field, Lattice.of(field), orders)))
+        values = np.array([sphere_norm(a, s) for s in orders])
+        return _dataset("norm", order, _closed_form(values, values**2))
+    field = _field(a, lattice, orders)
+    known = Lattice.of(field)
+    return _dataset("norm", order, _assessed(_shells_of(field, None, known), known, orders, [field]))
 
 
 def inner_product(
     a: Surface | xr.DataArray, b: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None
 ) -> xr.Dataset:
-    """The Sobolev inner product <a, b>_s, with the arguments of `distance`; real, since measures are."""
+    """The Sobolev inner product <a, b>_s, with the arguments of `distance`; real, since measures are.
+
+    Returns:
+        A dataset over `order` with `inner_product`.
+    """
     orders = check_orders(order)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
-        return _dataset("inner_product", order, [sphere_inner_product(a, b, s) for s in orders])
-    first, second = _pair(a, b, lattice)
-    return _dataset("inner_product", order, _products(first, second, Lattice.of(first), orders))
+        values = np.array([sphere_inner_product(a, b, s) for s in orders])
+    else:
+        first, second = _pair(a, b, lattice, orders)
+        known = Lattice.of(first)
+        sums = np.zeros(known.shell_count)
+        for block in known.split(_BLOCK_SAMPLES):
+            sums += shell_sums(_read(first, known, block), _read(second, known, block), known, block)
+        values = shell_weights(known, orders) @ sums
+    return _over_orders(order, {"inner_product": values})
 
 
 def distance(
     a: Surface | xr.DataArray, b: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None
 ) -> xr.Dataset:
-    """The Sobolev distance ||a - b||_s of two surfaces' area measures.
+    """The Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
     Args:
         a: a field, or a surface. Two spheres without a lattice are answered in closed form.
@@ -76,7 +89,7 @@ def distance(
         lattice: where surfaces are to be transformed; a field brings its own.
 
     Returns:
-        A dataset with `distance` over `order`.
+        A dataset over `order` with `distance`, its `error`, and the parts of that; see `norm`.
 
     Raises:
         OrderError: an order that is not below -1/2.
@@ -85,70 +98,53 @@ def distance(
     """
     orders = check_orders(order)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
-        return _dataset("distance", order, [sphere_distance(a, b, s) for s in orders])
-    first, second = _pair(a, b, lattice)
-    return _dataset("distance", order, np.sqrt(_squared_distances(first, second, Lattice.of(first), orders)))
+        values = np.array([sphere_distance(a, b, s) for s in orders])
+        squares = np.array([sphere_norm(a, s) ** 2 + sphere_norm(b, s) ** 2 for s in orders])
+        return _dataset("distance", order, _closed_form(values, squares))
+    first, second = _pair(a, b, lattice, orders)
+    known = Lattice.of(first)
+    return _dataset("distance", order, _assessed(_shells_of(first, second, known), known, orders, [first, second]))
 
 
-def check_orders(order: Orders) -> tuple[float, ...]:
-    """The orders as a tuple of floats.
-
-    Raises:
-        OrderError: none at all, or one that is not finite and below -1/2.
-    """
-    orders = tuple(float(s) for s in np.atleast_1d(np.asarray(order, dtype=np.float64)))
-    if not orders:
-        raise OrderError("at least one order is needed")
-    for s in orders:
-        if not (np.isfinite(s) and s < -0.5):
-            raise OrderError(f"the norm of a surface is finite only for orders below -1/2, found {s:g}")
-    return orders
-
-
-def shell_sums(
-    values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block
-) -> Reals:
-    """Trapezoidal sums of Re(a conj b) over each shell of one block of the half lattice.
-
-    Args:
-        values: a, complex (block.shape).
-        others: b, likewise; None stands for a itself.
-        lattice: where the values lie.
-        block: which part of it they are.
-
-    Returns:
-        float64 (lattice.shell_count,): indexed by |k|². The sums of all blocks add up to those of
-        the whole lattice, conjugate half included. NaN anywhere makes its shells NaN.
-    """
-    if others is None:
-        products = values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2
-    else:
-        products = values.real.astype(np.float64) * others.real + values.imag.astype(np.float64) * others.imag
-    products *= lattice.trapezoid_weights(block)
-    shells = lattice.shells(block).ravel()
-    sums: Reals = np.bincount(shells, weights=products.ravel(), minlength=lattice.shell_count).astype(np.float64)
-    return sums
-
-
-def shell_weights(lattice: Lattice, orders: Sequence[float]) -> Reals:
-    """(1 + h²|k|²)^s for each order and each shell, float64 (orders, lattice.shell_count)."""
-    squares = 1 + lattice.spacing**2 * np.arange(lattice.shell_count, dtype=np.float64)
-    return np.stack([squares**s for s in orders])
-
-
-def _products(a: xr.DataArray, b: xr.DataArray, lattice: Lattice, orders: Sequence[float]) -> Reals:
+def _shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
+    """Shell sums of |a|², or of |a - b|²."""
     sums = np.zeros(lattice.shell_count)
     for block in lattice.split(_BLOCK_SAMPLES):
         values = _read(a, lattice, block)
-        sums += shell_sums(values, None if b is a else _read(b, lattice, block), lattice, block)
-    return shell_weights(lattice, orders) @ sums
+        sums += shell_sums(values if b is None else values - _read(b, lattice, block), None, lattice, block)
+    return sums
 
 
-def _squared_distances(a: xr.DataArray, b: xr.DataArray, lattice: Lattice, orders: Sequence[float]) -> Reals:
-    sums = np.zeros(lattice.shell_count)
-    for block in lattice.split(_BLOCK_SAMPLES):
-        sums += shell_sums(_read(a, lattice, block) - _read(b, lattice, block), None, lattice, block)
-    return shell_weights(lattice, orders) @ sums
+def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> Assessed:
+    """The norm of what the fields add up to, with the error that follows from their qualities."""
+    qualities = [_quality(field) for field in fields]
+    known = [quality for quality in qualities if quality is not None]
+    complete = len(known) == len(qualities)
+    found = assess(
+        sums_of_shells(sums, lattice, orders),
+        lattice,
+        orders,
+        areas=np.array(sum(quality.area for quality in known)),
+        widths=support_widths(known) if complete else np.zeros(len(DIRECTIONS)),
+        discretisation=np.sum([quality.probe.norms(lattice, orders) for quality in known], axis=0),
+    )
+    if complete:
+        return found
+    unknown = np.full(len(orders), np.nan)
+    return Assessed(found.values, unknown, unknown, unknown)
+
+
+def _quality(field: xr.DataArray) -> Quality | None:
+    """What a field says of its own quality: an attribute of computed fields, a coordinate of stored ones."""
+    text = field.coords["quality"].item() if "quality" in field.coords else field.attrs.get("quality")
+    return Quality.from_json(text) if text else None
+
+
+def _closed_form(values: Reals, squares: Reals) -> Assessed:
+    """Values whose squares are exact up to a small part of some squared norms."""
+    nothing = np.zeros_like(values)
+    rounding = _CLOSED_FORM_ACCURACY * squares
+    return Assessed(values, nothing, nothing, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0))
 
 
 def _read(field: xr.DataArray, lattice: Lattice, block: Block) -> Complexes:
@@ -157,7 +153,7 @@ def _read(field: xr.DataArray, lattice: Lattice, block: Block) -> Complexes:
 
 
 def _pair(
-    a: Surface | xr.DataArray, b: Surface | xr.DataArray, lattice: Lattice | None
+    a: Surface | xr.DataArray, b: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Both as fields; a surface beside a field is transformed on the field's lattice."""
     known = [Lattice.of(x) for x in (a, b) if isinstance(x, xr.DataArray)]
@@ -167,10 +163,10 @@ def _pair(
         if other.M != known[0].M or not np.isclose(other.xi_max, known[0].xi_max, rtol=1e-12, atol=0):
             raise LatticeError(f"fields on different lattices cannot be compared: {known[0]} and {other}")
     common = known[0] if known else None
-    return _field(a, common), _field(b, common)
+    return _field(a, common, orders), _field(b, common, orders)
 
 
-def _field(a: Surface | xr.DataArray, lattice: Lattice | None) -> xr.DataArray:
+def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
     if isinstance(a, xr.DataArray):
         if set(a.dims) != set(AXES):
             raise LatticeError(
@@ -181,11 +177,24 @@ def _field(a: Surface | xr.DataArray, lattice: Lattice | None) -> xr.DataArray:
         raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
     if lattice is None:
         raise InputError("a mesh needs a lattice to be compared on: pass lattice=Lattice(xi_max=..., M=...)")
-    return fourier_transform(a, lattice, Transform().accuracy)
+    return fourier_transform(a, lattice, orders=orders)
 
 
-def _dataset(name: str, order: Orders, values: Sequence[float] | Reals) -> xr.Dataset:
+def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:
+    """A number with its error and the parts of that."""
+    parts = {
+        name: found.values,
+        "error": found.errors,
+        "truncation": found.truncation,
+        "aliasing": found.aliasing,
+        "discretisation": found.discretisation,
+    }
+    return _over_orders(order, parts)
+
+
+def _over_orders(order: Orders, values: dict[str, Reals]) -> xr.Dataset:
     """Values over the dimension `order`; a single number asked for comes back without dimensions."""
     orders = np.asarray(order, dtype=np.float64)
-    result = np.asarray(values, dtype=np.float64).reshape(orders.shape)
-    return xr.Dataset({name: (("order",) * orders.ndim, result)}, coords={"order": (("order",) * orders.ndim, orders)})
+    dimensions = ("order",) * orders.ndim
+    variables = {name: (dimensions, np.asarray(value).reshape(orders.shape)) for name, value in values.items()}
+    return xr.Dataset(variables, coords={"order": (dimensions, orders)})

@@ -86,6 +86,10 @@ class Quadrature:
         """How many points `batches` makes in all."""
         return sum(group.point_count for group in self._groups(mesh, highest_frequency, tolerance))
 
+    def lowest_degree(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
+        """The lowest degree among the rules that triangles get: the one whose error shows first."""
+        return min(group.rule.degree for group in self._groups(mesh, highest_frequency, tolerance))
+
     def _groups(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> list[_Group]:
         everything = np.arange(len(mesh.triangles))
         if self.method == "gauss8":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -14,7 +15,10 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.nufft import OVERSAMPLING, Precision, transform_points
+from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quality import Quality, draws_for, probe_mesh
+from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.spheres import sphere_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
@@ -22,11 +26,14 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 # Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
 # another version are then computed again instead of being compared with new ones.
-NUMERICS_VERSION = 1
+NUMERICS_VERSION = 2
 
 # Points of one NUFFT call: 4 million take 0.5 GB with their strengths and their sorting, and make
 # the FFT of a call a small part of it.
 DEFAULT_BATCH = 1 << 22
+
+# Where nobody says which orders a field is for.
+PROBED_ORDERS = (-2.0, -5.0, -10.0)
 
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
 _FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
@@ -76,6 +83,7 @@ def fourier_transform(
     dtype: Precision = "complex128",
     quadrature: str | int = "auto",
     threads: int | None = None,
+    orders: Sequence[float] = PROBED_ORDERS,
 ) -> xr.DataArray:
     """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
 
@@ -87,10 +95,13 @@ def fourier_transform(
         dtype: "complex128" or "complex64".
         quadrature: "auto", a degree from 1 to 50, or "gauss8".
         threads: of the NUFFT; default one per core.
+        orders: the orders for which the field's own error is probed; it can be had for any other
+            order too, with more uncertainty.
 
     Returns:
         The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
-        xi_z in cycles per unit length. The other half is the conjugate of this one.
+        xi_z in cycles per unit length. The other half is the conjugate of this one. The attribute
+        `quality` holds what the errors of norms and distances need to know of the field.
 
     Raises:
         LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
@@ -100,7 +111,13 @@ def fourier_transform(
     """
     settings = Transform(eps, dtype, Quadrature(quadrature))
     values = transform_block(surface, lattice, lattice.half, settings, threads=threads or os.cpu_count() or 1)
-    return as_field(values, lattice, {"eps": settings.accuracy, "quadrature": quadrature, "area": surface.area})
+    probe = Probe()
+    if isinstance(surface, Mesh):
+        draws = draws_for(surface, lattice, settings.quadrature, settings.accuracy, check_orders(orders))
+        probe = probe_mesh(surface, draws, values[tuple((draws.indices - lattice.half.start).T)])
+    quality = Quality.of_surface(surface, probe)
+    attributes = {"eps": settings.accuracy, "quadrature": quadrature, "quality": quality.to_json()}
+    return as_field(values, lattice, attributes)
 
 
 def as_field(values: NDArray[Any], lattice: Lattice, attributes: dict[str, Any]) -> xr.DataArray:

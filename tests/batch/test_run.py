@@ -21,7 +21,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     study = Study.from_table(small_table())
     sphere = fourier_transform(Sphere(), study.lattice)
     for level in range(4):
-        field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars("mesh")
+        field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars(["mesh", "quality"])
         expected = fourier_transform(icosphere(level), study.lattice, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
@@ -33,9 +33,28 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     assert (matrix.diagonal() == 0).all()
     a, b = (fourier_transform(icosphere(level), study.lattice) for level in (2, 3))
     assert matrix[2, 3] == pytest.approx(distance(a, b, -10.0)["distance"].item(), rel=1e-9)
-    rates = variable(tree, "convergence", "rate").sel(order=-10.0).values
+    convergence = tree["convergence"].to_dataset()
+    rates = convergence.sel(order=-3.0)["rate"].values
     assert np.isnan(rates[[0, 4]]).all()
     assert rates[3] == pytest.approx(2.0, abs=0.02)
+    # At order -10 the coarse lattice's aliasing exceeds the distances: marked, and without a rate.
+    assert not convergence.sel(order=-10.0)["resolved"].any()
+    assert np.isnan(convergence.sel(order=-10.0)["rate"]).all()
+    parts = convergence["truncation"] + convergence["aliasing"] + convergence["discretisation"]
+    assert np.array_equal(parts, convergence["error"])
+    # The same errors from the stored field as from one that was just computed.
+    field = variable(tree, "fourier", "fourier").sel(mesh="ico/3")
+    fresh = distance(
+        fourier_transform(icosphere(3), study.lattice, threads=1, orders=study.orders), sphere, study.orders
+    )
+    stored = distance(field, variable(tree, "fourier", "fourier").sel(mesh="reference"), study.orders)
+    for name in ("truncation", "aliasing"):
+        assert stored[name].values == pytest.approx(fresh[name].values, rel=1e-6)
+    assert stored["discretisation"].values == pytest.approx(fresh["discretisation"].values, rel=0.1)
+    # All pairs know their errors too, about as well as pair by pair.
+    pair = distance(a, b, study.orders)
+    ours = tree["distances"].to_dataset().sel(mesh="ico/2", other="ico/3")
+    assert ours["error"].values == pytest.approx(pair["error"].values, rel=0.3)
 
 
 def test_mesh_facts_are_recorded(finished_store: Path) -> None:

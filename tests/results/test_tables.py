@@ -24,8 +24,13 @@ def tree() -> xr.DataTree:
     convergence = xr.Dataset(
         {
             "distance": (("mesh", "order"), distance),
+            **dict.fromkeys(("error", "truncation"), (("mesh", "order"), distance / 1000)),
+            **dict.fromkeys(("aliasing", "discretisation"), (("mesh", "order"), 0 * distance)),
             "relative": (("mesh", "order"), distance / 4),
+            "relative_error": (("mesh", "order"), distance / 4000),
             "rate": (("mesh", "order"), rate),
+            "rate_error": (("mesh", "order"), 0.01 * rate),
+            "resolved": (("mesh", "order"), np.array([[True, True], [True, False], [False, False], [False, False]])),
             "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan]),
         },
         coords={"mesh": MESHES, "order": [-10.0, -2.5]},
@@ -55,8 +60,8 @@ def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
     text = format_table(tree, "text", [-2.5])
     assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
     rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
-    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "2.000000e-01"]
-    assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "5.000000e-02", "2.000"]
+    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "±", "8e-04", "2.00000e-01"]
+    assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "±", "2e-04*", "5.00000e-02", "2.000", "±", "0.020"]
     assert rows[2] == ["f_1/2", *["missing"] * 5]
     assert text.endswith("f_1/2 is failed: no 50% of it | is <there>")
 
@@ -75,7 +80,7 @@ def test_programs_get_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) ->
     assert records[1]["rate"] == 2.0
     lines = format_table(tree, "csv", [-10.0]).splitlines()
     assert len(lines) == 4
-    assert lines[3].endswith(",,,,")
+    assert lines[3].endswith(",,,,,False")
 
 
 def test_latex_escapes_labels(tree: xr.DataTree) -> None:

@@ -19,8 +19,8 @@ from sobolev_batch import (
     inner_product,
     norm,
 )
-from sobolev_batch.spectral.norms import shell_sums, shell_weights
 from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.shells import shell_sums, shell_weights
 from tests.spectral.test_quadrature import BOX
 
 LATTICE = Lattice(4.0, 32)

@@ -12,6 +12,7 @@ from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fouri
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.files import Files
@@ -152,7 +153,7 @@ def test_field_coordinates_and_attributes() -> None:
     assert field.dims == ("xi_x", "xi_y", "xi_z")
     assert field.sel(xi_x=0, xi_y=0, xi_z=0).item() == pytest.approx(16 * np.pi)
     assert field["xi_z"].attrs["units"] == "cycles per unit length"
-    assert field.attrs["area"] == pytest.approx(16 * np.pi)
+    assert Quality.from_json(field.attrs["quality"]).area == pytest.approx(16 * np.pi)
 
 
 def test_refuses_meshes_that_would_fold() -> None:

@@ -1,0 +1,74 @@
+"""What is known about the quality of a computed field, in a form that travels and is stored with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.spectral.budget import DIRECTIONS
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
+from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.triangles import exact_transform
+from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.sphere import Sphere
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What the error of a norm or distance needs to know of a field.
+
+    Attributes:
+        area: of the surface, in squared units of length.
+        lowest: the least x · direction over the surface, for each of `DIRECTIONS`, in units of length.
+        highest: the greatest, likewise.
+        probe: of the field's own error; empty for a closed form.
+    """
+
+    area: float
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
+    probe: Probe
+
+    @classmethod
+    def of_surface(cls, surface: Surface, probe: Probe) -> Self:
+        """The quality of the field of a surface."""
+        if isinstance(surface, Sphere):
+            along = DIRECTIONS @ np.asarray(surface.center)
+            low, high = along - surface.radius, along + surface.radius
+        else:
+            along = surface.vertices[surface.used_vertices] @ DIRECTIONS.T
+            low, high = along.min(axis=0), along.max(axis=0)
+        return cls(surface.area, tuple(low.tolist()), tuple(high.tolist()), probe)
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        parts = [self.area, self.lowest, self.highest, self.probe.shells, self.probe.sums]
+        return json.dumps(parts)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The quality that a line holds."""
+        area, lowest, highest, shells, sums = json.loads(text)
+        return cls(area, tuple(lowest), tuple(highest), Probe(tuple(shells), tuple(sums)))
+
+
+def draws_for(mesh: Mesh, lattice: Lattice, quadrature: Quadrature, tolerance: float, orders: Sequence[float]) -> Draws:
+    """The frequencies at which a mesh's field is to be probed; the same mesh gives the same ones."""
+    degree = quadrature.lowest_degree(mesh, lattice.highest_frequency, tolerance)
+    seed = int(np.float64(mesh.area).view(np.uint64))
+    return draw(lattice, orders, degree, draw_count(len(mesh.triangles)), seed)
+
+
+def probe_mesh(mesh: Mesh, draws: Draws, computed: Complexes) -> Probe:
+    """Compare a field's values at the drawn frequencies (P,) with the exact transform there."""
+    return measure(draws, computed, exact_transform(mesh, draws.frequencies))

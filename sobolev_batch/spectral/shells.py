@@ -1,0 +1,62 @@
+"""Sums over the shells |k|² of a lattice, to which every weight (1 + |ξ|²)^s reduces a field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import OrderError
+from sobolev_batch.spectral.lattice import Block, Lattice
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complexfloating[Any, Any]]
+Orders = float | Sequence[float]
+
+
+def check_orders(order: Orders) -> tuple[float, ...]:
+    """The orders as a tuple of floats.
+
+    Raises:
+        OrderError: none at all, or one that is not finite and below -1/2.
+    """
+    orders = tuple(float(s) for s in np.atleast_1d(np.asarray(order, dtype=np.float64)))
+    if not orders:
+        raise OrderError("at least one order is needed")
+    for s in orders:
+        if not (np.isfinite(s) and s < -0.5):
+            raise OrderError(f"the norm of a surface is finite only for orders below -1/2, found {s:g}")
+    return orders
+
+
+def shell_sums(
+    values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block
+) -> Reals:
+    """Trapezoidal sums of Re(a conj b) over each shell of one block of the half lattice.
+
+    Args:
+        values: a, complex (block.shape).
+        others: b, likewise; None stands for a itself.
+        lattice: where the values lie.
+        block: which part of it they are.
+
+    Returns:
+        float64 (lattice.shell_count,): indexed by |k|². The sums of all blocks add up to those of
+        the whole lattice, conjugate half included. NaN anywhere makes its shells NaN.
+    """
+    if others is None:
+        products = values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2
+    else:
+        products = values.real.astype(np.float64) * others.real + values.imag.astype(np.float64) * others.imag
+    products *= lattice.trapezoid_weights(block)
+    shells = lattice.shells(block).ravel()
+    sums: Reals = np.bincount(shells, weights=products.ravel(), minlength=lattice.shell_count).astype(np.float64)
+    return sums
+
+
+def shell_weights(lattice: Lattice, orders: Sequence[float]) -> Reals:
+    """(1 + h²|k|²)^s for each order and each shell, float64 (orders, lattice.shell_count)."""
+    squares = 1 + lattice.spacing**2 * np.arange(lattice.shell_count, dtype=np.float64)
+    return np.stack([squares**s for s in orders])
