@@ -25,6 +25,23 @@ class OrderError(InputError):
     """A Sobolev order for which the norm of a surface measure is infinite."""
 
 
+class AccuracyError(InputError):
+    """An accuracy is out of reach within the memory that may be used.
+
+    Attributes:
+        requested: the rtol that was asked for.
+        reachable: the smallest one that is expected to be met.
+    """
+
+    def __init__(self, message: str, requested: float, reachable: float) -> None:
+        super().__init__(message, requested, reachable)
+        self.requested = requested
+        self.reachable = reachable
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class StudyError(InputError):
     """A study file is malformed or asks for something that does not exist."""
 

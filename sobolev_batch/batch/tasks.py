@@ -68,12 +68,13 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     started = time.perf_counter()
     try:
         surface = job.similarity.apply(job.member.load())
-        facts = _facts(surface, job.lattice, job.transform)
+        points = 0
         probes: list[Probe] = []
         for block in blocks:
-            values = transform_block(surface, job.lattice, block, job.transform, threads=1)
-            job.store.write_field(job.row, job.lattice.place(block), values)
-            probes.append(_probe(job, surface, block, values))
+            made = transform_block(surface, job.lattice, block, job.transform, threads=1)
+            job.store.write_field(job.row, job.lattice.place(block), made.values)
+            probes.append(_probe(job, surface, block, made.values))
+            points = made.points
     except InputError as error:
         return Part(Facts(), time.perf_counter() - started, str(error))
     except Exception as error:
@@ -81,7 +82,7 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
         reason = " ".join(str(error).split()) or type(error).__name__
         return Part(Facts(), time.perf_counter() - started, reason)
     quality = Quality.of_surface(surface, join(probes))
-    return Part(facts, time.perf_counter() - started, quality=quality)
+    return Part(_facts(surface, points), time.perf_counter() - started, quality=quality)
 
 
 def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
@@ -118,7 +119,7 @@ def _whole(qualities: Sequence[Quality]) -> Quality:
     return replace(qualities[0], probe=join([quality.probe for quality in qualities]))
 
 
-def _facts(surface: Surface, lattice: Lattice, transform: Transform) -> Facts:
+def _facts(surface: Surface, points: int) -> Facts:
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area)
     lengths, counts = surface.edge_lengths, surface.counts
@@ -133,7 +134,7 @@ def _facts(surface: Surface, lattice: Lattice, transform: Transform) -> Facts:
         boundary_edges=counts.boundary_edges,
         nonmanifold_edges=counts.nonmanifold_edges,
         digest=surface.digest,
-        points=transform.quadrature.point_count(surface, lattice.highest_frequency, transform.accuracy),
+        points=points,
     )
 
 

@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
+from sobolev_batch.spectral.rules import (
+    HIGHEST_DEGREE,
+    TriangleRule,
+    corner_rule,
+    gauss_rule,
+    midpoint_rule,
+    reaches,
+    symmetric_rule,
+)
+from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
 from sobolev_batch.surfaces.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]
@@ -38,10 +47,10 @@ class Quadrature:
     """How triangles become points.
 
     Args:
-        method: "auto" gives every triangle the smallest symmetric rule that keeps the tolerance at
-            all frequencies of the lattice, and subdivides those too large for any; an integer is
-            the degree of one symmetric rule for all (1 to 50); "gauss8" is the 64-point product rule
-            of K. Koga's paper.
+        method: "auto" gives every triangle the cheapest rule that keeps the tolerance at all
+            frequencies of the lattice, and subdivides those too large for any; an integer is the
+            degree of one symmetric rule with interior nodes for all (1 to 50); "gauss8" is the
+            64-point product rule of K. Koga's paper.
 
     Raises:
         InputError: any other method.
@@ -71,20 +80,20 @@ class Quadrature:
                 keeps it, the others ignore it.
             capacity: bound on the points of one batch, 8 times the largest rule (3,624) or more.
         """
-        most = capacity // 8
         groups = self._groups(mesh, highest_frequency, tolerance)
-        pieces = [piece for group in groups for piece in group.cut(most)]
-        ends = np.cumsum([piece.point_count for piece in pieces])
+        # Nodes are merged within a piece, hence larger pieces where they are shared.
+        pieces = [
+            piece
+            for group in groups
+            for piece in group.cut(capacity // (2 if group.rule.sharing > 1 else 8))
+        ]
+        ends = np.cumsum([piece.most_points for piece in pieces])
         total = int(ends[-1])
-        count = -(-total // (capacity - most))
+        count = -(-total // (capacity - max(piece.most_points for piece in pieces)))
         # A piece goes where it starts, so a batch ends at most one piece after its share of the points.
         batch_of = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
         for _, batch in groupby(zip(batch_of, pieces, strict=True), key=itemgetter(0)):
             yield _join(mesh, [piece for _, piece in batch])
-
-    def point_count(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
-        """How many points `batches` makes in all."""
-        return sum(group.point_count for group in self._groups(mesh, highest_frequency, tolerance))
 
     def lowest_degree(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
         """The lowest degree among the rules that triangles get: the one whose error shows first."""
@@ -96,7 +105,7 @@ class Quadrature:
             return [_Group(gauss_rule(8), 0, everything)]
         if isinstance(self.method, int):
             return [_Group(symmetric_rule(self.method), 0, everything)]
-        return _smallest_rules(mesh, 2 * np.pi * highest_frequency, tolerance)
+        return _cheapest_rules(mesh, 2 * np.pi * highest_frequency, tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +121,7 @@ class _Group:
     path: tuple[int, ...] = ()
 
     @property
-    def point_count(self) -> int:
+    def most_points(self) -> int:
         return len(self.members) * self.rule.size << 2 * self.splits
 
     def cut(self, most: int) -> Iterator[_Group]:
@@ -122,11 +131,17 @@ class _Group:
             for quarter in range(4):
                 yield from _Group(self.rule, self.splits - 1, self.members, (*self.path, quarter)).cut(most)
             return
-        step = max(1, min(_SLICE, most // each))
+        largest = most // each
+        step = max(1, largest if self.rule.sharing > 1 else min(_SLICE, largest))
         for first in range(0, len(self.members), step):
             yield _Group(self.rule, self.splits, self.members[first : first + step], self.path)
 
     def points(self, mesh: Mesh) -> WeightedPoints:
+        whole = not (self.splits or self.path)
+        if self.rule is corner_rule() and whole:
+            return WeightedPoints(*merged_corners(mesh, self.members))
+        if self.rule is midpoint_rule() and whole:
+            return WeightedPoints(*merged_midpoints(mesh, self.members))
         a, b, c = mesh.corners(self.members)
         areas = mesh.areas[self.members] / 4 ** len(self.path)
         for quarter in self.path:
@@ -141,23 +156,28 @@ class _Group:
         return WeightedPoints(coordinates.reshape(3, -1), np.outer(rule.weights, areas).ravel())
 
 
-def _smallest_rules(mesh: Mesh, wavenumber: float, tolerance: float) -> list[_Group]:
+def _cheapest_rules(mesh: Mesh, wavenumber: float, tolerance: float) -> list[_Group]:
     rules, reach = reaches(tolerance)
     sizes = wavenumber * mesh.centroid_radii
-    splits = np.ceil(np.log2(np.maximum(sizes / reach[-1], 1.0))).astype(np.int64)
-    choice = np.searchsorted(reach, sizes / 2.0**splits)
-    # Rounding of the logarithm may leave a size just beyond the last reach.
-    choice = np.minimum(choice, len(rules) - 1)
+    splits, choice = choose_rules(np.array([sizes.min(), sizes.max()]), reach)
+    if splits[0] == splits[1] and choice[0] == choice[1]:
+        return [_Group(rules[choice[0]], int(splits[0]), np.arange(len(sizes)))]
+    splits, choice = choose_rules(sizes, reach)
     kinds, group_of = np.unique(splits * len(rules) + choice, return_inverse=True)
-    if len(kinds) == 1:
-        members = [np.arange(len(sizes))]
-    else:
-        order = np.argsort(group_of, kind="stable")
-        members = np.split(order, np.cumsum(np.bincount(group_of))[:-1])
+    order = np.argsort(group_of, kind="stable")
+    members = np.split(order, np.cumsum(np.bincount(group_of))[:-1])
     return [
         _Group(rules[kind % len(rules)], int(kind // len(rules)), chosen)
         for kind, chosen in zip(kinds.tolist(), members, strict=True)
     ]
+
+
+def choose_rules(sizes: Reals, reach: Reals) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How often triangles of sizes 2π|ξ|ρ are to be halved, and which of the rules each piece gets."""
+    splits = np.ceil(np.log2(np.maximum(sizes / reach[-1], 1.0))).astype(np.int64)
+    # Rounding of the logarithm may leave a size just beyond the last reach.
+    choice = np.minimum(np.searchsorted(reach, sizes / 2.0**splits), len(reach) - 1)
+    return splits, choice
 
 
 def _quarters(corners: Corners) -> tuple[Corners, Corners, Corners, Corners]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
-from sobolev_batch.spectral.nufft import OVERSAMPLING, Precision, transform_points
+from sobolev_batch.spectral.nufft import LARGEST_OVERSAMPLING, Complexes, Precision, transform_points
 from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quality import Quality, draws_for, probe_mesh
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.spheres import sphere_block
@@ -26,7 +26,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 # Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
 # another version are then computed again instead of being compared with new ones.
-NUMERICS_VERSION = 2
+NUMERICS_VERSION = 3
 
 # Points of one NUFFT call: 4 million take 0.5 GB with their strengths and their sorting, and make
 # the FFT of a call a small part of it.
@@ -36,8 +36,8 @@ DEFAULT_BATCH = 1 << 22
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
 
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
-_FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
-_COARSEST_EPS = 0.1
+FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
+COARSEST_EPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,12 @@ class Transform:
     """How fields are computed.
 
     Args:
-        eps: accuracy of a field relative to the surface's area, of triangle rule and NUFFT alike.
-            None stands for 1e-9 in complex128 and 1e-6 in complex64.
+        eps: accuracy of a field relative to the surface's area. None stands for 1e-9 in complex128
+            and 1e-6 in complex64.
         precision: "complex128" or "complex64".
         quadrature: see `Quadrature`.
+        tolerance: largest error of the triangle rules on any one triangle, relative to its area;
+            None stands for eps.
 
     Raises:
         InputError: a precision that does not exist, or an eps beyond what it can hold.
@@ -57,22 +59,41 @@ class Transform:
     eps: float | None = None
     precision: Precision = "complex128"
     quadrature: Quadrature = field(default_factory=Quadrature)
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
         if self.precision not in get_args(Precision):
             raise InputError(f"dtype must be 'complex128' or 'complex64', found {self.precision!r}")
         if self.eps is None:
             object.__setattr__(self, "eps", 1e-9 if self.precision == "complex128" else 1e-6)
-        finest = _FINEST_EPS[self.precision]
-        if not finest <= self.accuracy <= _COARSEST_EPS:
+        finest = FINEST_EPS[self.precision]
+        if not finest <= self.accuracy <= COARSEST_EPS:
             raise InputError(
-                f"eps must lie between {finest:g} and {_COARSEST_EPS:g} in {self.precision}, found {self.eps!r}"
+                f"eps must lie between {finest:g} and {COARSEST_EPS:g} in {self.precision}, found {self.eps!r}"
             )
 
     @property
     def accuracy(self) -> float:
         """The eps in force."""
         return float(self.eps) if self.eps is not None else float("nan")
+
+    @property
+    def rule_tolerance(self) -> float:
+        """The tolerance in force."""
+        return self.accuracy if self.tolerance is None else self.tolerance
+
+
+@dataclass(frozen=True, eq=False)
+class Transformed:
+    """A block of a field, and from how many points it was made.
+
+    Attributes:
+        values: complex (block.shape).
+        points: of the quadrature; 0 for a closed form.
+    """
+
+    values: Complexes
+    points: int
 
 
 def fourier_transform(
@@ -110,7 +131,7 @@ def fourier_transform(
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
     """
     settings = Transform(eps, dtype, Quadrature(quadrature))
-    values = transform_block(surface, lattice, lattice.half, settings, threads=threads or os.cpu_count() or 1)
+    values = transform_block(surface, lattice, lattice.half, settings, threads=threads or os.cpu_count() or 1).values
     probe = Probe()
     if isinstance(surface, Mesh):
         draws = draws_for(surface, lattice, settings.quadrature, settings.accuracy, check_orders(orders))
@@ -135,8 +156,8 @@ def transform_block(
     *,
     threads: int = 1,
     batch: int = DEFAULT_BATCH,
-) -> NDArray[np.complexfloating[Any, Any]]:
-    """The transform of a surface on one block of the lattice, complex (block.shape).
+) -> Transformed:
+    """The transform of a surface on one block of the lattice.
 
     Memory is that of the block (about twelve times its bytes), of the mesh, and of one batch of
     points: it does not grow with the number of points.
@@ -145,12 +166,21 @@ def transform_block(
         LatticeError: a mesh reaches beyond the lattice's half period.
     """
     if isinstance(surface, Sphere):
-        return sphere_block(surface, lattice, block).astype(settings.precision, copy=False)
+        return Transformed(sphere_block(surface, lattice, block).astype(settings.precision, copy=False), 0)
     require_inside(surface, lattice)
-    points = settings.quadrature.batches(surface, lattice.highest_frequency, settings.accuracy, batch)
-    return transform_points(
-        points, lattice, block, eps=settings.accuracy, precision=settings.precision, threads=threads
+    points = 0
+
+    def counted() -> Iterator[WeightedPoints]:
+        nonlocal points
+        batches = settings.quadrature.batches(surface, lattice.highest_frequency, settings.rule_tolerance, batch)
+        for part in batches:
+            points += len(part.weights)
+            yield part
+
+    values = transform_points(
+        counted(), lattice, block, eps=settings.accuracy, precision=settings.precision, threads=threads
     )
+    return Transformed(values, points)
 
 
 def memory_bytes(block: Block, settings: Transform, batch: int = DEFAULT_BATCH) -> int:
@@ -160,7 +190,7 @@ def memory_bytes(block: Block, settings: Transform, batch: int = DEFAULT_BATCH) 
     phases and sorting.
     """
     item = 16 if settings.precision == "complex128" else 8
-    return int(block.size * item * (OVERSAMPLING**3 * 1.3 + 2)) + batch * 140
+    return int(block.size * item * (LARGEST_OVERSAMPLING**3 * 1.3 + 2)) + batch * 140
 
 
 def require_inside(mesh: Mesh, lattice: Lattice) -> None:

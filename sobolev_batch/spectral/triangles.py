@@ -6,11 +6,14 @@ formula that quadrature rules are rated with and that computed fields are checke
 The transform of a triangle of area A is 2A times the second divided difference of exp at the
 nodes -2πi ξ·p_j of its corners p_j (Hermite-Genocchi; C. de Boor, "Divided differences", 2005,
 arXiv:math/0502036). The explicit quotient of exponentials cancels where two nodes are close, the
-usual case on a fine mesh, hence two branches: a power series where all three are close, and the
-difference quotient of first differences across the widest gap elsewhere.
+usual case on a fine mesh, hence two branches: a power series about the centroid where all three are
+close, and the difference quotient of first differences across the widest gap elsewhere.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,76 +24,94 @@ from sobolev_batch.surfaces.mesh import Corners, Mesh
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# Phases below this (radians) go through the series: it then needs at most 14 terms, and above it
-# the quotient loses less than one digit.
+# Gaps below this (radians) go through the series: it then needs at most 12 terms, and above it the
+# quotient loses less than one digit.
 _SERIES_REACH = 0.5
 # Below this many cycles a plain dot product keeps the phase of exp to 5e-14 radians.
 _PLAIN_CYCLES = 16.0
-_CHUNK = 1 << 16
+# Triangles whose area is a smaller part of a squared edge than this lose digits in a plain cross product.
+_FLATNESS = 1e-2
+# Triangles at a time: their temporaries stay in cache.
+_CHUNK = 1 << 13
 
 
-def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
+def exact_transform(mesh: Mesh, frequencies: Reals, *, threads: int = 1) -> Complexes:
     """The transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
     Args:
         mesh: the mesh, in units of length.
         frequencies: (P, 3) float64, in cycles per unit length.
+        threads: to compute with; the result does not depend on it.
 
     Returns:
         complex128 (P,). Each triangle contributes with a relative error of about 1e-15 of
         min(area, its decay); the area itself is exact to rounding even on slivers.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
-    values = np.zeros(len(frequencies), dtype=np.complex128)
-    exponentials = [_vertex_exponentials(mesh.vertices, frequency) for frequency in frequencies]
-    for first in range(0, len(mesh.triangles), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        a, b, c = mesh.corners(part)
-        doubled = doubled_areas((a, b, c))
-        edges = b - a, c - a, c - b
-        for row, frequency in enumerate(frequencies):
-            ea, eb, ec = exponentials[row][mesh.triangles[part]].T
-            ab, ac, bc = (edge @ (-2 * np.pi * frequency) for edge in edges)
-            values[row] += doubled @ second_difference((ea, eb, ec), ab, ac, bc)
-    return values
+    columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
+
+    def part(start: int) -> Complexes:
+        a, b, c = (
+            np.stack([column[index] for column in columns])
+            for index in np.ascontiguousarray(mesh.triangles[start : start + _CHUNK].T)
+        )
+        return _sums((a, b, c), frequencies)
+
+    starts = range(0, len(mesh.triangles), _CHUNK)
+    if threads == 1:
+        parts = [part(start) for start in starts]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(part, starts))
+    return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
 
-def second_difference(
-    exponentials: tuple[Complexes, Complexes, Complexes], ab: Reals, ac: Reals, bc: Reals
-) -> Complexes:
-    """The second divided difference of exp at three imaginary nodes iα, iβ, iγ.
+def second_difference(ab: Reals, ac: Reals) -> Complexes:
+    """The second divided difference of exp at three imaginary nodes iα, iβ, iγ whose mean is zero.
 
     Args:
-        exponentials: exp(iα), exp(iβ), exp(iγ), each (n,).
-        ab: the gap β - α in radians, (n,).
+        ab: the gap β - α in radians, (n,). Gaps are to be formed from edge vectors: differences of
+            phases have lost the digits that the phases share.
         ac: the gap γ - α, likewise.
-        bc: the gap γ - β, likewise. The gaps are passed apart from the exponentials since they keep
-            their relative accuracy only if they are formed from edge vectors.
 
     Returns:
-        complex128 (n,); 1/2 where the three nodes coincide at zero.
+        complex128 (n,); 1/2 where the three nodes coincide.
     """
-    widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(bc))
+    widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab))
     close = widest < _SERIES_REACH
     if close.all():
-        return exponentials[0] * _series(ab, ac, float(widest.max(initial=0.0)))
+        return _joined(*_series(ab, ac, float(widest.max(initial=0.0))))
     values = np.empty(len(ab), dtype=np.complex128)
-    values[close] = exponentials[0][close] * _series(ab[close], ac[close], _SERIES_REACH)
+    values[close] = _joined(*_series(ab[close], ac[close], _SERIES_REACH))
     apart = ~close
-    a, b, c = (e[apart] for e in exponentials)
-    values[apart] = _quotient(a, b, c, ab[apart], ac[apart], bc[apart])
+    b, c = ab[apart], ac[apart]
+    lowest = (b + c) / -3
+    corners = np.exp(1j * lowest), np.exp(1j * (b + lowest)), np.exp(1j * (c + lowest))
+    values[apart] = _quotient(corners, b, c)
     return values
 
 
 def doubled_areas(corners: Corners) -> Reals:
     """Twice the area of each triangle (m,), to rounding even where its corners are nearly collinear.
 
-    The edge vectors and their cross product are formed in double-double arithmetic: in plain
-    doubles an aspect ratio of 1e6 costs six digits.
+    Args:
+        corners: (3, m) each, one row an axis.
+
+    On flat triangles the edge vectors and their cross product are formed in double-double
+    arithmetic: in plain doubles an aspect ratio of 1e6 costs six digits.
     """
     a, b, c = corners
-    p = [compensated.two_sum(b[:, i], -a[:, i]) for i in range(3)]
-    q = [compensated.two_sum(c[:, i], -a[:, i]) for i in range(3)]
+    (ux, uy, uz), (vx, vy, vz) = b - a, c - a
+    doubled = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    flat = np.flatnonzero(doubled < _FLATNESS * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
+    doubled[flat] = _doubled_areas_of_flat((a[:, flat], b[:, flat], c[:, flat]))
+    return doubled
+
+
+def _doubled_areas_of_flat(corners: Corners) -> Reals:
+    a, b, c = corners
+    p = [compensated.two_sum(b[i], -a[i]) for i in range(3)]
+    q = [compensated.two_sum(c[i], -a[i]) for i in range(3)]
     normal = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
         high, low = compensated.subtract(compensated.multiply(p[i], q[j]), compensated.multiply(p[j], q[i]))
@@ -98,43 +119,80 @@ def doubled_areas(corners: Corners) -> Reals:
     return np.asarray(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
 
 
-def _vertex_exponentials(vertices: Reals, frequency: Reals) -> Complexes:
-    """exp(-2πi ξ·p) at each vertex, with the phase reduced before it is rounded."""
-    bound = float(np.abs(vertices).max(initial=0.0) * np.abs(frequency).sum())
-    if bound <= _PLAIN_CYCLES:
-        return np.asarray(np.exp(-2j * np.pi * (vertices @ frequency)))
-    cycles: compensated.Pair = (np.zeros(len(vertices)), np.zeros(len(vertices)))
+def _sums(corners: Corners, frequencies: Reals) -> Complexes:
+    """The transforms (P,) of triangles together, from their corners (3, k) each."""
+    a, b, c = corners
+    ab, ac = b - a, c - a
+    doubled = doubled_areas(corners)
+    longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
+    centroids = a + (ab + ac) / 3
+    waves = -2 * np.pi * frequencies
+    gaps = zip(waves @ ab, waves @ ac, strict=True)
+    values = np.empty(len(frequencies), dtype=np.complex128)
+    for row, (frequency, (first, second)) in enumerate(zip(frequencies, gaps, strict=True)):
+        widest = 2 * np.pi * float(np.linalg.norm(frequency)) * longest
+        if widest < _SERIES_REACH:
+            values[row] = _near(doubled, centroids, frequency, first, second, widest)
+            continue
+        close = np.maximum(np.maximum(np.abs(first), np.abs(second)), np.abs(second - first)) < _SERIES_REACH
+        apart = ~close
+        values[row] = _near(
+            doubled[close], centroids[:, close], frequency, first[close], second[close], _SERIES_REACH
+        ) + doubled[apart] @ _quotient(
+            [np.exp(1j * _phases(corner[:, apart], frequency)) for corner in corners], first[apart], second[apart]
+        )
+    return values
+
+
+def _near(doubled: Reals, centroids: Reals, frequency: Reals, ab: Reals, ac: Reals, widest: float) -> complex:
+    """The transform at one frequency of triangles whose gaps are small."""
+    phases = _phases(centroids, frequency)
+    cosines, sines = doubled * np.cos(phases), doubled * np.sin(phases)
+    real, imaginary = _series(ab, ac, widest)
+    return complex(cosines @ real - sines @ imaginary, cosines @ imaginary + sines @ real)
+
+
+def _phases(points: Reals, frequency: Reals) -> Reals:
+    """-2π ξ·p at points (3, k), in radians and up to whole turns, which are taken off before rounding."""
+    if np.abs(points).max(initial=0.0) * np.abs(frequency).sum() <= _PLAIN_CYCLES:
+        return np.asarray((-2 * np.pi * frequency) @ points)
+    cycles: compensated.Pair = (np.zeros(points.shape[1]), np.zeros(points.shape[1]))
     for axis in range(3):
-        high, low = compensated.two_product(vertices[:, axis], np.broadcast_to(frequency[axis], len(vertices)))
+        high, low = compensated.two_product(points[axis], np.broadcast_to(frequency[axis], points.shape[1]))
         high -= np.rint(high)  # exact, and whole turns do not change the exponential
         total, error = compensated.two_sum(cycles[0], high)
         cycles = total, cycles[1] + (error + low)
-    return np.asarray(np.exp(-2j * np.pi * (cycles[0] + cycles[1])))
+    return np.asarray(-2 * np.pi * (cycles[0] + cycles[1]))
 
 
-def _series(ab: Reals, ac: Reals, widest: float) -> Complexes:
-    """Σ_n i^n h_n(0, ab, ac) / (n+2)!, with h_n the complete homogeneous symmetric polynomials."""
-    total, mixed = ab + ac, ab * ac
-    previous, current = np.zeros_like(ab), np.ones_like(ab)
-    parts = [np.full_like(ab, 0.5), np.zeros_like(ab)]
-    factor, n = 0.5, 0
-    # |h_n| <= (n+1) widest^n: stop where the next term is below a tenth of a rounding error of 1/2.
-    while (n + 2) * widest ** (n + 1) * factor / (n + 3) > 5e-18:
+def _series(ab: Reals, ac: Reals, widest: float) -> tuple[Reals, Reals]:
+    """Real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
+
+    With the nodes' mean at zero, h_n = p h_(n-2) + q h_(n-3) for p = Σ node²/2 and q their product.
+    """
+    lowest = (ab + ac) / -3
+    p = (ab * (ab - ac) + ac * ac) / 3
+    q = lowest * (ab + lowest) * (ac + lowest)
+    before, previous, current = np.ones_like(ab), np.zeros_like(ab), p
+    real, imaginary = 0.5 - p / 24, np.zeros_like(ab)
+    factor, n = 1 / 24, 2
+    # |h_n| <= 2 (widest · 2/3)^n: stop where the next term is below a tenth of a rounding error of 1/2.
+    while 2 * (widest * 2 / 3) ** (n + 1) * factor / (n + 3) > 5e-18:
         n += 1
         factor /= n + 2
-        previous, current = current, total * current - mixed * previous
-        parts[n % 2] += (-factor if n % 4 >= 2 else factor) * current
-    return parts[0] + 1j * parts[1]
+        before, previous, current = previous, current, p * previous + q * before
+        target = imaginary if n % 2 else real
+        target += (-factor if n % 4 >= 2 else factor) * current
+    return real, imaginary
 
 
-def _quotient(a: Complexes, b: Complexes, c: Complexes, ab: Reals, ac: Reals, bc: Reals) -> Complexes:
+def _quotient(exponentials: Sequence[Complexes], ab: Reals, ac: Reals) -> Complexes:
     """The difference quotient of the two first differences that meet across the widest gap."""
-    first = {"ab": _first_difference(a, b, ab), "ac": _first_difference(a, c, ac), "bc": _first_difference(b, c, bc)}
-    sizes = np.abs(np.stack([ab, ac, bc]))
-    widest = sizes.argmax(axis=0)
-    numerators = np.stack([first["bc"] - first["ac"], first["bc"] - first["ab"], first["ac"] - first["ab"]])
-    gaps = np.stack([ab, ac, bc])
-    pick = (widest, np.arange(len(ab)))
+    a, b, c = exponentials
+    gaps = np.stack([ab, ac, ac - ab])
+    of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, gaps[2])
+    numerators = np.stack([of_bc - of_ac, of_bc - of_ab, of_ac - of_ab])
+    pick = (np.abs(gaps).argmax(axis=0), np.arange(len(ab)))
     return np.asarray(numerators[pick] / (1j * gaps[pick]))
 
 
@@ -144,3 +202,7 @@ def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
     denominator = np.where(wide, gap, 1.0)
     near = a * np.exp(0.5j * gap) * np.sinc(gap / (2 * np.pi))
     return np.where(wide, (b - a) / (1j * denominator), near)
+
+
+def _joined(real: Reals, imaginary: Reals) -> Complexes:
+    return real + 1j * imaginary

@@ -46,7 +46,7 @@ def test_no_triangle_within_reach_exceeds_the_tolerance(tolerance: float) -> Non
     rng = np.random.default_rng(11)
     rules, reach = reaches(tolerance)
     assert (np.diff(reach) > 0).all()
-    assert (np.diff([rule.size for rule in rules]) > 0).all()
+    assert (np.diff([rule.cost for rule in rules]) > 0).all()
     for rule, limit in zip(rules, reach, strict=True):
         if limit == 0:
             continue

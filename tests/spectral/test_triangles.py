@@ -110,7 +110,7 @@ def test_areas_of_slivers_are_exact_to_rounding() -> None:
             u, v = b - a, c - a
             normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
             expected = float(mpmath.sqrt(mpmath.fsum(x * x for x in normal)))
-        found = doubled_areas((corners[:1], corners[1:2], corners[2:]))[0]
+        found = doubled_areas((corners[:1].T, corners[1:2].T, corners[2:].T))[0]
         assert found == pytest.approx(expected, rel=1e-15)
 
 
