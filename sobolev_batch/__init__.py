@@ -14,6 +14,7 @@ task; a reduction over what the tasks stored makes the tables. Data flows one wa
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import (
+    AccuracyError,
     ClusterError,
     InputError,
     LatticeError,
@@ -24,9 +25,9 @@ from sobolev_batch.errors import (
     StudyError,
 )
 from sobolev_batch.results.opening import open_store
+from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.norms import distance, inner_product, norm
-from sobolev_batch.spectral.transform import fourier_transform
 from sobolev_batch.surfaces.icosphere import icosphere
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.readers import read_mesh
@@ -34,6 +35,7 @@ from sobolev_batch.surfaces.similarity import Similarity
 from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
+    "AccuracyError",
     "ClusterError",
     "InputError",
     "Lattice",

@@ -11,16 +11,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 from distributed import get_worker
 
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.probe import Draws, Probe, join
-from sobolev_batch.spectral.quality import Quality, draws_for, probe_mesh
-from sobolev_batch.spectral.shells import Complexes
+from sobolev_batch.spectral.probe import Probe, join
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.samples import probe_block
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity, Surface
@@ -73,7 +72,7 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
         for block in blocks:
             made = transform_block(surface, job.lattice, block, job.transform, threads=1)
             job.store.write_field(job.row, job.lattice.place(block), made.values)
-            probes.append(_probe(job, surface, block, made.values))
+            probes.append(probe_block(surface, job.lattice, job.transform, job.orders, block, made.values))
             points = made.points
     except InputError as error:
         return Part(Facts(), time.perf_counter() - started, str(error))
@@ -102,17 +101,6 @@ def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
     job.store.write_record(job.row, record)
     _log.info("%s: %s in %.2f s by %s", job.label, record.status, record.seconds, record.backend)
     return record
-
-
-def _probe(job: Job, surface: Surface, block: Block, values: Complexes) -> Probe:
-    """Probe the part of a mesh's field that lies in one block."""
-    if not isinstance(surface, Mesh):
-        return Probe()
-    draws = draws_for(surface, job.lattice, job.transform.quadrature, job.transform.accuracy, job.orders)
-    offsets = draws.indices - block.start
-    inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
-    here = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
-    return probe_mesh(surface, here, values[tuple(offsets[inside].T)])
 
 
 def _whole(qualities: Sequence[Quality]) -> Quality:

@@ -23,14 +23,24 @@ Reals = NDArray[np.float64]
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation
 # between 0.5 and 8 times, the aliasing between 0.25 and 2 times what was truly lost.
-_TRUNCATION_CAUTION = 2.5
-_ALIASING_CAUTION = 5.0
+TRUNCATION_CAUTION = 2.5
+ALIASING_CAUTION = 5.0
 # The energy of the difference of two surfaces is followed from the first of these shells, in
 # fractions of xi_max, to the second, and carried on from there.
 _WINDOWS = ((0.5, 0.75), (0.75, 1.0))
 
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
 DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
+
+_CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
+_ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
+_PERIOD: Reals = _CUBE[(np.abs(_CUBE).max(axis=1) == 1)]
+# Residues of |k|² mod 4 that make a sublattice, its index, and its further images in periods.
+_SUBLATTICES: tuple[tuple[list[int], int, Reals], ...] = (
+    ([0, 2], 2, _CUBE[_ODD_ENTRIES == 3] / 2),
+    ([0, 3], 4, _CUBE[_ODD_ENTRIES == 2] / 2),
+    ([0], 8, _CUBE[_ODD_ENTRIES > 0] / 2),
+)
 
 
 @dataclass(frozen=True)
@@ -109,13 +119,13 @@ def assess(
     """
     totals: Reals = np.maximum(sums.squares.sum(axis=1), 0.0)
     values = np.sqrt(totals)
-    truncated = _truncated(sums, lattice, orders, areas)
-    aliased = _aliased(sums, lattice, orders, widths)
+    beyond = truncated(sums, lattice, orders, areas)
+    images = aliased(sums, lattice, orders, widths)
     return Assessed(
         values,
-        np.sqrt(totals + truncated) - values,
+        np.sqrt(totals + beyond) - values,
         # The larger of the two sides: the square may come out too large as well as too small.
-        np.maximum(np.sqrt(totals + aliased) - values, values - np.sqrt(np.maximum(totals - aliased, 0.0))),
+        np.maximum(np.sqrt(totals + images) - values, values - np.sqrt(np.maximum(totals - images, 0.0))),
         discretisation,
     )
 
@@ -139,8 +149,10 @@ def support_widths(extents: Sequence[Extent]) -> Reals:
     return np.asarray(highest - lowest)
 
 
-def _truncated(sums: Sums, lattice: Lattice, orders: Sequence[float], areas: Reals) -> Reals:
-    """Bound on the squared norm beyond xi_max (orders, ...).
+def truncated(
+    sums: Sums, lattice: Lattice, orders: Sequence[float], areas: Reals, highest: float | None = None
+) -> Reals:
+    """Bound on the squared norm beyond xi_max, or beyond a frequency above it (orders, ...).
 
     The energy on |ξ| = r grows like r^p, as it does for two surfaces apart by less than the
     wavelength (p = 2), until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated surfaces.
@@ -153,7 +165,7 @@ def _truncated(sums: Sums, lattice: Lattice, orders: Sequence[float], areas: Rea
         power = np.clip(np.nan_to_num(power, nan=0.0), 0.0, 4.0)
         # Below half the ceiling the growth must still come, whatever two windows say.
         power = np.where(outer < ceiling / 2, np.maximum(power, 1.0), power)
-        start = 1 + lattice.xi_max**2
+        start = 1 + (highest or lattice.xi_max) ** 2
         reached = (middles[1] * lattice.xi_max) * (ceiling / outer) ** (1 / power)
     saturated = np.maximum(1 + np.nan_to_num(reached, nan=0.0, posinf=1e150) ** 2, start)
     # With q = 1 + r², dr = dq / (2 √(q-1)), and √(q-1) is at least this part of √q from xi_max on.
@@ -165,10 +177,10 @@ def _truncated(sums: Sums, lattice: Lattice, orders: Sequence[float], areas: Rea
         growing = growth * _exprel(exponent * np.log(saturated / start))
         flat = ceiling * saturated ** (order + 0.5) / (-order - 0.5)
         tails.append(np.where(outer > 0, (growing + flat) / (2 * part), 0.0))
-    return _TRUNCATION_CAUTION * np.stack(tails)
+    return TRUNCATION_CAUTION * np.stack(tails)
 
 
-def _aliased(sums: Sums, lattice: Lattice, orders: Sequence[float], widths: Reals) -> Reals:
+def aliased(sums: Sums, lattice: Lattice, orders: Sequence[float], widths: Reals) -> Reals:
     """Estimate of the images' part in the squared norm (orders, ...).
 
     Summing over a sublattice alone brings in further images, at fractions of the period. How much
@@ -180,20 +192,25 @@ def _aliased(sums: Sums, lattice: Lattice, orders: Sequence[float], widths: Real
     for residues, index, fractions in _SUBLATTICES:
         change = np.abs(index * sums.squares[:, residues].sum(axis=1) - full)
         decay = [
-            _image_weight(_PERIOD, lattice, order, widths) / _image_weight(fractions, lattice, order, widths)
+            image_weight(lattice.spacing, order, widths) / image_weight(lattice.spacing, order, widths, fractions)
             for order in orders
         ]
         estimates.append(change * np.reshape(decay, (-1, *[1] * (change.ndim - 1))))
     largest: Reals = np.max(estimates, axis=0)
-    return _ALIASING_CAUTION * largest
+    return ALIASING_CAUTION * largest
 
 
-def _image_weight(images: Reals, lattice: Lattice, order: float, widths: Reals) -> float:
+def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:
     """The kernel summed over the least distances of surfaces to their images at n/h, relative to its peak.
 
-    The least distance of S to S + v is at least v·u - width(u), for every direction u.
+    Args:
+        spacing: h.
+        order: s.
+        widths: see `support_widths`.
+        images: n, (..., 3); by default all that differ by one period or none along each axis.
     """
-    offsets = np.abs(images @ DIRECTIONS.T) / lattice.spacing
+    # The least distance of S to S + v is at least v·u - width(u), for every direction u.
+    offsets = np.abs(images @ DIRECTIONS.T) / spacing
     distances = np.maximum((offsets - widths).max(axis=1), 0.0)
     # Of order above -3/2 the kernel has no finite peak, but the same decay: the nearest order that has.
     nu = max(-order - 1.5, 0.25)
@@ -207,14 +224,3 @@ def _exprel(x: Reals) -> Reals:
     """(exp(x) - 1) / x, 1 at zero."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.where(np.abs(x) < 1e-12, 1.0, np.expm1(x) / x)
-
-
-_CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
-_ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
-_PERIOD: Reals = _CUBE[(np.abs(_CUBE).max(axis=1) == 1)]
-# Residues of |k|² mod 4 that make a sublattice, its index, and its further images in periods.
-_SUBLATTICES: tuple[tuple[list[int], int, Reals], ...] = (
-    ([0, 2], 2, _CUBE[_ODD_ENTRIES == 3] / 2),
-    ([0, 3], 4, _CUBE[_ODD_ENTRIES == 2] / 2),
-    ([0], 8, _CUBE[_ODD_ENTRIES > 0] / 2),
-)

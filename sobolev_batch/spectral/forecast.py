@@ -19,13 +19,16 @@ from sobolev_batch.spectral.quadrature import choose_rules
 from sobolev_batch.spectral.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
 from sobolev_batch.spectral.transform import COARSEST_EPS, FINEST_EPS, Transform
 from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Surface
 
 Reals = NDArray[np.float64]
 
 # Of what a field may err, this part is left to the NUFFT.
-_NUFFT_SHARE = 0.3
+_NUFFT_SHARE = 0.25
 # The rms error of a field of many points at one frequency over eps · area: measured 0.003 to 0.006.
 _NUFFT_ERROR = 0.01
+# The same of single precision over the area, however small its eps; measured 1e-7 at most.
+_SINGLE_ROUNDING = 3e-7
 # Between neighbouring triangles this much of the odd errors was seen to remain.
 _ODD_REMAINDER = 0.3
 _BINS = 48
@@ -51,6 +54,12 @@ class Goal:
     def tightened(self, factor: float) -> Goal:
         """A goal so many times smaller."""
         return Goal(self.orders, tuple(norm / factor for norm in self.norms))
+
+
+def permits_single(surface: Surface, lattice: Lattice, goal: Goal) -> bool:
+    """Whether single precision is enough for a goal: its rounding is 1e-7 of the area at every frequency."""
+    rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(_weight_masses(lattice, goal.orders))
+    return bool(np.all(rounding <= _NUFFT_SHARE * np.array(goal.norms)))
 
 
 def settle(mesh: Mesh, lattice: Lattice, goal: Goal, transform: Transform) -> Transform:
@@ -111,9 +120,8 @@ class _Census:
         count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
         edges = np.geomspace(smallest, largest, count + 1)
         where = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
-        return cls(
-            edges[:-1], edges[1:], np.bincount(where, areas, count), np.bincount(where, areas * areas, count)
-        )
+        sums = [np.bincount(where, part, count).astype(np.float64, copy=False) for part in (areas, areas * areas)]
+        return cls(edges[:-1], edges[1:], *sums)
 
     def quadrature_error(self, lattice: Lattice, orders: Sequence[float], tolerance: float) -> Reals:
         """See `quadrature_error`.
@@ -143,7 +151,8 @@ def _typical(rule: TriangleRule, phases: Reals) -> tuple[Reals, Reals]:
     sizes, even, odd = typical_errors(rule)
     logs = np.log(np.maximum(phases, sizes[0]))
     grid = np.log(sizes)
-    return tuple(np.exp(np.interp(logs, grid, np.log(part + 1e-17))) for part in (even, odd))  # type: ignore[return-value]
+    first, second = (np.exp(np.interp(logs, grid, np.log(part + 1e-17))) for part in (even, odd))
+    return first, second
 
 
 def _weight_masses(lattice: Lattice, orders: Sequence[float]) -> Reals:

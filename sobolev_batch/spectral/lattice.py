@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import LatticeError
 
 # Beyond this the half lattice of doubles alone takes 34 GB and more; no FFT of it is sensible.
-_LARGEST_M = 2048
+LARGEST_M = 2048
 AXES = ("xi_x", "xi_y", "xi_z")
 
 
@@ -62,8 +62,8 @@ class Lattice:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.xi_max) and self.xi_max > 0):
             raise LatticeError(f"xi_max must be positive and finite, found {self.xi_max}")
-        if isinstance(self.M, bool) or not isinstance(self.M, int) or self.M % 2 or not 2 <= self.M <= _LARGEST_M:
-            raise LatticeError(f"M must be an even integer from 2 to {_LARGEST_M}, found {self.M!r}")
+        if isinstance(self.M, bool) or not isinstance(self.M, int) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
+            raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
 
     @property
     def spacing(self) -> float:

@@ -7,18 +7,21 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.pursuit import pursue
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Complexes, Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
-from sobolev_batch.spectral.transform import fourier_transform
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
@@ -29,7 +32,14 @@ _CLOSED_FORM_ACCURACY = 1e-13
 _BLOCK_SAMPLES = 1 << 22
 
 
-def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
+def norm(
+    a: Surface | xr.DataArray,
+    order: Orders,
+    *,
+    lattice: Lattice | None = None,
+    rtol: float | None = None,
+    memory: float | None = None,
+) -> xr.Dataset:
     """The Sobolev norm ||a||_s of a surface's area measure, with its error.
 
     Args:
@@ -37,6 +47,8 @@ def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = 
             answered in closed form.
         order: one order s < -1/2, or several.
         lattice: where a surface is to be transformed; a field brings its own.
+        rtol: instead of a lattice, the accuracy that is asked for; see `distance`.
+        memory: bytes that a transform may take with rtol; default 2e9.
 
     Returns:
         A dataset over `order` with `norm`, its `error`, and the parts of that: `truncation` (what
@@ -45,9 +57,14 @@ def norm(a: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = 
 
     Raises:
         OrderError: an order that is not below -1/2.
-        InputError: a mesh without a lattice.
+        InputError: a mesh without a lattice or an rtol; or both of these.
+        AccuracyError: the rtol is out of reach within the memory.
     """
     orders = check_orders(order)
+    if rtol is not None:
+        return _pursued("norm", (a,), order, lattice, _accuracy(rtol, memory))
+    if memory is not None:
+        raise InputError("memory limits what an rtol may cost; without an rtol it has no meaning")
     if isinstance(a, Sphere) and lattice is None:
         values = np.array([sphere_norm(a, s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
@@ -78,7 +95,13 @@ def inner_product(
 
 
 def distance(
-    a: Surface | xr.DataArray, b: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None
+    a: Surface | xr.DataArray,
+    b: Surface | xr.DataArray,
+    order: Orders,
+    *,
+    lattice: Lattice | None = None,
+    rtol: float | None = None,
+    memory: float | None = None,
 ) -> xr.Dataset:
     """The Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
@@ -87,16 +110,26 @@ def distance(
         b: a field on the same lattice, or a surface.
         order: one order s < -1/2, or several.
         lattice: where surfaces are to be transformed; a field brings its own.
+        rtol: instead of a lattice, the largest error of the distance relative to it. Lattice,
+            triangle rules, NUFFT accuracy and precision are then chosen, and chosen again where the
+            result's own error falls short; the attributes of what is returned tell what they were.
+        memory: bytes that a transform may take with rtol; default 2e9.
 
     Returns:
-        A dataset over `order` with `distance`, its `error`, and the parts of that; see `norm`.
+        A dataset over `order` with `distance`, its `error`, and the parts of that; see `norm`. With
+        rtol, `within` says whether the error is below rtol times the distance.
 
     Raises:
         OrderError: an order that is not below -1/2.
         LatticeError: fields on different lattices, or a surface that does not fit into the lattice.
-        InputError: a mesh, and no lattice from anywhere.
+        InputError: a mesh, and no lattice from anywhere; or a lattice or a field, and an rtol.
+        AccuracyError: the rtol is out of reach within the memory; says what can be reached.
     """
     orders = check_orders(order)
+    if rtol is not None:
+        return _pursued("distance", (a, b), order, lattice, _accuracy(rtol, memory))
+    if memory is not None:
+        raise InputError("memory limits what an rtol may cost; without an rtol it has no meaning")
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         values = np.array([sphere_distance(a, b, s) for s in orders])
         squares = np.array([sphere_norm(a, s) ** 2 + sphere_norm(b, s) ** 2 for s in orders])
@@ -104,6 +137,35 @@ def distance(
     first, second = _pair(a, b, lattice, orders)
     known = Lattice.of(first)
     return _dataset("distance", order, _assessed(_shells_of(first, second, known), known, orders, [first, second]))
+
+
+def _accuracy(rtol: float, memory: float | None) -> Accuracy:
+    return Accuracy(rtol) if memory is None else Accuracy(rtol, memory)
+
+
+def _pursued(
+    name: str, parts: Sequence[Surface | xr.DataArray], order: Orders, lattice: Lattice | None, accuracy: Accuracy
+) -> xr.Dataset:
+    """A norm or distance to an accuracy, with what was chosen for it in the attributes."""
+    surfaces = [part for part in parts if not isinstance(part, xr.DataArray)]
+    if lattice is not None or len(surfaces) < len(parts):
+        raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
+    for surface in surfaces:
+        _check_surface(surface)
+    orders = check_orders(order)
+    found = pursue(surfaces, orders, accuracy, threads=os.cpu_count() or 1, what=f"the {name}")
+    dataset = _dataset(name, order, found.assessed)
+    within = accuracy.met(found.assessed).reshape(np.shape(order))
+    settings = [field.settings for field in found.fields]
+    return dataset.assign(within=(dataset[name].dims, within)).assign_attrs(
+        rtol=accuracy.rtol,
+        xi_max=found.lattice.xi_max,
+        M=found.lattice.M,
+        dtype=settings[0].precision,
+        eps=[setting.accuracy for setting in settings],
+        tolerance=[setting.rule_tolerance for setting in settings],
+        points=[field.points for field in found.fields],
+    )
 
 
 def _shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
@@ -173,11 +235,15 @@ def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[
                 f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
             )
         return a
+    _check_surface(a)
+    if lattice is None:
+        raise InputError("a mesh needs a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=...")
+    return fourier_transform(a, lattice, orders=orders)
+
+
+def _check_surface(a: object) -> None:
     if not isinstance(a, Mesh | Sphere):
         raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
-    if lattice is None:
-        raise InputError("a mesh needs a lattice to be compared on: pass lattice=Lattice(xi_max=..., M=...)")
-    return fourier_transform(a, lattice, orders=orders)
 
 
 def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.shells import shell_weights
 
 Reals = NDArray[np.float64]
@@ -40,6 +41,16 @@ class Draws:
     indices: NDArray[np.int64]
     frequencies: Reals
     scales: Reals
+
+    def within(self, block: Block) -> Draws:
+        """Those that lie in a block."""
+        offsets = self.indices - block.start
+        inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
+        return Draws(self.indices[inside], self.frequencies[inside], self.scales[inside])
+
+    def places(self, block: Block) -> tuple[NDArray[np.int64], ...]:
+        """Where the draws lie in an array of a block that holds them all."""
+        return tuple((self.indices - block.start).T)
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,7 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
     return Draws(indices, lattice.spacing * indices.astype(np.float64), 1 / (count * chances[shells]))
 
 
-def measure(draws: Draws, computed: Complexes, exact: Complexes) -> Probe:
+def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact: Complexes) -> Probe:
     """The probe that a field's values at the drawn frequencies (P,) and the exact ones make."""
     sums = draws.scales * np.abs(computed - exact) ** 2
     shells = np.sum(draws.indices**2, axis=1)

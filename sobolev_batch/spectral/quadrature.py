@@ -82,11 +82,7 @@ class Quadrature:
         """
         groups = self._groups(mesh, highest_frequency, tolerance)
         # Nodes are merged within a piece, hence larger pieces where they are shared.
-        pieces = [
-            piece
-            for group in groups
-            for piece in group.cut(capacity // (2 if group.rule.sharing > 1 else 8))
-        ]
+        pieces = [piece for group in groups for piece in group.cut(capacity // (2 if group.rule.sharing > 1 else 8))]
         ends = np.cumsum([piece.most_points for piece in pieces])
         total = int(ends[-1])
         count = -(-total // (capacity - max(piece.most_points for piece in pieces)))

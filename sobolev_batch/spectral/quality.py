@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,16 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.budget import DIRECTIONS
-from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
-from sobolev_batch.spectral.quadrature import Quadrature
-from sobolev_batch.spectral.triangles import exact_transform
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -60,15 +54,3 @@ class Quality:
         """The quality that a line holds."""
         area, lowest, highest, shells, sums = json.loads(text)
         return cls(area, tuple(lowest), tuple(highest), Probe(tuple(shells), tuple(sums)))
-
-
-def draws_for(mesh: Mesh, lattice: Lattice, quadrature: Quadrature, tolerance: float, orders: Sequence[float]) -> Draws:
-    """The frequencies at which a mesh's field is to be probed; the same mesh gives the same ones."""
-    degree = quadrature.lowest_degree(mesh, lattice.highest_frequency, tolerance)
-    seed = int(np.float64(mesh.area).view(np.uint64))
-    return draw(lattice, orders, degree, draw_count(len(mesh.triangles)), seed)
-
-
-def probe_mesh(mesh: Mesh, draws: Draws, computed: Complexes) -> Probe:
-    """Compare a field's values at the drawn frequencies (P,) with the exact transform there."""
-    return measure(draws, computed, exact_transform(mesh, draws.frequencies))

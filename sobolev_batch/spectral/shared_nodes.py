@@ -20,7 +20,8 @@ def merged_corners(mesh: Mesh, members: Indices) -> tuple[Reals, Reals]:
     Returns:
         coordinates (3, n), in units of length; weights (n,), in squared units of length.
     """
-    weights = np.bincount(mesh.triangles[members].ravel(), weights=np.repeat(mesh.areas[members] / 3, 3))
+    thirds = np.repeat(mesh.areas[members] / 3, 3)
+    weights: Reals = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
     there = np.flatnonzero(weights)
     return np.ascontiguousarray(mesh.vertices[there].T), weights[there]
 

@@ -1,24 +1,18 @@
-"""The Fourier transform of a surface on a lattice: closed form, or quadrature and NUFFT."""
+"""The Fourier transform of a surface on a block of the lattice: closed form, or quadrature and NUFFT."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import LARGEST_OVERSAMPLING, Complexes, Precision, transform_points
-from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
-from sobolev_batch.spectral.quality import Quality, draws_for, probe_mesh
-from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.spheres import sphere_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
@@ -31,9 +25,6 @@ NUMERICS_VERSION = 3
 # Points of one NUFFT call: 4 million take 0.5 GB with their strengths and their sorting, and make
 # the FFT of a call a small part of it.
 DEFAULT_BATCH = 1 << 22
-
-# Where nobody says which orders a field is for.
-PROBED_ORDERS = (-2.0, -5.0, -10.0)
 
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
 FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
@@ -82,6 +73,12 @@ class Transform:
         """The tolerance in force."""
         return self.accuracy if self.tolerance is None else self.tolerance
 
+    def lowest_degree(self, surface: Surface, lattice: Lattice) -> int:
+        """The lowest degree among the rules that triangles get, whose error shows first; 0 for a closed form."""
+        if not isinstance(surface, Mesh):
+            return 0
+        return self.quadrature.lowest_degree(surface, lattice.highest_frequency, self.rule_tolerance)
+
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
@@ -94,58 +91,6 @@ class Transformed:
 
     values: Complexes
     points: int
-
-
-def fourier_transform(
-    surface: Surface,
-    lattice: Lattice,
-    eps: float | None = None,
-    *,
-    dtype: Precision = "complex128",
-    quadrature: str | int = "auto",
-    threads: int | None = None,
-    orders: Sequence[float] = PROBED_ORDERS,
-) -> xr.DataArray:
-    """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
-
-    Args:
-        surface: a `Mesh` or `Sphere`, in units of length.
-        lattice: the frequencies.
-        eps: accuracy relative to the surface's area; the error reached is a small multiple of it.
-            Default 1e-9, or 1e-6 in single precision.
-        dtype: "complex128" or "complex64".
-        quadrature: "auto", a degree from 1 to 50, or "gauss8".
-        threads: of the NUFFT; default one per core.
-        orders: the orders for which the field's own error is probed; it can be had for any other
-            order too, with more uncertainty.
-
-    Returns:
-        The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
-        xi_z in cycles per unit length. The other half is the conjugate of this one. The attribute
-        `quality` holds what the errors of norms and distances need to know of the field.
-
-    Raises:
-        LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
-        InputError: settings out of range.
-
-    Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
-    """
-    settings = Transform(eps, dtype, Quadrature(quadrature))
-    values = transform_block(surface, lattice, lattice.half, settings, threads=threads or os.cpu_count() or 1).values
-    probe = Probe()
-    if isinstance(surface, Mesh):
-        draws = draws_for(surface, lattice, settings.quadrature, settings.accuracy, check_orders(orders))
-        probe = probe_mesh(surface, draws, values[tuple((draws.indices - lattice.half.start).T)])
-    quality = Quality.of_surface(surface, probe)
-    attributes = {"eps": settings.accuracy, "quadrature": quadrature, "quality": quality.to_json()}
-    return as_field(values, lattice, attributes)
-
-
-def as_field(values: NDArray[Any], lattice: Lattice, attributes: dict[str, Any]) -> xr.DataArray:
-    """An array over the half lattice as a labelled field."""
-    units = {"units": "cycles per unit length"}
-    coordinates = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
-    return xr.DataArray(values, coords=coordinates, dims=AXES, name="fourier", attrs=attributes)
 
 
 def transform_block(

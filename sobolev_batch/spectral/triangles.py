@@ -105,7 +105,7 @@ def doubled_areas(corners: Corners) -> Reals:
     doubled = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     flat = np.flatnonzero(doubled < _FLATNESS * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
     doubled[flat] = _doubled_areas_of_flat((a[:, flat], b[:, flat], c[:, flat]))
-    return doubled
+    return np.asarray(doubled)
 
 
 def _doubled_areas_of_flat(corners: Corners) -> Reals:

@@ -202,7 +202,7 @@ def _centroid_radii(edges: _Edges) -> NDArray[np.float64]:
     first, second = edges
     centroid = (first + second) / 3
     squares = [np.einsum("ij,ij->j", arm, arm) for arm in (centroid, first - centroid, second - centroid)]
-    return np.sqrt(np.maximum.reduce(squares))
+    return np.asarray(np.sqrt(np.maximum.reduce(squares)))
 
 
 def _array(values: ArrayLike, name: str) -> NDArray[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from tempfile import TemporaryFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +48,15 @@ def parse_ply(data: bytes) -> Raw:
 
 def _read(data: bytes, text: bool, lengths: dict[str, dict[str, int]]) -> tuple[PlyData, int]:
     """The parsed file, and how many bytes of a binary one were left over."""
-    stream = io.BytesIO(data)
-    ply = PlyData.read(stream, known_list_len=lengths)
-    # Of text the library closes the stream; there, lines are counted.
-    return ply, 0 if text else len(data) - stream.tell()
+    if text:
+        # The library closes the stream of a text; there, lines are counted.
+        return PlyData.read(io.BytesIO(data), known_list_len=lengths), 0
+    # A real file, since of any other stream the library reads row by row.
+    with TemporaryFile() as stream:
+        stream.write(data)
+        stream.seek(0)
+        ply = PlyData.read(stream, known_list_len=lengths)
+        return ply, len(data) - stream.tell()
 
 
 def _triangles(faces: PlyElement) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ Merge = Callable[[Mesh, NDArray[np.int64]], tuple[Reals, Reals]]
 CASES = [(merged_corners, corner_rule()), (merged_midpoints, midpoint_rule())]
 # Three triangles on one edge, one of them twice, one with a corner repeated, and a vertex of no triangle.
 ODD = Mesh(
-    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0.5], [9, 9, 9]],
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0.5], [9, 9, 9]]),
     [[0, 1, 2], [1, 0, 3], [0, 1, 4], [4, 0, 1], [2, 2, 3]],
 )
 

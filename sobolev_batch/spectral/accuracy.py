@@ -1,0 +1,214 @@
+"""From the accuracy that is asked for to the lattice that gives it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betainc
+
+from sobolev_batch.errors import AccuracyError, InputError
+from sobolev_batch.spectral.budget import (
+    ALIASING_CAUTION,
+    TRUNCATION_CAUTION,
+    Assessed,
+    Sums,
+    aliased,
+    image_weight,
+    truncated,
+)
+from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
+from sobolev_batch.spectral.transform import Transform, memory_bytes
+
+Reals = NDArray[np.float64]
+
+# The part of the accuracy that aliasing may use up; the rest is for truncation and the fields' own errors.
+_ALIASING_SHARE = 0.1
+# At low orders the tail falls so fast that leaving it little costs nothing.
+_TRUNCATION_SHARE, _HIGH_ORDER = 0.7, 2.0
+_DEFAULT_MEMORY = 2e9
+# Before anything is known of a pair: how much larger than the kernel alone says its images are, and
+# by how much a tail may exceed that of two surfaces close to each other.
+_IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
+# Where those laws ask for more than this, a lattice of this size finds out first.
+_PILOT_M = 64
+_HIGHEST_FREQUENCY = 1e4
+_STEP = 1.04
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What is asked of distances instead of a lattice and settings.
+
+    Args:
+        rtol: largest error of a distance, relative to it.
+        memory: bytes that the computing of one field may take.
+
+    Raises:
+        InputError: an rtol that is not between 0 and 1, or memory that is not positive.
+    """
+
+    rtol: float
+    memory: float = _DEFAULT_MEMORY
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rtol < 1:
+            raise InputError(f"rtol must lie between 0 and 1, found {self.rtol!r}")
+        if not (math.isfinite(self.memory) and self.memory > 0):
+            raise InputError(f"memory must be a positive number of bytes, found {self.memory!r}")
+
+    def met(self, found: Assessed) -> NDArray[np.bool_]:
+        """Which numbers have an error within rtol of them; a distance of exactly zero has."""
+        return np.asarray(found.errors <= self.rtol * found.values)
+
+    @property
+    def largest_intervals(self) -> int:
+        """The largest M whose fields fit into the memory, two of them and the transform that makes one.
+
+        Raises:
+            InputError: not even the smallest lattice fits.
+        """
+        candidates = np.arange(2, LARGEST_M + 1, 2)
+        fits = [self._bytes(int(M)) <= self.memory for M in candidates]
+        if not fits[0]:
+            raise InputError(f"memory of {self.memory:.3g} bytes is too little: {self._bytes(2):.3g} are needed")
+        return int(candidates[np.count_nonzero(fits) - 1])
+
+    @staticmethod
+    def _bytes(intervals: int) -> float:
+        half = Lattice(1.0, intervals).half
+        return memory_bytes(half, Transform()) + 2 * 16 * half.size
+
+
+def truncation_share(order: float) -> float:
+    """The part of the accuracy that truncation may use up at an order."""
+    return _TRUNCATION_SHARE * min(1.0, _HIGH_ORDER / -order)
+
+
+def discretisation_share(order: float) -> float:
+    """The part of the accuracy that the errors of both fields together may use up at an order."""
+    return 1 - _ALIASING_SHARE - truncation_share(order)
+
+
+def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
+    """The lattice that two surfaces close to each other need, before anything else is known of them.
+
+    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. Where that is
+    too much to compute without having looked, the lattice is a pilot.
+
+    Args:
+        widths: extents (13,) of all surfaces together, see `support_widths`.
+        orders: s, each.
+        accuracy: what is asked for.
+
+    Returns:
+        A lattice, and whether it is a pilot that is likely to be `refined`.
+    """
+    period = _first_period(widths, orders, accuracy.rtol)
+    radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
+    highest = radii[0]
+    for order in orders:
+        # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
+        tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
+        allowed = truncation_share(order) * accuracy.rtol / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+        enough = np.flatnonzero(tails <= allowed)
+        highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
+    intervals = good_intervals(2 * highest * period)
+    most = min(_PILOT_M, accuracy.largest_intervals)
+    if intervals > most:
+        return Lattice(most / (2 * period), most), True
+    return Lattice(intervals / (2 * period), intervals), False
+
+
+def refined(
+    lattice: Lattice, sums: Sums, orders: Sequence[float], accuracy: Accuracy, *, areas: Reals, widths: Reals, what: str
+) -> Lattice:
+    """The lattice that distances need, from their sums on a smaller one.
+
+    Args:
+        lattice: on which the sums were taken.
+        sums: of the difference of a pair of surfaces, or of several pairs.
+        orders: s, each.
+        accuracy: what is asked for.
+        areas: (...) of both surfaces of a pair together.
+        widths: extents (13,) of all surfaces together.
+        what: names the pair in the message.
+
+    Returns:
+        A lattice at least as fine and as large as the given one.
+
+    Raises:
+        AccuracyError: it does not fit into the memory; says what does.
+    """
+    totals: Reals = sums.squares.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        images = np.nan_to_num(aliased(sums, lattice, orders, widths) / (2 * totals), posinf=0.0)
+    images = images.reshape(len(orders), -1).max(axis=1)
+    period = 1 / lattice.spacing
+    before = np.array([image_weight(1 / period, order, widths) for order in orders])
+    while period < 1 / lattice.spacing + 8 and any(
+        image * image_weight(1 / period, order, widths) / weight > _ALIASING_SHARE * accuracy.rtol
+        for image, order, weight in zip(images, orders, before, strict=True)
+    ):
+        period += 0.02 / lattice.spacing
+
+    def tail(highest: float) -> Reals:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = np.nan_to_num(truncated(sums, lattice, orders, areas, highest) / (2 * totals), posinf=0.0)
+        return np.asarray(parts.reshape(len(orders), -1).max(axis=1))
+
+    most = accuracy.largest_intervals
+    highest = lattice.xi_max
+    shares = np.array([truncation_share(order) for order in orders])
+    while np.any(tail(highest) > shares * accuracy.rtol):
+        highest *= _STEP
+        if 2 * highest * period > most:
+            parts = tail(max(most / (2 * period), lattice.xi_max)) / shares
+            worst = int(np.argmax(parts))
+            reachable = _rounded_up(float(parts[worst]))
+            raise AccuracyError(
+                f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: within "
+                f"{accuracy.memory / 1e9:.3g} GB (M <= {most}) about {reachable:g} can be reached; "
+                "ask for that, allow more memory, or take a lower order",
+                accuracy.rtol,
+                reachable,
+            )
+    intervals = min(good_intervals(2 * highest * period), most)
+    return Lattice(intervals / (2 * period), intervals)
+
+
+def good_intervals(least: float) -> int:
+    """An even M of at least so much for which the FFT of the fine grid is quick and wasted on nothing."""
+    smallest = 2 * math.ceil(least / 2)
+    choices = range(smallest, smallest + max(8, smallest // 8), 2)
+    return min(choices, key=lambda M: (_grid(M + 1) ** 2 * _grid(M // 2 + 1), -M))
+
+
+def _grid(modes: int) -> int:
+    """The even number of grid points without prime factors above 5 that a doubled axis of modes gets."""
+    count = 2 * modes
+    while True:
+        rest = count
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return count
+        count += 2
+
+
+def _first_period(widths: Reals, orders: Sequence[float], rtol: float) -> float:
+    period = float(widths.max())
+    allowed = _ALIASING_SHARE * rtol / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
+    while any(image_weight(1 / period, order, widths) > allowed for order in orders):
+        period *= 1.01
+    return period
+
+
+def _rounded_up(value: float) -> float:
+    """Two digits are as many as an estimate has."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit) * unit

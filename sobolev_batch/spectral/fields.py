@@ -1,0 +1,157 @@
+"""Fourier fields of surfaces on the half lattice, each with what is known of its error."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.spectral.forecast import Goal, settle
+from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.nufft import Complexes, Precision
+from sobolev_batch.spectral.probe import measure
+from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.samples import Sample, needs_probe, probe_block
+from sobolev_batch.spectral.shells import check_orders
+from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.similarity import Surface
+
+# Where nobody says which orders a field is for.
+PROBED_ORDERS = (-2.0, -5.0, -10.0)
+# Of the rules that most triangles get: samples drawn for it serve coarser and equal ones.
+USUAL_DEGREE = 2
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A field that was computed for a goal.
+
+    Attributes:
+        values: complex, the half lattice.
+        quality: what is known of its error.
+        settings: that it was computed with.
+        points: of the quadrature.
+    """
+
+    values: Complexes
+    quality: Quality
+    settings: Transform
+    points: int
+
+
+def fourier_transform(
+    surface: Surface,
+    lattice: Lattice,
+    eps: float | None = None,
+    *,
+    dtype: Precision = "complex128",
+    quadrature: str | int = "auto",
+    threads: int | None = None,
+    orders: Sequence[float] = PROBED_ORDERS,
+) -> xr.DataArray:
+    """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
+
+    Args:
+        surface: a `Mesh` or `Sphere`, in units of length.
+        lattice: the frequencies.
+        eps: accuracy relative to the surface's area; the error reached is a small multiple of it.
+            Default 1e-9, or 1e-6 in single precision.
+        dtype: "complex128" or "complex64".
+        quadrature: "auto", a degree from 1 to 50, or "gauss8".
+        threads: of the NUFFT; default one per core.
+        orders: the orders for which the field's own error is probed; it can be had for any other
+            order too, with more uncertainty.
+
+    Returns:
+        The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
+        xi_z in cycles per unit length. The other half is the conjugate of this one. The attribute
+        `quality` holds what the errors of norms and distances need to know of the field.
+
+    Raises:
+        LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
+        InputError: settings out of range.
+
+    Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
+    """
+    settings = Transform(eps, dtype, Quadrature(quadrature))
+    field = compute_field(surface, lattice, settings, check_orders(orders), threads=threads or os.cpu_count() or 1)
+    attributes = {
+        "eps": settings.accuracy,
+        "quadrature": settings.quadrature.method,
+        "quality": field.quality.to_json(),
+    }
+    units = {"units": "cycles per unit length"}
+    coordinates = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
+    return xr.DataArray(field.values, coords=coordinates, dims=AXES, name="fourier", attrs=attributes)
+
+
+def compute_field(
+    surface: Surface,
+    lattice: Lattice,
+    settings: Transform,
+    orders: Sequence[float],
+    *,
+    sample: Sample | None = None,
+    threads: int = 1,
+) -> Field:
+    """The field of a surface with given settings, and its probe.
+
+    Args:
+        surface: whose field.
+        lattice: where.
+        settings: how.
+        orders: that it is probed for.
+        sample: of the surface, drawn for these orders and `USUAL_DEGREE`, where there is one.
+        threads: to compute with.
+
+    Raises:
+        LatticeError: a mesh reaches beyond the lattice's half period.
+    """
+    block = lattice.half
+    made = transform_block(surface, lattice, block, settings, threads=threads)
+    usable = sample is not None and settings.lowest_degree(surface, lattice) <= USUAL_DEGREE
+    if sample is not None and usable and needs_probe(surface, settings):
+        probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
+    else:
+        probe = probe_block(surface, lattice, settings, orders, block, made.values, threads=threads)
+    return Field(made.values, Quality.of_surface(surface, probe), settings, made.points)
+
+
+def field_for(
+    surface: Surface,
+    lattice: Lattice,
+    goal: Goal,
+    transform: Transform,
+    *,
+    sample: Sample | None = None,
+    threads: int = 1,
+) -> Field:
+    """The field of a surface with an error that keeps a goal, as far as its probe can tell.
+
+    Args:
+        surface: whose field.
+        lattice: where.
+        goal: what its error may be.
+        transform: whose precision and quadrature are kept.
+        sample: of the surface, where there is one.
+        threads: to compute with.
+
+    Returns:
+        The first of a few attempts that keeps the goal, or the last.
+    """
+    if not isinstance(surface, Mesh):
+        return compute_field(surface, lattice, transform, goal.orders, sample=sample)
+    for _ in range(_ATTEMPTS):
+        settings = settle(surface, lattice, goal, transform)
+        field = compute_field(surface, lattice, settings, goal.orders, sample=sample, threads=threads)
+        excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
+        if excess <= 1:
+            break
+        goal = goal.tightened(2 * excess)
+    return field
