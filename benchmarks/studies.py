@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from shutil import rmtree
 from statistics import median
@@ -17,8 +17,8 @@ from distributed import Client
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from benchmarks.table import Row, as_bytes, as_seconds, at_most
-from benchmarks.timing import Effort, take_turns
+from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
+from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.spectral.shells import shell_weights
@@ -28,7 +28,7 @@ _WORKERS = 2
 _OVERHEAD = at_most(1.15)
 _ALL_PAIRS = at_most(2)
 _XI_MAX = 5.0
-_PURE_PER_WORKER = 8
+_SAMPLE_PER_WORKER = 8
 
 Reals = NDArray[np.float64]
 
@@ -55,34 +55,48 @@ class Split:
         return self.planning + self.fields + self.reduction
 
 
+@dataclass(frozen=True)
+class Parts:
+    """What the parts of a task take by themselves, in seconds.
+
+    Attributes:
+        reading: of the mesh's file.
+        transform: the bare transform.
+        describing: edge lengths, counts and digest, which go into the mesh's record.
+    """
+
+    reading: float
+    transform: float
+    describing: float
+
+
 def study_overhead(effort: Effort) -> Iterator[Row]:
     """Item 5: a study of many meshes against its transforms alone."""
     count, level, intervals = (8, 3, 32) if effort.quick else (200, 5, 64)
     splits: list[Split] = []
-    pure: list[float] = []
+    parts: list[Parts] = []
     with TemporaryDirectory() as name, local_client(_WORKERS) as client:
         folder = Path(name)
         paths = _write_meshes(folder, count, level)
         study = sb.Study.from_table(_study_of_files(intervals), folder=folder)
-        for turn in range(effort.repeats + 1):
-            split = _split_run(study, folder / "study.zarr", client)
+        # The workers' tables of rules are made once, whatever the number of meshes.
+        _parts(client, paths, study)
+        for _ in range(effort.repeats):
+            splits.append(_split_run(study, folder / "study.zarr", client))
             rmtree(folder / "study.zarr")
-            alone = count * _pure_seconds(client, paths, study)
-            # The first turn fills the workers' tables of rules.
-            if turn:
-                splits.append(split)
-                pure.append(alone)
-    alone = median(pure)
+            parts.append(_parts(client, paths, study))
+    pure = count * median(part.transform for part in parts)
     what = f"study of {count} x T_{level}, M = {intervals}"
 
-    def row(part: str, seconds: float, target: bool = False) -> Row:
-        ratio = seconds / alone
-        return Row("5", f"{what}: {part}", as_seconds(seconds), as_seconds(alone), ratio, _OVERHEAD if target else None)
+    def row(name: str, seconds: float, target: Target | None = None) -> Row:
+        return Row("5", f"{what}: {name}", as_seconds(seconds), as_seconds(pure), seconds / pure, target)
 
-    yield row("wall time x workers", _WORKERS * median(split.total for split in splits), target=True)
+    yield row("wall time x workers", _WORKERS * median(split.total for split in splits), _OVERHEAD)
     yield row("of it planning", _WORKERS * median(split.planning for split in splits))
     yield row("of it fields", _WORKERS * median(split.fields for split in splits))
     yield row("of the fields within tasks", median(split.tasks for split in splits))
+    yield row("of the tasks reading", count * median(part.reading for part in parts))
+    yield row("of the tasks describing", count * median(part.describing for part in parts))
     yield row("of it reduction and tables", _WORKERS * median(split.reduction for split in splits))
 
 
@@ -128,26 +142,31 @@ def _split_run(study: sb.Study, store: Path, client: Client) -> Split:
     return Split(fields - started, reduction - fields, ended - reduction, sum(tasks))
 
 
-def _pure_seconds(client: Client, paths: Sequence[Path], study: sb.Study) -> float:
-    """The mean time of a mesh's transform while every worker is busy with such."""
-    shares = [paths[i::_WORKERS][:_PURE_PER_WORKER] for i in range(_WORKERS)]
+def _parts(client: Client, paths: Sequence[Path], study: sb.Study) -> Parts:
+    """The mean times of a mesh's parts while every worker is busy with the same part of others."""
+    shares = [paths[i::_WORKERS][:_SAMPLE_PER_WORKER] for i in range(_WORKERS)]
     futures = [
-        client.submit(_transform_seconds, share, study.lattice, study.transform, workers=[worker], pure=False)
+        client.submit(_measure_parts, share, study.lattice, study.transform, workers=[worker], pure=False)
         for share, worker in zip(shares, client.scheduler_info()["workers"], strict=True)
     ]
-    found: list[list[float]] = client.gather(futures)
-    return float(np.mean(np.concatenate(found)))
+    found: list[Parts] = client.gather(futures)
+    return Parts(*np.mean([astuple(parts) for parts in found], axis=0).tolist())
 
 
-def _transform_seconds(paths: Sequence[Path], lattice: sb.Lattice, transform: Transform) -> list[float]:
-    # All are read first, so that the workers transform at the same time.
-    meshes = [sb.read_mesh(path) for path in paths]
-    seconds = []
-    for mesh in meshes:
-        started = time.perf_counter()
-        transform_block(mesh, lattice, lattice.half, transform, threads=1)
-        seconds.append(time.perf_counter() - started)
-    return seconds
+def _measure_parts(paths: Sequence[Path], lattice: sb.Lattice, transform: Transform) -> Parts:
+    meshes: list[sb.Mesh] = []
+    reading = elapsed_seconds(lambda: meshes.extend(sb.read_mesh(path) for path in paths))
+
+    def transform_all() -> None:
+        for mesh in meshes:
+            transform_block(mesh, lattice, lattice.half, transform, threads=1)
+
+    def describe_all() -> None:
+        for mesh in meshes:
+            _ = mesh.edge_lengths, mesh.counts, mesh.digest
+
+    parts = reading, elapsed_seconds(transform_all), elapsed_seconds(describe_all)
+    return Parts(*(seconds / len(meshes) for seconds in parts))
 
 
 def _write_meshes(folder: Path, count: int, level: int) -> list[Path]:

@@ -108,7 +108,7 @@ def as_in_the_paper(effort: Effort) -> Iterator[Row]:
     level, intervals = (2, 32) if effort.quick else (5, 128)
     finest = 3 if effort.quick else 7
     sizes = [(n, intervals) for n in range(finest + 1)]
-    sizes += [(level, m) for m in ((32,) if effort.quick else (32, 64))]
+    sizes += [(level, m) for m in ((48,) if effort.quick else (32, 64))]
     if effort.large:
         sizes += [(level, m) for m in (256, 416)]
     for n, m in sizes:
