@@ -36,7 +36,11 @@ def main() -> None:
         for row in _ITEMS[item](effort):
             print("  ".join(filter(None, row.cells())), file=sys.stderr, flush=True)
             rows.append(row)
-    facts = [*machine_facts(), f"times are medians of {effort.repeats} turns each, taken alternately"]
+    facts = [
+        *machine_facts(),
+        f"times are medians of {effort.repeats} turns each, taken alternately",
+        "items 1 to 4: ratios of times are other / ours; items 5 to 7: ours / other; distances: relative difference",
+    ]
     print("\n".join(["", format_table(rows), "", *facts]))
     if options.markdown:
         lines = ["# Benchmarks", "", *(f"- {fact}" for fact in facts), "", format_table(rows, "github"), ""]

@@ -6,13 +6,14 @@ one half of it is the conjugate of the other; norms are trapezoidal sums over th
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import finufft
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.timing import elapsed_seconds
+from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh, Sphere
 from sobolev_batch.spectral.nufft import Precision
 from sobolev_batch.spectral.rules import gauss_rule
@@ -59,13 +60,12 @@ def whole_transform(
 
 def faster_upsampling(mesh: Mesh, lattice: Lattice, *, eps: float, precision: Precision, threads: int) -> float:
     """The upsampling of the NUFFT's fine grid with which `whole_transform` takes less time here."""
-
-    def seconds(upsampling: float) -> float:
-        return elapsed_seconds(
-            lambda: whole_transform(mesh, lattice, eps=eps, precision=precision, upsampling=upsampling, threads=threads)
-        )
-
-    return min(_UPSAMPLINGS, key=seconds)
+    contestants = [
+        partial(whole_transform, lattice=lattice, eps=eps, precision=precision, upsampling=upsampling, threads=threads)
+        for upsampling in _UPSAMPLINGS
+    ]
+    seconds = take_turns(contestants, lambda: mesh, repeats=1)
+    return _UPSAMPLINGS[int(np.argmin(seconds))]
 
 
 def relative_distance(values: Complexes, lattice: Lattice, order: float) -> float:
