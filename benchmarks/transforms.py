@@ -135,10 +135,10 @@ def against_the_direct_sum(effort: Effort) -> Iterator[Row]:
     yield Row("4", f"direct sum: T_{level}, half of M = {intervals}", as_seconds(fast), as_seconds(slow), slow / fast)
     finest, most = (4, 32) if effort.quick else (7, 128)
     large, whole = sb.icosphere(finest), sb.Lattice(XI_MAX, most)
-    growth = len(large.triangles) / len(mesh.triangles) * (whole.half.size / lattice.half.size)
+    larger = len(large.triangles) / len(mesh.triangles) * (whole.half.size / lattice.half.size)
     fast = _our_seconds(large, whole, effort)
     what = f"direct sum: T_{finest}, half of M = {most}, extrapolated"
-    yield Row("4", what, as_seconds(fast), as_seconds(slow * growth), slow * growth / fast)
+    yield Row("4", what, as_seconds(fast), as_seconds(slow * larger), slow * larger / fast)
 
 
 def growth(effort: Effort) -> Iterator[Row]:
