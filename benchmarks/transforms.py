@@ -1,0 +1,189 @@
+"""Times of one transform: against the paper's pipeline, against the direct sum, and how they grow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import sobolev_batch as sb
+from benchmarks.direct import direct_transform, frequencies_of
+from benchmarks.paper import Complexes, faster_upsampling, relative_distance, whole_transform
+from benchmarks.table import Row, as_seconds, at_least, at_most
+from benchmarks.timing import Effort, take_turns
+from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.transform import Transform, as_field, transform_block
+from sobolev_batch.spectral.triangles import exact_transform
+
+ORDER = -10.0
+XI_MAX = 5.0
+_EPS: dict[Precision, float] = {"complex128": 1e-9, "complex64": 1e-6}
+_SPEED_UP = at_least(18)
+_SAME_DISTANCE = at_most(2e-6)
+# Relative to the area. The direct sum's guard keeps some eleven digits.
+_DIRECT_AGREES = 1e-9
+
+
+def settings(precision: Precision) -> Transform:
+    """How the package computes the fields that are timed here."""
+    return Transform(_EPS[precision], precision)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One mesh on one lattice, for both pipelines.
+
+    Attributes:
+        mesh: its caches may be filled.
+        lattice: the frequencies.
+        precision: of both pipelines.
+        threads: of both NUFFTs.
+        upsampling: of the paper's.
+    """
+
+    mesh: sb.Mesh
+    lattice: sb.Lattice
+    precision: Precision
+    threads: int
+    upsampling: float
+
+    @classmethod
+    def of(cls, level: int, intervals: int, effort: Effort, precision: Precision = "complex128") -> Case:
+        """An icosphere on a lattice up to 5 cycles per unit length."""
+        mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
+        upsampling = faster_upsampling(mesh, lattice, eps=_EPS[precision], precision=precision, threads=effort.threads)
+        return cls(mesh, lattice, precision, effort.threads, upsampling)
+
+    def fresh_mesh(self) -> sb.Mesh:
+        """The mesh as `fresh` leaves it."""
+        return fresh(self.mesh)
+
+    def ours(self, mesh: sb.Mesh) -> Complexes:
+        """The package's transform, on half the lattice."""
+        return our_transform(mesh, self.lattice, self.precision, self.threads)
+
+    def papers(self, mesh: sb.Mesh) -> Complexes:
+        """The paper's transform, on all of it."""
+        return whole_transform(
+            mesh,
+            self.lattice,
+            eps=_EPS[self.precision],
+            precision=self.precision,
+            upsampling=self.upsampling,
+            threads=self.threads,
+        )
+
+    def times(self, repeats: int) -> tuple[float, float]:
+        """Median seconds of the package's transform and the paper's."""
+        ours, papers = take_turns([self.ours, self.papers], self.fresh_mesh, repeats)
+        return ours, papers
+
+    def distances(self) -> tuple[float, float]:
+        """The relative distance to the unit sphere from the package's transform and the paper's."""
+        field = as_field(self.ours(self.mesh), self.lattice, {})
+        sphere = sb.fourier_transform(sb.Sphere(), self.lattice)
+        ours = sb.distance(field, sphere, ORDER)["distance"].item() / sb.norm(sphere, ORDER)["norm"].item()
+        return ours, relative_distance(self.papers(self.mesh), self.lattice, ORDER)
+
+
+def fresh(mesh: sb.Mesh) -> sb.Mesh:
+    """A mesh with none of its lengths or bounds known yet, as one that was just read."""
+    return sb.Mesh(mesh.vertices, mesh.triangles)
+
+
+def our_transform(mesh: sb.Mesh, lattice: sb.Lattice, precision: Precision, threads: int) -> Complexes:
+    """The package's transform on half the lattice."""
+    return transform_block(mesh, lattice, lattice.half, settings(precision), threads=threads)
+
+
+def against_the_paper(effort: Effort) -> Iterator[Row]:
+    """Item 1: the finest icosphere of the paper in double precision."""
+    yield from _speed_up_and_distance("1", "complex128", effort)
+
+
+def as_in_the_paper(effort: Effort) -> Iterator[Row]:
+    """Item 3: the same in single precision, and the sizes of the paper's Fig. 4."""
+    yield from _speed_up_and_distance("3", "complex64", effort)
+    level, intervals = (2, 32) if effort.quick else (5, 128)
+    finest = 3 if effort.quick else 7
+    sizes = [(n, intervals) for n in range(finest + 1)]
+    sizes += [(level, m) for m in ((48,) if effort.quick else (32, 64))]
+    if effort.large:
+        sizes += [(level, m) for m in (256, 416)]
+    for n, m in sizes:
+        ours, papers = Case.of(n, m, effort).times(effort.repeats)
+        yield Row("3", f"Fig. 4: T_{n}, M = {m}", as_seconds(ours), as_seconds(papers), papers / ours)
+
+
+def against_the_direct_sum(effort: Effort) -> Iterator[Row]:
+    """Item 4: the exact formula, timed where it finishes and carried on by its O(triangles · frequencies)."""
+    level, intervals = (2, 24) if effort.quick else (3, 32)
+    mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
+    frequencies = frequencies_of(lattice, lattice.half)
+    few = frequencies[:: len(frequencies) // 7]
+    error = float(np.abs(direct_transform(mesh, few) - exact_transform(mesh, few)).max() / mesh.area)
+    yield Row("4", "direct sum: error relative to the area", ratio=error, target=at_most(_DIRECT_AGREES))
+
+    def ours(given: sb.Mesh) -> object:
+        return our_transform(given, lattice, "complex128", effort.threads)
+
+    def direct(given: sb.Mesh) -> object:
+        return direct_transform(given, frequencies)
+
+    fast, slow = take_turns([ours, direct], lambda: fresh(mesh), effort.repeats)
+    yield Row("4", f"direct sum: T_{level}, half of M = {intervals}", as_seconds(fast), as_seconds(slow), slow / fast)
+    finest, most = (4, 32) if effort.quick else (7, 128)
+    large, whole = sb.icosphere(finest), sb.Lattice(XI_MAX, most)
+    larger = len(large.triangles) / len(mesh.triangles) * (whole.half.size / lattice.half.size)
+    fast = _our_seconds(large, whole, effort)
+    what = f"direct sum: T_{finest}, half of M = {most}, extrapolated"
+    yield Row("4", what, as_seconds(fast), as_seconds(slow * larger), slow * larger / fast)
+
+
+def growth(effort: Effort) -> Iterator[Row]:
+    """Exponents of the package's time in the triangles and in the intervals per axis."""
+    levels = range(1, 4) if effort.quick else range(3, 9 if effort.large else 8)
+    intervals = 32 if effort.quick else 64
+    meshes = [sb.icosphere(level) for level in levels]
+    lattice = sb.Lattice(XI_MAX, intervals)
+    yield _fitted(
+        f"time against triangles: T_{levels[0]} to T_{levels[-1]}, M = {intervals}",
+        [len(mesh.triangles) for mesh in meshes],
+        [_our_seconds(mesh, lattice, effort) for mesh in meshes],
+    )
+    level = 3 if effort.quick else 5
+    mesh = sb.icosphere(level)
+    sizes = (24, 32, 48) if effort.quick else (32, 64, 128, 256)
+    yield _fitted(
+        f"time against M: T_{level}, M = {sizes[0]} to {sizes[-1]}",
+        sizes,
+        [_our_seconds(mesh, sb.Lattice(XI_MAX, m), effort) for m in sizes],
+    )
+
+
+def _speed_up_and_distance(item: str, precision: Precision, effort: Effort) -> Iterator[Row]:
+    level, intervals = (4, 32) if effort.quick else (7, 128)
+    case = Case.of(level, intervals, effort, precision)
+    ours, papers = case.times(effort.repeats)
+    what = f"T_{level}, M = {intervals}, {precision}"
+    yield Row(item, f"{what}: transform", as_seconds(ours), as_seconds(papers), papers / ours, _SPEED_UP)
+    near, far = case.distances()
+    # Single precision holds six digits of a field, hence about one of so small a distance.
+    target = _SAME_DISTANCE if precision == "complex128" else None
+    difference = abs(near - far) / far
+    yield Row(item, f"{what}: distance, relative difference", f"{near:.6e}", f"{far:.6e}", difference, target)
+
+
+def _our_seconds(mesh: sb.Mesh, lattice: sb.Lattice, effort: Effort) -> float:
+    def transform(given: sb.Mesh) -> object:
+        return our_transform(given, lattice, "complex128", effort.threads)
+
+    (seconds,) = take_turns([transform], lambda: fresh(mesh), effort.repeats)
+    return seconds
+
+
+def _fitted(what: str, sizes: Sequence[int], seconds: Sequence[float]) -> Row:
+    exponent = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+    ends = f"{as_seconds(seconds[0])} to {as_seconds(seconds[-1])}"
+    return Row("growth", f"{what}, exponent", ends, ratio=exponent)
