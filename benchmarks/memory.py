@@ -39,7 +39,7 @@ def _peak_bytes(folder: Path, intervals: int, threads: int) -> int:
     """What loading and transforming a mesh adds to the peak of this process."""
     before = _highest_bytes()
     mesh = sb.Mesh(np.load(folder / "vertices.npy"), np.load(folder / "triangles.npy"))
-    our_transform(mesh, sb.Lattice(XI_MAX, intervals), "complex128", threads)
+    our_transform(mesh, sb.Lattice(XI_MAX, intervals), threads)
     return _highest_bytes() - before
 
 

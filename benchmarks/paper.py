@@ -22,7 +22,7 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 Reals = NDArray[np.float64]
 
 _RULE = gauss_rule(8)
-_UPSAMPLINGS = (2.0, 1.25)
+_UPSAMPLINGS = (2.0, 1.75, 1.5, 1.25)
 
 
 def whole_transform(
