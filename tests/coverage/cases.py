@@ -168,12 +168,16 @@ def _placed(mesh: Mesh, sphere: Sphere) -> Mesh:
 
 
 def _solids(rng: np.random.Generator) -> Pair:
-    """A torus or a capsule, and itself changed a little, or in fewer triangles."""
-    thick, sections = rng.uniform(0.1, 0.3), int(rng.integers(10, 20))
-    if rng.random() < 0.5:
-        made = [trimesh.creation.torus(0.6, thick, count, 8) for count in (sections, sections - 3)]
+    """A prism, a torus or a capsule, and itself changed a little, or in fewer triangles."""
+    thick, choice = rng.uniform(0.1, 0.3), rng.random()
+    sections = int(rng.integers(5, 9) if choice < 0.6 else rng.integers(10, 20))
+    counts = (sections, sections - 2)
+    if choice < 0.3:
+        made = [trimesh.creation.cylinder(thick, 1.2, count) for count in counts]
+    elif choice < 0.8:
+        made = [trimesh.creation.torus(0.6, thick, count, 3 if choice < 0.6 else 8) for count in counts]
     else:
-        made = [trimesh.creation.capsule(0.8, thick, count=[count, count]) for count in (sections, sections - 3)]
+        made = [trimesh.creation.capsule(0.8, thick, count=[count, count]) for count in counts]
     turn = _rotation(rng)
     first, second = (Mesh((part.vertices - part.centroid) @ turn.T, part.faces) for part in made)
     return first, second if rng.random() < 0.5 else _changed(rng, first)
@@ -181,7 +185,7 @@ def _solids(rng: np.random.Generator) -> Pair:
 
 def _cortices(rng: np.random.Generator) -> Pair:
     """The cortical surface in two numbers of triangles, or in one and changed a little."""
-    first, second = rng.choice([100, 200, 400, 800, 1600, 3200], size=2, replace=False)
+    first, second = rng.choice([100, 150, 200, 400, 1600, 3200], size=2, replace=False)
     a = cortex(int(first))
     return a, cortex(int(second)) if rng.random() < 0.6 else _changed(rng, a)
 

@@ -25,9 +25,9 @@ Reals = NDArray[np.float64]
 # Points per side of a tile of the double sum: its temporaries stay in the processor's cache.
 _TILE = 384
 # Pairs of a point and a node on an edge that are held at a time.
-_HELD = 1 << 19
+_HELD = 1 << 17
 # Nodes on either side of a point's foot on an edge.
-_EDGE_NODES = 20
+_EDGE_NODES = 16
 
 
 def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
@@ -40,12 +40,12 @@ def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
         value *= z
         value += coefficient
     value *= decay
-    return value
+    return np.asarray(value)
 
 
-def radial_integral(distances: Reals, power: int) -> Reals:
-    """∫_r^∞ K_a(t) t dt = a K_{a+1}(r) / (2π²)."""
-    return power / (2 * np.pi**2) * kernel(distances, power + 1)
+def radial_integral(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
+    """∫_r^∞ K_a(t) t dt = a K_{a+1}(r) / (2π²); `decay` as for `kernel`."""
+    return power / (2 * np.pi**2) * kernel(distances, power + 1, decay)
 
 
 def sphere_potential(sphere: Sphere, points: Reals, power: int) -> Reals:
@@ -69,7 +69,7 @@ def double_sum(points: Reals, weights: Reals, powers: Sequence[int]) -> Reals:
         return np.array([count * (weights[rows] @ kernel(distances, a, decay) @ weights[columns]) for a in powers])
 
     with ThreadPoolExecutor(2) as pool:
-        return np.sum(list(pool.map(tile, combinations_with_replacement(starts, 2))), axis=0)
+        return np.asarray(np.sum(list(pool.map(tile, combinations_with_replacement(starts, 2))), axis=0))
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,9 @@ def mesh_potentials(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals
     side's distance from the foot and t the place on it. t = √(p²+d²) sinh u gathers nodes near x.
     """
     step = max(1, _HELD // (2 * _EDGE_NODES * len(sides.lengths)))
-    parts = [_potentials_of_part(sides, points[first : first + step], powers) for first in range(0, len(points), step)]
-    return np.concatenate(parts, axis=1)
+    parts = [points[first : first + step] for first in range(0, len(points), step)]
+    with ThreadPoolExecutor(2) as pool:
+        return np.concatenate(list(pool.map(lambda part: _potentials_of_part(sides, part, powers), parts)), axis=1)
 
 
 def _potentials_of_part(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals:
@@ -133,12 +134,9 @@ def _potentials_of_part(sides: Sides, points: Reals, powers: Sequence[int]) -> R
     r = closest[..., None] * np.cosh(u)
     squared = np.maximum(p[..., None] ** 2 + (closest[..., None] * np.sinh(u)) ** 2, 1e-28)
     factor = p[..., None] * r * du / squared
-    return np.stack(
-        [
-            np.sum(factor * (radial_integral(np.abs(d), power)[..., None] - radial_integral(r, power)), axis=(1, 2))
-            for power in powers
-        ]
-    )
+    decay = np.exp(-2 * np.pi * r)
+    falls = (radial_integral(np.abs(d), a)[..., None] - radial_integral(r, a, decay) for a in powers)
+    return np.stack([np.einsum("xeq,xeq->x", factor, fall) for fall in falls])
 
 
 def graded_points(mesh: Mesh, count: int) -> tuple[Reals, Reals]:

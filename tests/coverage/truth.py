@@ -29,15 +29,17 @@ from tests.coverage.matern import (
 
 Reals = NDArray[np.float64]
 
+# Kernels of orders above this have a strong kink at zero, those of others hardly any.
+_SMOOTH = -4.0
 # Triangles of both meshes together for which the inner integral is done in closed form.
-_FEW = 24
+_FEW = 90
 # Nodes per direction of the two outer rules.
-_OUTER = (8, 12)
-# Points of the double sum.
-_MOST_POINTS = 32_000
-# Lattices far finer than those under test, by the highest order that they serve. Surfaces within
-# the unit ball: periods of 5 and 6 keep their images away.
-_FINE = {-2.0: Lattice(16.0, 160), -4.0: Lattice(10.0, 120)}
+_OUTER = (7, 10)
+# Points of the double sum at most.
+_POINTS_ROUGH, _POINTS_SMOOTH = 40_000, 10_000
+# Lattices far finer than those under test. Surfaces within the unit ball: periods of 5 and 6 keep
+# their images away.
+_FINE_ROUGH, _FINE_SMOOTH = Lattice(16.0, 160), Lattice(10.0, 120)
 # Rounding of sums of some thousand terms, relative to the squared norms.
 _ROUNDING = 1e-14
 
@@ -64,12 +66,27 @@ def truths(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]
         closed = distance(a, b, orders)
         pairs = zip(closed["distance"].values, closed["error"].values, strict=True)
         return tuple(Truth(float(value), float(error)) for value, error in pairs)
-    triangles = sum(len(mesh.triangles) for mesh in meshes)
-    found = [(closed_within if triangles <= _FEW else on_fine_lattice)(a, b, orders)]
+    rough, smooth = ([order for order in orders if (order > _SMOOTH) == side] for side in (True, False))
+    known: dict[float, Truth] = {}
+    for chosen, points in ((rough, _POINTS_ROUGH), (smooth, _POINTS_SMOOTH)):
+        if chosen:
+            known |= dict(zip(chosen, _most_certain(a, b, chosen, points), strict=True))
+    return tuple(known[order] for order in orders)
+
+
+def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth]:
+    triangles = sum(len(surface.triangles) for surface in (a, b) if isinstance(surface, Mesh))
+    found = []
+    if triangles <= _FEW and orders[0] > _SMOOTH:
+        found.append(closed_within(a, b, orders))
+        # Still of use against spheres, whose potential has a kink where they cross a face.
+        points = _POINTS_SMOOTH
+    else:
+        found.append(on_fine_lattice(a, b, orders))
     # An extrapolation needs two levels at least.
-    if 24 * triangles <= _MOST_POINTS:
-        found.append(summed_in_real_space(a, b, orders))
-    return tuple(min(known, key=lambda truth: truth.uncertainty) for known in zip(*found, strict=True))
+    if 24 * triangles <= points:
+        found.append(summed_in_real_space(a, b, orders, points))
+    return [min(each, key=lambda truth: truth.uncertainty) for each in zip(*found, strict=True)]
 
 
 def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
@@ -95,7 +112,9 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
     return tuple(map(Truth.of_square, fine.tolist(), slack.tolist()))
 
 
-def summed_in_real_space(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
+def summed_in_real_space(
+    a: Surface, b: Surface, orders: Sequence[float], most: int = _POINTS_SMOOTH
+) -> tuple[Truth, ...]:
     """By double sums over points, extrapolated; the uncertainty is what the last extrapolation changed.
 
     The kernel of a = -s has the term r^(2a-3), which leaves an error of h^(2a-1) beside the rule's h^6.
@@ -103,7 +122,7 @@ def summed_in_real_space(a: Surface, b: Surface, orders: Sequence[float]) -> tup
     powers = [round(-order) for order in orders]
     signed = ((a, 1.0), (b, -1.0))
     triangles = sum(len(surface.triangles) for surface, _ in signed if isinstance(surface, Mesh))
-    levels = [level for level in range(6) if 6 * triangles * 4**level <= _MOST_POINTS][-3:]
+    levels = [level for level in range(6) if 6 * triangles * 4**level <= most][-3:]
     rows = []
     for level in levels:
         squares, norms = _spheres_alone(a, b, orders)
@@ -129,18 +148,11 @@ def on_fine_lattice(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Tr
 
     Not independent of the way that errors are found, but of how well that works where they are large.
     """
-    found: dict[float, Truth] = {}
-    for order in orders:
-        if order in found:
-            continue
-        highest = -2.0 if order > -4 else -4.0
-        shared = [s for s in orders if (s > -4) == (order > -4)]
-        lattice = _FINE[highest]
-        first, second = (fourier_transform(surface, lattice, 1e-13, orders=shared) for surface in (a, b))
-        fine = distance(first, second, shared)
-        for s, value, error in zip(shared, fine["distance"].values, fine["error"].values, strict=True):
-            found[s] = Truth(float(value), float(error))
-    return tuple(found[order] for order in orders)
+    lattice = _FINE_ROUGH if max(orders) > _SMOOTH else _FINE_SMOOTH
+    first, second = (fourier_transform(surface, lattice, 1e-13, orders=orders) for surface in (a, b))
+    fine = distance(first, second, orders)
+    pairs = zip(fine["distance"].values, fine["error"].values, strict=True)
+    return tuple(Truth(float(value), float(error)) for value, error in pairs)
 
 
 def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Reals, Reals]:
