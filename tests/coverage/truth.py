@@ -2,8 +2,9 @@
 
 Two spheres have a closed form. Meshes of few triangles are integrated in real space, the inner
 integral in closed form up to the sides of the faces, the outer with two rules. Others are summed in
-real space on triangles that are cut finer and finer, or taken from a far finer lattice, whichever
-is more certain.
+real space on triangles that are cut finer and finer, as long as that does not take too many points.
+The rest, and what such sums find hard (surfaces nearer to each other than the points), is taken
+from a far finer lattice. Whatever is most certain counts.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _SMOOTH = -4.0
 # Triangles of both meshes together for which the inner integral is done in closed form.
 _FEW = 90
 # Nodes per direction of the two outer rules.
-_OUTER = (7, 10)
+_OUTER = (8, 11)
 # Points of the double sum at most.
 _POINTS_ROUGH, _POINTS_SMOOTH = 40_000, 10_000
 # Lattices far finer than those under test. Surfaces within the unit ball: periods of 5 and 6 keep
@@ -76,15 +77,16 @@ def truths(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]
 
 def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth]:
     triangles = sum(len(surface.triangles) for surface in (a, b) if isinstance(surface, Mesh))
+    # An extrapolation needs two levels at least.
+    summable = 24 * triangles <= points
     found = []
     if triangles <= _FEW and orders[0] > _SMOOTH:
         found.append(closed_within(a, b, orders))
         # Still of use against spheres, whose potential has a kink where they cross a face.
         points = _POINTS_SMOOTH
-    else:
+    elif not summable or orders[0] > _SMOOTH:
         found.append(on_fine_lattice(a, b, orders))
-    # An extrapolation needs two levels at least.
-    if 24 * triangles <= points:
+    if summable:
         found.append(summed_in_real_space(a, b, orders, points))
     return [min(each, key=lambda truth: truth.uncertainty) for each in zip(*found, strict=True)]
 
