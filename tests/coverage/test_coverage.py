@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, Sphere, icosphere
 from sobolev_batch.surfaces.similarity import Surface
 from tests.coverage.cases import KINDS, ORDERS, all_cases, cases_of
 from tests.coverage.judging import Tally, Verdict, judge
+from tests.coverage.matern import kernel, radial_integral
 from tests.coverage.truth import Truth, closed_within, on_fine_lattice, summed_in_real_space, truths
 from tests.spectral.test_quadrature import BOX
 
@@ -70,6 +73,15 @@ def test_three_ways_to_the_truth_agree_within_what_they_claim(a: Surface, b: Sur
         for truth in found:
             assert abs(truth.value - best.value) <= 3 * truth.uncertainty + best.uncertainty, (order, found)
         assert best.uncertainty < 3e-5 * best.value
+
+
+@pytest.mark.parametrize("power", [2, 3, 5, 10])
+def test_the_kernel_is_the_matern_function_and_its_integral_that_of_the_kernel(power: int) -> None:
+    r = np.geomspace(1e-3, 3, 7)
+    matern = 2 * np.pi**power / gamma(power) * r ** (power - 1.5) * kv(power - 1.5, 2 * np.pi * r)
+    assert np.allclose(kernel(r, power), matern, rtol=1e-12, atol=0)
+    rest = [quad(lambda t: t * kernel(np.array(t), power), low, np.inf, epsabs=0, epsrel=1e-11)[0] for low in r]
+    assert np.allclose(radial_integral(r, power), rest, rtol=1e-9, atol=0)
 
 
 def test_real_space_agrees_with_the_closed_form_of_spheres() -> None:
