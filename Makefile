@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test check bench format clean
+.PHONY: study icosphere test coverage check bench format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -14,6 +14,9 @@ icosphere: $(READY)  ## run the paper's study
 
 test: $(READY)  ## the tests
 	$(BIN)/python -m pytest
+
+coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
+	$(BIN)/python -m tests.coverage
 
 check: $(READY)  ## lint, formatting, types
 	$(BIN)/ruff check .

@@ -157,7 +157,7 @@ def refined(
 
     def tail(highest: float) -> Reals:
         with np.errstate(divide="ignore", invalid="ignore"):
-            parts = np.nan_to_num(truncated(sums, lattice, orders, areas, highest) / (2 * totals), posinf=0.0)
+            parts = np.nan_to_num(truncated(sums, lattice, orders, areas, widths, highest) / (2 * totals), posinf=0.0)
         return np.asarray(parts.reshape(len(orders), -1).max(axis=1))
 
     most = accuracy.largest_intervals

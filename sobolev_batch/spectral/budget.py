@@ -25,6 +25,8 @@ Reals = NDArray[np.float64]
 # between 0.5 and 8 times, the aliasing between 0.25 and 2 times what was truly lost.
 TRUNCATION_CAUTION = 2.5
 ALIASING_CAUTION = 5.0
+# With so many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
+_TROUGH_PERIODS = 3.0
 # The energy of the difference of two surfaces is followed from the first of these shells, in
 # fractions of xi_max, to the second, and carried on from there.
 _WINDOWS = ((0.5, 0.75), (0.75, 1.0))
@@ -119,7 +121,7 @@ def assess(
     """
     totals: Reals = np.maximum(sums.squares.sum(axis=1), 0.0)
     values = np.sqrt(totals)
-    beyond = truncated(sums, lattice, orders, areas)
+    beyond = truncated(sums, lattice, orders, areas, widths)
     images = aliased(sums, lattice, orders, widths)
     return Assessed(
         values,
@@ -150,12 +152,19 @@ def support_widths(extents: Sequence[Extent]) -> Reals:
 
 
 def truncated(
-    sums: Sums, lattice: Lattice, orders: Sequence[float], areas: Reals, highest: float | None = None
+    sums: Sums,
+    lattice: Lattice,
+    orders: Sequence[float],
+    areas: Reals,
+    widths: Reals,
+    highest: float | None = None,
 ) -> Reals:
     """Bound on the squared norm beyond xi_max, or beyond a frequency above it (orders, ...).
 
     The energy on |ξ| = r grows like r^p, as it does for two surfaces apart by less than the
     wavelength (p = 2), until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated surfaces.
+    It oscillates with the inverse width of the surfaces; where ξ_max covers few of these periods, the
+    outer ranges may lie in a trough.
     """
     inner, outer = sums.outer
     ceiling = np.maximum(2 * areas, outer)
@@ -177,7 +186,8 @@ def truncated(
         growing = growth * _exprel(exponent * np.log(saturated / start))
         flat = ceiling * saturated ** (order + 0.5) / (-order - 0.5)
         tails.append(np.where(outer > 0, (growing + flat) / (2 * part), 0.0))
-    return TRUNCATION_CAUTION * np.stack(tails)
+    periods = float(widths.max()) * lattice.xi_max
+    return TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails)
 
 
 def aliased(sums: Sums, lattice: Lattice, orders: Sequence[float], widths: Reals) -> Reals:
