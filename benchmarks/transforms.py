@@ -21,7 +21,7 @@ ORDER = -10.0
 XI_MAX = 5.0
 _EPS: dict[Precision, float] = {"complex128": 1e-9, "complex64": 1e-6}
 # The norm of the field's own error over the distance. What it does to the distance is less, and measured.
-_FIELD_ERROR = 4e-6
+_FIELD_ERROR = 6e-6
 _SPEED_UP = at_least(18)
 _SAME_DISTANCE = at_most(2e-6)
 # Relative to the area. The direct sum's guard keeps some eleven digits.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -71,11 +72,11 @@ class Accuracy:
         Raises:
             InputError: not even the smallest lattice fits.
         """
-        candidates = np.arange(2, LARGEST_M + 1, 2)
-        fits = [self._bytes(int(M)) <= self.memory for M in candidates]
-        if not fits[0]:
+        candidates = range(2, LARGEST_M + 1, 2)
+        fitting = bisect_right(candidates, self.memory, key=self._bytes)
+        if not fitting:
             raise InputError(f"memory of {self.memory:.3g} bytes is too little: {self._bytes(2):.3g} are needed")
-        return int(candidates[np.count_nonzero(fits) - 1])
+        return candidates[fitting - 1]
 
     @staticmethod
     def _bytes(intervals: int) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -98,6 +98,7 @@ def compute_field(
     orders: Sequence[float],
     *,
     sample: Sample | None = None,
+    extent: Quality | None = None,
     threads: int = 1,
 ) -> Field:
     """The field of a surface with given settings, and its probe.
@@ -108,6 +109,7 @@ def compute_field(
         settings: how.
         orders: that it is probed for.
         sample: of the surface, drawn for these orders and `USUAL_DEGREE`, where there is one.
+        extent: the surface's quality but for its probe, where it is known.
         threads: to compute with.
 
     Raises:
@@ -119,8 +121,9 @@ def compute_field(
     if sample is not None and usable and needs_probe(surface, settings):
         probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
     else:
-        probe = probe_block(surface, lattice, settings, orders, block, made.values, threads=threads)
-    return Field(made.values, Quality.of_surface(surface, probe), settings, made.points)
+        probe = probe_block(surface, lattice, settings, orders, block, made.values)
+    quality = Quality.of_surface(surface, probe) if extent is None else replace(extent, probe=probe)
+    return Field(made.values, quality, settings, made.points)
 
 
 def field_for(
@@ -130,6 +133,7 @@ def field_for(
     transform: Transform,
     *,
     sample: Sample | None = None,
+    extent: Quality | None = None,
     threads: int = 1,
 ) -> Field:
     """The field of a surface with an error that keeps a goal, as far as its probe can tell.
@@ -139,17 +143,18 @@ def field_for(
         lattice: where.
         goal: what its error may be.
         transform: whose precision and quadrature are kept.
-        sample: of the surface, where there is one.
+        sample: see `compute_field`.
+        extent: likewise.
         threads: to compute with.
 
     Returns:
         The first of a few attempts that keeps the goal, or the last.
     """
     if not isinstance(surface, Mesh):
-        return compute_field(surface, lattice, transform, goal.orders, sample=sample)
+        return compute_field(surface, lattice, transform, goal.orders, sample=sample, extent=extent)
     for _ in range(_ATTEMPTS):
         settings = settle(surface, lattice, goal, transform)
-        field = compute_field(surface, lattice, settings, goal.orders, sample=sample, threads=threads)
+        field = compute_field(surface, lattice, settings, goal.orders, sample=sample, extent=extent, threads=threads)
         excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
         if excess <= 1:
             break

@@ -24,13 +24,13 @@ from sobolev_batch.surfaces.similarity import Surface
 Reals = NDArray[np.float64]
 
 # Of what a field may err, this part is left to the NUFFT.
-_NUFFT_SHARE = 0.25
+_NUFFT_SHARE = 0.4
 # The rms error of a field of many points at one frequency over eps · area: measured 0.003 to 0.006.
-_NUFFT_ERROR = 0.01
+_NUFFT_ERROR = 0.005
 # The same of single precision over the area, however small its eps; measured 1e-7 at most.
 _SINGLE_ROUNDING = 3e-7
-# Between neighbouring triangles this much of the odd errors was seen to remain.
-_ODD_REMAINDER = 0.3
+# Between neighbouring triangles about this much of the odd errors was seen to remain.
+_ODD_REMAINDER = 0.2
 _BINS = 48
 _RADII = 32
 _LOOSEST_TOLERANCE = 0.1

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.phases import cosine_and_sine
 from sobolev_batch.spectral.quadrature import WeightedPoints
 
 Precision = Literal["complex128", "complex64"]
@@ -89,8 +90,9 @@ def transform_points(
         turned = np.flatnonzero(shift)
         if turned.size:
             phase = shift[turned].astype(np.float64) @ angles[turned]
-            np.multiply(np.cos(phase), points.weights, out=strengths.real, casting="same_kind")
-            np.multiply(np.sin(phase), -points.weights, out=strengths.imag, casting="same_kind")
+            cosines, sines = cosine_and_sine(phase)
+            np.multiply(cosines, points.weights, out=strengths.real, casting="same_kind")
+            np.multiply(sines, -points.weights, out=strengths.imag, casting="same_kind")
         else:
             strengths.real = points.weights
             strengths.imag = 0

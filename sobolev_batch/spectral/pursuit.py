@@ -79,15 +79,17 @@ def pursue(
     values: Reals | None = None
     strictness = 1.0
     for _ in range(_ROUNDS):
-        samples = _samples(surfaces, lattice, orders, threads)
+        samples = _samples(surfaces, lattice, orders)
         if values is None:
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
         asked = max(accuracy.rtol, _PILOT_RTOL) if pilot else accuracy.rtol
         goal = goal_of(values, orders, asked).tightened(strictness * meshes)
         precision: Precision = "complex64" if all(permits_single(s, lattice, goal) for s in surfaces) else "complex128"
         fields = tuple(
-            field_for(surface, lattice, goal, Transform(precision=precision), sample=sample, threads=threads)
-            for surface, sample in zip(surfaces, samples, strict=True)
+            field_for(
+                surface, lattice, goal, Transform(precision=precision), sample=sample, extent=extent, threads=threads
+            )
+            for surface, sample, extent in zip(surfaces, samples, extents, strict=True)
         )
         found = _assessed(fields, lattice, orders, areas, widths)
         values = found.assessed.values
@@ -109,12 +111,10 @@ def goal_of(values: Reals, orders: Sequence[float], rtol: float) -> Goal:
     return Goal(tuple(orders), tuple(norms.tolist()))
 
 
-def _samples(
-    surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], threads: int
-) -> tuple[Sample, ...]:
+def _samples(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float]) -> tuple[Sample, ...]:
     """Samples of all surfaces at the same frequencies."""
     draws = draws_for(surfaces, lattice, orders, USUAL_DEGREE)
-    return tuple(Sample.of(surface, draws, threads) for surface in surfaces)
+    return tuple(Sample.of(surface, draws) for surface in surfaces)
 
 
 def _assessed(fields: Sequence[Field], lattice: Lattice, orders: Sequence[float], areas: Reals, widths: Reals) -> Found:

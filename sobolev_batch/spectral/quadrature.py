@@ -81,7 +81,7 @@ class Quadrature:
             capacity: bound on the points of one batch, 8 times the largest rule (3,624) or more.
         """
         groups = self._groups(mesh, highest_frequency, tolerance)
-        # Nodes are merged within a piece, hence larger pieces where they are shared.
+        # Nodes are merged within a piece, hence large pieces where they are shared.
         pieces = [piece for group in groups for piece in group.cut(capacity // (2 if group.rule.sharing > 1 else 8))]
         ends = np.cumsum([piece.most_points for piece in pieces])
         total = int(ends[-1])

@@ -40,8 +40,8 @@ class Quality:
             along = DIRECTIONS @ np.asarray(surface.center)
             low, high = along - surface.radius, along + surface.radius
         else:
-            along = surface.vertices[surface.used_vertices] @ DIRECTIONS.T
-            low, high = along.min(axis=0), along.max(axis=0)
+            along = DIRECTIONS @ surface.used_coordinates
+            low, high = along.min(axis=1), along.max(axis=1)
         return cls(surface.area, tuple(low.tolist()), tuple(high.tolist()), probe)
 
     def to_json(self) -> str:

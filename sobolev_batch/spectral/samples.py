@@ -34,11 +34,11 @@ class Sample:
     exact: NDArray[np.complex128]
 
     @classmethod
-    def of(cls, surface: Surface, draws: Draws, threads: int = 1) -> Sample:
+    def of(cls, surface: Surface, draws: Draws) -> Sample:
         """The sample of a surface."""
         if isinstance(surface, Sphere):
             return cls(draws, sphere_transform(surface, draws.frequencies))
-        return cls(draws, exact_transform(surface, draws.frequencies, threads=threads))
+        return cls(draws, exact_transform(surface, draws.frequencies))
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
@@ -62,8 +62,6 @@ def probe_block(
     orders: Sequence[float],
     block: Block,
     values: Complexes,
-    *,
-    threads: int = 1,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
@@ -72,7 +70,7 @@ def probe_block(
     if not needs_probe(surface, settings):
         return Probe()
     draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice)).within(block)
-    sample = Sample.of(surface, draws, threads)
+    sample = Sample.of(surface, draws)
     return measure(draws, values[draws.places(block)], sample.exact)
 
 

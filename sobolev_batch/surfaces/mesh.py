@@ -108,8 +108,8 @@ class Mesh:
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper corner of the bounding box of the vertices that triangles use, (3,) each."""
-        used = self.vertices[self.used_vertices]
-        return _frozen(used.min(axis=0)), _frozen(used.max(axis=0))
+        used = self.used_coordinates
+        return _frozen(used.min(axis=1)), _frozen(used.max(axis=1))
 
     @cached_property
     def used_vertices(self) -> NDArray[np.int64]:
@@ -117,6 +117,11 @@ class Mesh:
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.triangles] = True
         return _frozen(np.flatnonzero(used).astype(np.int64))
+
+    @property
+    def used_coordinates(self) -> NDArray[np.float64]:
+        """The vertices that triangles use, one contiguous row an axis (3, n), in units of length."""
+        return np.ascontiguousarray(self.vertices[self.used_vertices].T)
 
     @cached_property
     def counts(self) -> MeshCounts:
