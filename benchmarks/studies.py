@@ -120,7 +120,7 @@ def all_pairs(effort: Effort) -> Iterator[Row]:
 
         forget()
         fields = _stored_fields(store)
-        weighted = [fields * weights for weights in _weights(by_pair.lattice, orders)]
+        weighted = [fields * weights for weights in _weights(sb.Lattice(_XI_MAX, intervals), orders)]
         ours, bare = take_turns([package, product], forget, effort.repeats)
     what = f"all pairs of {count} fields, M = {intervals}, {len(orders)} orders, {as_bytes(fields.nbytes)}"
     yield Row("6", what, as_seconds(ours), as_seconds(bare), ours / bare, _ALL_PAIRS)

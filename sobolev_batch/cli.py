@@ -14,7 +14,7 @@ import click
 from sobolev_batch.batch.cluster import remote_client
 from sobolev_batch.batch.plan import Plan, make_plan
 from sobolev_batch.batch.run import Progress, Summary, run
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.opening import open_store
@@ -83,8 +83,8 @@ def run_command(
 def plan_command(study: Path, store: Path | None) -> None:
     """Show what running STUDY would do: tasks, lattice, bytes, memory, what is already there."""
     parsed = Study.from_toml(study)
-    plan = make_plan(parsed)
     place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    plan = make_plan(parsed, stored_choice(place))
     for name, value in _plan_lines(plan, place):
         click.echo(f"{name + ':':<14} {value}")
 
@@ -222,7 +222,7 @@ class _Reporter:
 
 
 def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
-    study, lattice, transform = plan.study, plan.study.lattice, plan.study.transform
+    study, lattice, transform = plan.study, plan.lattice, plan.transform
     origin = " ".join(f"{x:.9g}" for x in plan.similarity.origin)
     tasks = len(plan.rows) * len(plan.blocks)
     yield "study", study.title
@@ -236,10 +236,16 @@ def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
         f"xi_max {lattice.xi_max:g}, M {lattice.M}, spacing {lattice.spacing:g}, half period {lattice.half_period:g}",
     )
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
-    yield (
-        "transform",
-        f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
-    )
+    if study.accuracy is not None:
+        yield "accuracy", f"rtol {study.accuracy.rtol:g} of every distance to {plan.reference}"
+        for reason in plan.choice.reasons:
+            yield "chosen", reason
+        yield "transform", f"{transform.precision}, eps and quadrature for each surface from its distance"
+    else:
+        yield (
+            "transform",
+            f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
+        )
     yield "tasks", f"{tasks}, {len(plan.blocks)} per surface"
     yield "memory", f"{_size(plan.task_memory_bytes)} per task at most, and its mesh"
     yield "storage", f"{_size(plan.field_bytes)} per surface, {_size(plan.field_bytes * len(plan.rows))} in all"

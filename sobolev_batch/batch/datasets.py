@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.plan import Row
 from sobolev_batch.batch.records import Facts, Record
+from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.budget import Assessed
 from sobolev_batch.spectral.convergence import observed_rates
 
@@ -69,6 +70,7 @@ def convergence_dataset(
     reference_norms: Assessed,
     sizes: Reals,
     reference: str,
+    accuracy: Accuracy | None,
 ) -> xr.Dataset:
     """Distances to the reference, relative ones, and observed rates within each family, all with errors.
 
@@ -79,6 +81,7 @@ def convergence_dataset(
         reference_norms: over (orders,).
         sizes: (meshes,) mean edge lengths.
         reference: label of the reference's row.
+        accuracy: that was asked for, if any.
     """
     distances, errors = to_reference.values, to_reference.errors
     rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
@@ -93,6 +96,7 @@ def convergence_dataset(
             )
     norms, norm_errors = reference_norms.values[:, None], reference_norms.errors[:, None]
     relative = distances / norms
+    within = np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference)
     return xr.Dataset(
         {
             **_with_errors("distance", ("mesh", "order"), to_reference),
@@ -101,10 +105,11 @@ def convergence_dataset(
             "rate": (("mesh", "order"), rates.T),
             "rate_error": (("mesh", "order"), rate_errors.T),
             "resolved": (("mesh", "order"), (errors < distances).T),
+            "within": (("mesh", "order"), within.T, {"description": "the error is as small as the study asks for"}),
             "edge_length": ("mesh", sizes, {"units": "unit length"}),
         },
         coords=_coordinates(rows, orders),
-        attrs={"reference": reference},
+        attrs={"reference": reference, **({} if accuracy is None else {"rtol": accuracy.rtol})},
     )
 
 

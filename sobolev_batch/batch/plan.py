@@ -6,16 +6,20 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from sobolev_batch.batch.choice import Choice, basis_of, choose
 from sobolev_batch.batch.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
-from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform import NUMERICS_VERSION, memory_bytes, require_inside
+from sobolev_batch.spectral.fields import USUAL_DEGREE
+from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.pursuit import Aim
+from sobolev_batch.spectral.samples import Sample, draws_for
+from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, memory_bytes, require_inside
 from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member, sole_member
 
 _log = logging.getLogger(__name__)
@@ -52,6 +56,8 @@ class Plan:
         rows: every surface, the reference among them, in the order of the study.
         reference: the label of the reference's row.
         blocks: the blocks of the lattice, one chunk of the store each.
+        choice: the lattice and precision of all fields.
+        sample: of the reference, where an accuracy is asked for.
     """
 
     study: Study
@@ -59,42 +65,104 @@ class Plan:
     rows: tuple[Row, ...]
     reference: str
     blocks: tuple[Block, ...]
+    choice: Choice
+    sample: Sample | None = None
+
+    @property
+    def lattice(self) -> Lattice:
+        """The lattice of all fields."""
+        return self.choice.lattice
+
+    @property
+    def transform(self) -> Transform:
+        """How fields are computed; where an accuracy is asked for, eps and tolerance follow for each."""
+        return replace(self.study.transform, precision=self.choice.precision)
+
+    def aim(self, row: Row) -> Aim | None:
+        """What the field of a row is computed for, where an accuracy is asked for."""
+        if self.study.accuracy is None:
+            return None
+        sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
+        return Aim(self.study.orders, self.study.accuracy, sample, closest)
+
+    def on(self, choice: Choice) -> Plan:
+        """The same study with its fields on another lattice."""
+        rows = tuple(
+            replace(row, key=_key(self.study, self.similarity, choice, row.member, row.label)) for row in self.rows
+        )
+        return replace(self, rows=rows, choice=choice, blocks=_blocks(choice))
 
     @cached_property
     def item_bytes(self) -> int:
         """Bytes of one sample of a field."""
-        return 16 if self.study.transform.precision == "complex128" else 8
+        return 16 if self.choice.precision == "complex128" else 8
 
     @property
     def field_bytes(self) -> int:
         """Bytes of one stored field."""
-        return self.study.lattice.half.size * self.item_bytes
+        return self.lattice.half.size * self.item_bytes
 
     @property
     def task_memory_bytes(self) -> int:
         """Peak memory of one task, without its mesh."""
-        return memory_bytes(self.blocks[0], self.study.transform)
+        return memory_bytes(self.blocks[0], self.transform)
 
 
-def make_plan(study: Study) -> Plan:
-    """Resolve a study: list its surfaces, choose its similarity, identify every field.
+def make_plan(study: Study, known: Choice | None = None) -> Plan:
+    """Resolve a study: list its surfaces, choose its similarity and lattice, identify every field.
 
-    The reference is loaded, since the similarity depends on it; no other surface is.
+    The reference is loaded, since the similarity depends on it, and a few pilots where an accuracy is
+    asked for; no other surface is.
+
+    Args:
+        study: what to compute.
+        known: an earlier choice for it, which is kept as long as it was made from the same.
 
     Raises:
         StudyError: labels that collide, or sources that make no surface.
         MeshError: the reference cannot be read.
         LatticeError: the reference does not fit into the lattice's period.
+        AccuracyError: the accuracy is out of reach within the memory.
     """
     members = _members(study)
     reference = _reference_label(study, members)
-    similarity = _similarity(study, members[reference][1])
+    surface = _load_reference(members[reference][1])
+    similarity = Similarity.to_unit_ball(surface) if study.scaling.mode == "reference" else study.scaling.fixed
+    scaled = similarity.apply(surface)
+    choice = _choice(study, similarity, members, reference, scaled, known)
+    if isinstance(scaled, Mesh):
+        require_inside(scaled, choice.lattice)
     rows = tuple(
-        Row(label, family, member, _key(study, similarity, member, label))
+        Row(label, family, member, _key(study, similarity, choice, member, label))
         for label, (family, member) in members.items()
     )
-    item_bytes = 16 if study.transform.precision == "complex128" else 8
-    return Plan(study, similarity, rows, reference, study.lattice.split(_LARGEST_CHUNK_BYTES // item_bytes))
+    sample = None
+    if study.accuracy is not None:
+        draws = draws_for([scaled], choice.lattice, study.orders, USUAL_DEGREE)
+        sample = Sample.of(scaled, draws)
+    return Plan(study, similarity, rows, reference, _blocks(choice), choice, sample)
+
+
+def _choice(
+    study: Study,
+    similarity: Similarity,
+    members: Mapping[str, tuple[str, Member]],
+    reference: str,
+    surface: Surface,
+    known: Choice | None,
+) -> Choice:
+    if study.lattice is not None:
+        return Choice(study.lattice, study.transform.precision)
+    basis = basis_of(study, similarity, members[reference][1].fingerprint())
+    if known is not None and known.basis == basis:
+        return known
+    others = {label: member for label, member in members.items() if label != reference}
+    return choose(study, similarity, surface, others, basis)
+
+
+def _blocks(choice: Choice) -> tuple[Block, ...]:
+    item_bytes = 16 if choice.precision == "complex128" else 8
+    return choice.lattice.split(_LARGEST_CHUNK_BYTES // item_bytes)
 
 
 def _members(study: Study) -> dict[str, tuple[str, Member]]:
@@ -128,20 +196,14 @@ def _reference_label(study: Study, members: Mapping[str, tuple[str, Member]]) ->
     return label
 
 
-def _similarity(study: Study, member: Member) -> Similarity:
+def _load_reference(member: Member) -> Surface:
     try:
-        surface = member.load()
+        return member.load()
     except InputError as error:
         raise MeshError(f"the reference cannot be made: {error}") from error
-    by_reference = study.scaling.mode == "reference"
-    similarity = Similarity.to_unit_ball(surface) if by_reference else study.scaling.fixed
-    scaled = similarity.apply(surface)
-    if isinstance(scaled, Mesh):
-        require_inside(scaled, study.lattice)
-    return similarity
 
 
-def _key(study: Study, similarity: Similarity, member: Member, label: str) -> str:
+def _key(study: Study, similarity: Similarity, choice: Choice, member: Member, label: str) -> str:
     try:
         fingerprint: Mapping[str, Any] = member.fingerprint()
     except InputError as error:
@@ -150,8 +212,10 @@ def _key(study: Study, similarity: Similarity, member: Member, label: str) -> st
     parts = {
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
-        "lattice": [study.lattice.xi_max, study.lattice.M],
-        "transform": [study.transform.eps, study.transform.precision, study.transform.quadrature.method],
+        "lattice": [choice.lattice.xi_max, choice.lattice.M],
+        "transform": [study.transform.eps, choice.precision, study.transform.quadrature.method],
         "numerics": NUMERICS_VERSION,
+        # What is asked of a field follows from its distance to the reference.
+        "accuracy": choice.basis,
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -15,12 +15,13 @@ import numpy as np
 from distributed import Client, Future, as_completed
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
 from sobolev_batch.batch.plan import Plan, Row, make_plan
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
@@ -49,6 +50,10 @@ class Progress:
     label: str = ""
     record: Record | None = None
 
+
+# A study whose distances fall short of the accuracy asked for is computed again on a larger lattice,
+# this often in all.
+_MOST_ROUNDS = 3
 
 Notify = Callable[[Progress], None]
 
@@ -95,19 +100,30 @@ def run(
 
     Raises:
         StudyError, MeshError, LatticeError: the study cannot be carried out.
+        AccuracyError: the accuracy that the study asks for is out of reach; nothing was computed.
         StoreError: the store cannot be written or belongs to another study.
     """
-    plan = make_plan(study)
+    plan = make_plan(study, stored_choice(store))
     place = Store.prepare(store, plan)
     rows = rows_of(place, plan)
     records = place.records()
     notify = on_progress or (lambda progress: None)
-    missing = [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
+    missing = _missing(place, rows)
     if missing or not _is_reduced(place, plan, rows, records):
         with nullcontext(client) if client is not None else local_client(workers) as active:
             notify(Progress("cluster", 0, 0, active.dashboard_link))
             _compute_fields(active, place, plan, rows, missing, notify)
-            _reduce(active, place, plan, rows, notify)
+            found = _reduce(active, place, plan, rows, notify)
+            for _ in range(_MOST_ROUNDS - 1):
+                choice = _grown(plan, found)
+                if choice is None:
+                    break
+                plan = plan.on(choice)
+                place = Store.prepare(store, plan)
+                rows = rows_of(place, plan)
+                missing = _missing(place, rows)
+                _compute_fields(active, place, plan, rows, missing, notify)
+                found = _reduce(active, place, plan, rows, notify)
     records = place.records()
     failed = {
         row.label: record.reason if record else "not computed"
@@ -121,6 +137,21 @@ def run(
         tuple(row.label for i, row in enumerate(rows) if i not in todo),
         failed,
     )
+
+
+def _missing(store: Store, rows: Sequence[Row]) -> list[int]:
+    """The rows whose fields are not there."""
+    records = store.records()
+    return [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
+
+
+def _grown(plan: Plan, found: Assessed | None) -> Choice | None:
+    """A larger lattice where distances to the reference fall short of the accuracy that is asked for."""
+    if plan.study.accuracy is None or found is None:
+        return None
+    known = ~np.isnan(found.values).any(axis=0)
+    complete = Assessed(*(part[:, known] for part in found))
+    return plan.choice.grown(complete, plan.study.orders, plan.study.accuracy)
 
 
 def rows_of(store: Store, plan: Plan) -> tuple[Row, ...]:
@@ -141,9 +172,17 @@ def _compute_fields(
     futures: dict[Future, int] = {}
     for i in missing:
         row = rows[i]
-        study = plan.study
         job = Job(
-            store, i, row.label, row.key, row.member, plan.similarity, study.lattice, study.transform, study.orders
+            store,
+            i,
+            row.label,
+            row.key,
+            row.member,
+            plan.similarity,
+            plan.lattice,
+            plan.transform,
+            plan.study.orders,
+            plan.aim(row),
         )
         futures[_submit(client, job, plan)] = i
     for done, future in enumerate(as_completed(list(futures)), 1):
@@ -168,10 +207,11 @@ def _submit(client: Client, job: Job, plan: Plan) -> Future:
     return client.submit(finish_mesh, job, parts, pure=False)
 
 
-def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify) -> None:
+def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify) -> Assessed | None:
+    """Make the tables; the distances to the reference, or None where the tables were there."""
     records = store.records()
     if _is_reduced(store, plan, rows, records):
-        return
+        return None
     complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
     reference = next(i for i, row in enumerate(rows) if row.label == plan.reference)
     orders = plan.study.orders
@@ -206,11 +246,12 @@ def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notif
     else:
         distances[..., 0] = to_reference
     _write_tables(store, plan, rows, records, norms, to_reference, distances, [rows[j] for j in others])
+    return Assessed(*to_reference)
 
 
 def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
     """The reducer of a store, with what the records say of its fields."""
-    lattice, orders = plan.study.lattice, plan.study.orders
+    lattice, orders = plan.lattice, plan.study.orders
     qualities = {
         i: Quality.from_json(record.quality)
         for i, record in enumerate(records)
@@ -238,7 +279,13 @@ def _write_tables(
     meshes = meshes_dataset(rows, records)
     sizes = meshes["edge_length_mean"].to_numpy()
     convergence = convergence_dataset(
-        rows, orders, Assessed(*to_reference), Assessed(*norms[..., reference]), sizes, plan.reference
+        rows,
+        orders,
+        Assessed(*to_reference),
+        Assessed(*norms[..., reference]),
+        sizes,
+        plan.reference,
+        plan.study.accuracy,
     )
     store.write_qualities([record.quality if record else "" for record in records])
     store.write_table("meshes", meshes)

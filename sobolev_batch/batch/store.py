@@ -19,10 +19,11 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
 
+from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.records import Record
 from sobolev_batch.errors import StoreError
-from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity
 
 SCHEMA_VERSION = 1
@@ -55,6 +56,8 @@ class Store:
                 store._create(plan)
             else:
                 store._check_same_study(plan)
+                if store._lattice() != _lattice_entry(plan):
+                    store._replace_fields(plan)
                 store._extend(plan)
                 store._update_attributes(plan)
             store.consolidate()
@@ -169,14 +172,25 @@ class Store:
         nearest = next(folder for folder in [Path(self.path), *Path(self.path).absolute().parents] if folder.exists())
         if not os.access(nearest, os.W_OK):
             raise StoreError(f"{self.path}: the store cannot be written: no permission in {nearest}")
+        zarr.create_group(self.path, zarr_format=3)
+        self._lay_out(plan)
+
+    def _replace_fields(self, plan: Plan) -> None:
+        """Remove everything that was computed and lay out the arrays for another lattice."""
+        root = zarr.open_group(self.path, mode="r+")
+        for group in list(root.group_keys()):
+            del root[group]
+        self._lay_out(plan)
+
+    def _lay_out(self, plan: Plan) -> None:
         labels = [row.label for row in plan.rows]
-        lattice = plan.study.lattice
+        lattice = plan.lattice
         chunk = plan.blocks[0].shape
-        root = zarr.create_group(self.path, zarr_format=3)
+        root = zarr.open_group(self.path, mode="r+")
         root.create_array(
             _FIELD,
             shape=(len(labels), *lattice.shape),
-            dtype=plan.study.transform.precision,
+            dtype=plan.choice.precision,
             chunks=(1, *chunk),
             compressors=(Crc32cCodec(),),
             fill_value=complex(np.nan, np.nan),
@@ -216,16 +230,17 @@ class Store:
         self._update_attributes(plan)
 
     def _check_same_study(self, plan: Plan) -> None:
-        found = self.attributes()
-        study = found["study"]
+        study = self.attributes()["study"]
+        # A lattice that was chosen may be chosen anew; one that was given is part of the study.
+        chosen = plan.study.accuracy is not None
         differences = [
             f"{what} {old!r}, not {new!r}"
             for what, old, new in (
                 ("the study", study["name"], plan.study.name),
-                ("the lattice", study["lattice"], _lattice_entry(plan.study.lattice)),
-                ("dtype", study["dtype"], plan.study.transform.precision),
+                ("the lattice", study["lattice"], _lattice_entry(plan)["lattice"]),
+                ("dtype", study["dtype"], plan.choice.precision),
             )
-            if old != new
+            if old != new and not (chosen and what != "the study" and study.get("choice"))
         ]
         removed = set(self.labels()) - {row.label for row in plan.rows}
         if removed:
@@ -235,6 +250,10 @@ class Store:
                 f"{self.path}: a store of another study is there, with {'; '.join(differences)}. "
                 "Name another store, or remove this one"
             )
+
+    def _lattice(self) -> dict[str, Any]:
+        study = self.attributes()["study"]
+        return {"lattice": study["lattice"], "dtype": study["dtype"]}
 
     def _extend(self, plan: Plan) -> None:
         """Append rows for meshes that the study has gained; the rows that are there stay."""
@@ -257,9 +276,9 @@ class Store:
                 "schema_version": SCHEMA_VERSION,
                 "study": {
                     "name": study.name,
-                    "lattice": _lattice_entry(study.lattice),
-                    "dtype": study.transform.precision,
-                    "eps": study.transform.accuracy,
+                    **_lattice_entry(plan),
+                    "eps": None if study.accuracy else study.transform.accuracy,
+                    "choice": plan.choice.to_table() if study.accuracy else None,
                     "orders": list(study.orders),
                     "reference": plan.reference,
                     "table": dict(study.table),
@@ -270,8 +289,16 @@ class Store:
         )
 
 
-def _lattice_entry(lattice: Lattice) -> dict[str, float | int]:
-    return {"xi_max": lattice.xi_max, "M": lattice.M}
+def stored_choice(path: str | Path) -> Choice | None:
+    """The lattice that the fields of a store were chosen to have; None without a store, or where it was given."""
+    if not (Path(path) / "zarr.json").exists():
+        return None
+    table = Store.open(path).attributes()["study"].get("choice")
+    return Choice.from_table(table) if table else None
+
+
+def _lattice_entry(plan: Plan) -> dict[str, Any]:
+    return {"lattice": {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}, "dtype": plan.choice.precision}
 
 
 def _similarity_entry(similarity: Similarity) -> dict[str, Any]:

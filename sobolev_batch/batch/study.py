@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.nufft import Precision
 from sobolev_batch.spectral.quadrature import Quadrature
@@ -65,8 +66,10 @@ class Study:
     Attributes:
         name: one word or line that identifies the study; a store remembers it.
         title: free text.
-        lattice: the one lattice of all fields.
+        lattice: the one lattice of all fields; None where an accuracy asks for one.
+        accuracy: of the distances to the reference; None where the lattice is given.
         transform: accuracy, precision and quadrature.
+        dtype: the precision that was asked for, if any.
         orders: the Sobolev orders s < -1/2.
         pairs: "all" for the distance of every mesh to every other, "reference" for those to the
             reference alone.
@@ -79,8 +82,10 @@ class Study:
 
     name: str
     title: str
-    lattice: Lattice
+    lattice: Lattice | None
+    accuracy: Accuracy | None
     transform: Transform
+    dtype: Precision | None
     orders: tuple[float, ...]
     pairs: Literal["all", "reference"]
     families: tuple[Family, ...]
@@ -114,7 +119,8 @@ class Study:
         """Validate a study given as nested tables, with the keys of the study file.
 
         Args:
-            table: sections [study], [lattice], [norm], [transform], [reference], [[family]], [scaling].
+            table: sections [study], [lattice] or [accuracy], [norm], [transform], [reference],
+                [[family]], [scaling].
             folder: where relative paths start.
 
         Raises:
@@ -135,8 +141,10 @@ class Study:
             return cls(
                 name=document.study.name,
                 title=document.study.title or document.study.name,
-                lattice=Lattice(document.lattice.xi_max, document.lattice.M),
+                lattice=None if document.lattice is None else document.lattice.settings(),
+                accuracy=None if document.accuracy is None else document.accuracy.settings(),
                 transform=document.transform.settings(),
+                dtype=document.transform.dtype,
                 orders=_distinct(check_orders(document.norm.orders)),
                 pairs=document.norm.pairs,
                 families=families,
@@ -164,6 +172,17 @@ class _LatticeSection(_Section):
     xi_max: Number
     M: int
 
+    def settings(self) -> Lattice:
+        return Lattice(self.xi_max, self.M)
+
+
+class _AccuracySection(_Section):
+    rtol: Number
+    memory_gb: Number | None = None
+
+    def settings(self) -> Accuracy:
+        return Accuracy(self.rtol) if self.memory_gb is None else Accuracy(self.rtol, 1e9 * self.memory_gb)
+
 
 class _NormSection(_Section):
     orders: Annotated[tuple[Number, ...], Field(min_length=1, max_length=100, strict=False)]
@@ -172,11 +191,11 @@ class _NormSection(_Section):
 
 class _TransformSection(_Section):
     eps: Number | None = None
-    dtype: Precision = "complex128"
+    dtype: Precision | None = None
     quadrature: str | int = "auto"
 
     def settings(self) -> Transform:
-        return Transform(self.eps, self.dtype, Quadrature(self.quadrature))
+        return Transform(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))
 
 
 class _ScalingSection(_Section):
@@ -203,12 +222,21 @@ class _FamilyReferenceSection(_Section):
 
 class _Document(_Section):
     study: _Header
-    lattice: _LatticeSection
+    lattice: _LatticeSection | None = None
+    accuracy: _AccuracySection | None = None
     norm: _NormSection
     transform: _TransformSection = _TransformSection()
     reference: dict[str, Any]
     family: Annotated[list[dict[str, Any]], Field(min_length=1)]
     scaling: _ScalingSection = _ScalingSection()
+
+    @model_validator(mode="after")
+    def _lattice_or_accuracy(self) -> Self:
+        if (self.lattice is None) == (self.accuracy is None):
+            raise ValueError("either a [lattice] or an [accuracy] is needed, and not both")
+        if self.accuracy is not None and (self.transform.eps is not None or self.transform.quadrature != "auto"):
+            raise ValueError("an [accuracy] chooses eps and quadrature; take them out of [transform]")
+        return self
 
 
 class _FamilyName(_Section):

@@ -16,8 +16,11 @@ from distributed import get_worker
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.fields import compute_field, field_for
+from sobolev_batch.spectral.forecast import settle
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.probe import Probe, join
+from sobolev_batch.spectral.probe import join
+from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import probe_block
 from sobolev_batch.spectral.transform import Transform, transform_block
@@ -41,6 +44,7 @@ class Job:
     lattice: Lattice
     transform: Transform
     orders: tuple[float, ...]
+    aim: Aim | None = None
 
 
 @dataclass(frozen=True)
@@ -67,21 +71,36 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     started = time.perf_counter()
     try:
         surface = job.similarity.apply(job.member.load())
-        points = 0
-        probes: list[Probe] = []
-        for block in blocks:
-            made = transform_block(surface, job.lattice, block, job.transform, threads=1)
-            job.store.write_field(job.row, job.lattice.place(block), made.values)
-            probes.append(probe_block(surface, job.lattice, job.transform, job.orders, block, made.values))
-            points = made.points
+        quality, points = _compute(job, surface, blocks)
     except InputError as error:
         return Part(Facts(), time.perf_counter() - started, str(error))
     except Exception as error:
         _log.exception("%s failed for a reason that is not its mesh's", job.label)
         reason = " ".join(str(error).split()) or type(error).__name__
         return Part(Facts(), time.perf_counter() - started, reason)
-    quality = Quality.of_surface(surface, join(probes))
     return Part(_facts(surface, points), time.perf_counter() - started, quality=quality)
+
+
+def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quality, int]:
+    """Compute and store some blocks; what is known of their errors, and the points they were made from."""
+    goal = job.aim.goal(surface) if job.aim is not None and isinstance(surface, Mesh) else None
+    if tuple(blocks) == (job.lattice.half,):
+        if goal is not None:
+            field = field_for(surface, job.lattice, goal, job.transform)
+        else:
+            field = compute_field(surface, job.lattice, job.transform, job.orders)
+        job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
+        return field.quality, field.points
+    settings = job.transform
+    if goal is not None and isinstance(surface, Mesh):
+        settings = settle(surface, job.lattice, goal, settings)
+    probes, points = [], 0
+    for block in blocks:
+        made = transform_block(surface, job.lattice, block, settings, threads=1)
+        job.store.write_field(job.row, job.lattice.place(block), made.values)
+        probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values))
+        points = made.points
+    return Quality.of_surface(surface, join(probes)), points
 
 
 def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:

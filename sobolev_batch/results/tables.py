@@ -29,6 +29,7 @@ _NUMBERS = (
     "rate",
     "rate_error",
     "resolved",
+    "within",
 )
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate")
@@ -37,6 +38,9 @@ The true distance lies within its error: truncation (beyond xi_max; it can only
 raise the distance), aliasing (spacing of the lattice) and discretisation
 (quadrature and NUFFT) together. Lengths are in the study's unit. A distance
 marked * is not larger than its error; no rate is taken from it."""
+_ACCURACY_NOTE = """\
+The study asks for an error of at most {rtol:g} of each distance; where it is
+larger, the distance is marked !."""
 
 
 def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) -> pd.DataFrame:
@@ -49,7 +53,8 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
     Returns:
         Columns order, mesh, family, name, level, status, reason, triangles, edge_length, distance,
         error, truncation, aliasing, discretisation, relative, relative_error, rate, rate_error,
-        resolved (whether the distance exceeds its error). Lengths are in the study's unit. A mesh
+        resolved (whether the distance exceeds its error), within (whether the error is as small as
+        the study asks for). Lengths are in the study's unit. A mesh
         that failed has NaN, never a number.
 
     Raises:
@@ -102,7 +107,10 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
             colalign=("left", *["right"] * (len(_HEADERS) - 1)),
         )
         parts.append(f"% {caption}\n{table}" if style == "latex" else f"{caption}\n\n{table}")
-    parts.append("\n".join(f"% {line}" if style == "latex" else line for line in _NOTE.split("\n")))
+    note = _NOTE
+    if "rtol" in tree["convergence"].attrs:
+        note += "\n" + _ACCURACY_NOTE.format(rtol=tree["convergence"].attrs["rtol"])
+    parts.append("\n".join(f"% {line}" if style == "latex" else line for line in note.split("\n")))
     failures = frame.drop_duplicates("mesh").query("status != 'complete'")
     notes = [f"{line.mesh} is {line.status}: {line.reason}" for line in failures.itertuples(index=False)]
     if notes:
@@ -128,10 +136,16 @@ def _cells(line: dict[str, Any]) -> list[str]:
         line["mesh"],
         f"{line['triangles']:,}" if line["triangles"] else "",
         _number(line["edge_length"], ".4g"),
-        _with_error(line["distance"], line["error"], ".6e", ".0e") + ("" if line["resolved"] else "*"),
+        _with_error(line["distance"], line["error"], ".6e", ".0e") + _mark(line),
         _number(line["relative"], ".5e"),
         _with_error(line["rate"], line["rate_error"], ".3f", ".3f"),
     ]
+
+
+def _mark(line: dict[str, Any]) -> str:
+    if not line["resolved"]:
+        return "*"
+    return "" if line["within"] else "!"
 
 
 def _with_error(value: float, error: float, spec: str, error_spec: str) -> str:

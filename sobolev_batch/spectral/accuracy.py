@@ -28,7 +28,7 @@ Reals = NDArray[np.float64]
 
 # The part of the accuracy that aliasing may use up; the rest is for truncation and the fields' own errors.
 _ALIASING_SHARE = 0.1
-# At low orders the tail falls so fast that leaving it little costs nothing.
+# At orders below this one the tail falls so fast that leaving it less costs little.
 _TRUNCATION_SHARE, _HIGH_ORDER = 0.7, 2.0
 _DEFAULT_MEMORY = 2e9
 # Before anything is known of a pair: how much larger than the kernel alone says its images are, and
@@ -66,6 +66,19 @@ class Accuracy:
         return np.asarray(found.errors <= self.rtol * found.values)
 
     @property
+    def aliasing_part(self) -> float:
+        """The largest error by aliasing, relative."""
+        return _ALIASING_SHARE * self.rtol
+
+    def truncation_part(self, order: float) -> float:
+        """The largest error by truncation at an order, relative: the lower the order, the cheaper a small one."""
+        return _TRUNCATION_SHARE * min(1.0, _HIGH_ORDER / -order) * self.rtol
+
+    def discretisation_part(self, order: float) -> float:
+        """The largest error of both fields together at an order, relative."""
+        return self.rtol - self.aliasing_part - self.truncation_part(order)
+
+    @property
     def largest_intervals(self) -> int:
         """The largest M whose fields fit into the memory, two of them and the transform that makes one.
 
@@ -84,16 +97,6 @@ class Accuracy:
         return memory_bytes(half, Transform()) + 2 * 16 * half.size
 
 
-def truncation_share(order: float) -> float:
-    """The part of the accuracy that truncation may use up at an order."""
-    return _TRUNCATION_SHARE * min(1.0, _HIGH_ORDER / -order)
-
-
-def discretisation_share(order: float) -> float:
-    """The part of the accuracy that the errors of both fields together may use up at an order."""
-    return 1 - _ALIASING_SHARE - truncation_share(order)
-
-
 def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
     """The lattice that two surfaces close to each other need, before anything else is known of them.
 
@@ -108,13 +111,13 @@ def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
     Returns:
         A lattice, and whether it is a pilot that is likely to be `refined`.
     """
-    period = _first_period(widths, orders, accuracy.rtol)
+    period = _first_period(widths, orders, accuracy)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
     highest = radii[0]
     for order in orders:
         # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
         tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
-        allowed = truncation_share(order) * accuracy.rtol / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+        allowed = accuracy.truncation_part(order) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
         enough = np.flatnonzero(tails <= allowed)
         highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
     intervals = good_intervals(2 * highest * period)
@@ -151,7 +154,7 @@ def refined(
     period = 1 / lattice.spacing
     before = np.array([image_weight(1 / period, order, widths) for order in orders])
     while period < 1 / lattice.spacing + 8 and any(
-        image * image_weight(1 / period, order, widths) / weight > _ALIASING_SHARE * accuracy.rtol
+        image * image_weight(1 / period, order, widths) / weight > accuracy.aliasing_part
         for image, order, weight in zip(images, orders, before, strict=True)
     ):
         period += 0.02 / lattice.spacing
@@ -163,13 +166,13 @@ def refined(
 
     most = accuracy.largest_intervals
     highest = lattice.xi_max
-    shares = np.array([truncation_share(order) for order in orders])
-    while np.any(tail(highest) > shares * accuracy.rtol):
+    allowed = np.array([accuracy.truncation_part(order) for order in orders])
+    while np.any(tail(highest) > allowed):
         highest *= _STEP
         if 2 * highest * period > most:
-            parts = tail(max(most / (2 * period), lattice.xi_max)) / shares
+            parts = tail(max(most / (2 * period), lattice.xi_max)) / allowed
             worst = int(np.argmax(parts))
-            reachable = _rounded_up(float(parts[worst]))
+            reachable = _rounded_up(float(parts[worst]) * accuracy.rtol)
             raise AccuracyError(
                 f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: within "
                 f"{accuracy.memory / 1e9:.3g} GB (M <= {most}) about {reachable:g} can be reached; "
@@ -201,9 +204,9 @@ def _grid(modes: int) -> int:
         count += 2
 
 
-def _first_period(widths: Reals, orders: Sequence[float], rtol: float) -> float:
+def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> float:
     period = float(widths.max())
-    allowed = _ALIASING_SHARE * rtol / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
+    allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
     while any(image_weight(1 / period, order, widths) > allowed for order in orders):
         period *= 1.01
     return period

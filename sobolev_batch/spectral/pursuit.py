@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.accuracy import Accuracy, discretisation_share, first_lattice, refined
+from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, refined
 from sobolev_batch.spectral.budget import Assessed, Sums, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.forecast import Goal, permits_single
@@ -27,6 +27,8 @@ Reals = NDArray[np.float64]
 _ROUNDS = 4
 # A distance is first estimated from a few frequencies; it is seldom less than this part of that.
 _ESTIMATE_CAUTION = 0.7
+# The surfaces of a pair have equal parts in what both fields may err.
+_PAIR = 2
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -82,9 +84,8 @@ def pursue(
         samples = _samples(surfaces, lattice, orders)
         if values is None:
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
-        asked = max(accuracy.rtol, _PILOT_RTOL) if pilot else accuracy.rtol
-        goal = goal_of(values, orders, asked).tightened(strictness * meshes)
-        precision: Precision = "complex64" if all(permits_single(s, lattice, goal) for s in surfaces) else "complex128"
+        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy).tightened(strictness * meshes)
+        precision = _precision(surfaces, lattice, goal)
         fields = tuple(
             field_for(
                 surface, lattice, goal, Transform(precision=precision), sample=sample, extent=extent, threads=threads
@@ -97,18 +98,104 @@ def pursue(
             break
         lattice = refined(lattice, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
         if not pilot:
-            excess = found.assessed.discretisation / (np.array(goal_of(values, orders, asked).norms))
+            excess = found.assessed.discretisation / np.array(goal_of(values, orders, accuracy).norms)
             strictness *= max(1.0, 2 * float(excess.max()))
         pilot = False
     return found
 
 
-def goal_of(values: Reals, orders: Sequence[float], rtol: float) -> Goal:
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """What a pair of surfaces needs.
+
+    Attributes:
+        values: the distances (orders,), roughly.
+        lattice: that the accuracy needs.
+        single: whether single precision is enough.
+    """
+
+    values: Reals
+    lattice: Lattice
+    single: bool
+
+
+def pilot_of(
+    surface: Surface,
+    reference: Surface,
+    orders: Sequence[float],
+    accuracy: Accuracy,
+    widths: Reals,
+    *,
+    what: str,
+    threads: int = 1,
+) -> Pilot:
+    """What a pair of surfaces needs for an accuracy, found out on a small lattice.
+
+    Args:
+        surface: one of them.
+        reference: the other.
+        orders: s, each.
+        accuracy: what is asked for.
+        widths: extents (13,) of all surfaces that share the lattice.
+        what: names the surface in messages.
+        threads: to compute with.
+
+    Raises:
+        AccuracyError: it cannot be met within the memory.
+    """
+    lattice, _ = first_lattice(widths, orders, accuracy)
+    samples = _samples((surface, reference), lattice, orders)
+    goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy)).tightened(_PAIR)
+    fields = [
+        field_for(each, lattice, goal, Transform(), sample=sample, threads=threads)
+        for each, sample in zip((surface, reference), samples, strict=True)
+    ]
+    areas = np.array(surface.area + reference.area)
+    found = _assessed(fields, lattice, orders, areas, widths)
+    needed = refined(lattice, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
+    final = goal_of(found.assessed.values, orders, accuracy).tightened(_PAIR)
+    single = all(permits_single(each, needed, final) for each in (surface, reference))
+    return Pilot(found.assessed.values, needed, single)
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What the field of a surface is computed for: its distance to a reference, to an accuracy.
+
+    Attributes:
+        orders: s, each.
+        accuracy: what is asked for.
+        reference: a sample of the reference; None for the reference itself, then
+        distances: are the smallest (orders,) that its field has to serve.
+    """
+
+    orders: tuple[float, ...]
+    accuracy: Accuracy
+    reference: Sample | None
+    distances: tuple[float, ...] = ()
+
+    def goal(self, surface: Surface) -> Goal:
+        """What the field of a surface may err."""
+        values = np.array(self.distances)
+        if self.reference is not None:
+            sample = Sample.of(surface, self.reference.draws)
+            values = _ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
+        return goal_of(values, self.orders, self.accuracy).tightened(_PAIR)
+
+
+def goal_of(values: Reals, orders: Sequence[float], accuracy: Accuracy) -> Goal:
     """What the fields of a pair at these distances (orders,) may err, both together."""
-    shares = np.array([discretisation_share(order) for order in orders])
+    parts = np.array([accuracy.discretisation_part(order) for order in orders])
     # Twins have no distance that could be kept to a relative accuracy: rounding is all there is.
-    norms = np.maximum(shares * rtol * values, 1e-300)
-    return Goal(tuple(orders), tuple(norms.tolist()))
+    return Goal(tuple(orders), tuple(np.maximum(parts * values, 1e-300).tolist()))
+
+
+def _of_pilot(accuracy: Accuracy) -> Accuracy:
+    return replace(accuracy, rtol=max(accuracy.rtol, _PILOT_RTOL))
+
+
+def _precision(surfaces: Sequence[Surface], lattice: Lattice, goal: Goal) -> Precision:
+    return "complex64" if all(permits_single(surface, lattice, goal) for surface in surfaces) else "complex128"
 
 
 def _samples(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float]) -> tuple[Sample, ...]:

@@ -10,8 +10,10 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from sobolev_batch import Study, run
+from sobolev_batch import Lattice, Study, run
 from sobolev_batch.batch.cluster import local_client
+
+SMALL_LATTICE = Lattice(3.0, 16)
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +27,7 @@ def small_table(**changes: Any) -> dict[str, Any]:
     """A study of four icospheres that takes a second."""
     table: dict[str, Any] = {
         "study": {"name": "small"},
-        "lattice": {"xi_max": 3.0, "M": 16},
+        "lattice": {"xi_max": SMALL_LATTICE.xi_max, "M": SMALL_LATTICE.M},
         "norm": {"orders": [-10.0, -3.0]},
         "reference": {"source": "sphere"},
         "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]}],

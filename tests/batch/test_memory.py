@@ -42,7 +42,7 @@ plan = make_plan(sb.Study.from_table(table))
 store = Store.prepare(sys.argv[1], plan)
 study = plan.study
 sheet = Sheet("sheet", 0)
-job = Job(store, 0, "a/0", "key", sheet, plan.similarity, study.lattice, study.transform, study.orders)
+job = Job(store, 0, "a/0", "key", sheet, plan.similarity, plan.lattice, plan.transform, study.orders)
 record = compute_mesh(job, plan.blocks)
 assert record.status == "complete", record.reason
 print(record.facts.triangles, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

@@ -13,16 +13,16 @@ from sobolev_batch import Mesh, Sphere, StoreError, Study, distance, fourier_tra
 from sobolev_batch.batch import plan as plan_module
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
-from tests.batch.conftest import small_table, variable
+from tests.batch.conftest import SMALL_LATTICE, small_table, variable
 
 
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
     tree = open_store(finished_store)
     study = Study.from_table(small_table())
-    sphere = fourier_transform(Sphere(), study.lattice)
+    sphere = fourier_transform(Sphere(), SMALL_LATTICE)
     for level in range(4):
         field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars(["mesh", "quality"])
-        expected = fourier_transform(icosphere(level), study.lattice, threads=1)
+        expected = fourier_transform(icosphere(level), SMALL_LATTICE, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
         assert found == pytest.approx(distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
@@ -31,7 +31,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     matrix = variable(tree, "distances", "distance").sel(order=-10.0).values
     assert np.array_equal(matrix, matrix.T)
     assert (matrix.diagonal() == 0).all()
-    a, b = (fourier_transform(icosphere(level), study.lattice) for level in (2, 3))
+    a, b = (fourier_transform(icosphere(level), SMALL_LATTICE) for level in (2, 3))
     assert matrix[2, 3] == pytest.approx(distance(a, b, -10.0)["distance"].item(), rel=1e-9)
     convergence = tree["convergence"].to_dataset()
     rates = convergence.sel(order=-3.0)["rate"].values
@@ -45,7 +45,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     # The same errors from the stored field as from one that was just computed.
     field = variable(tree, "fourier", "fourier").sel(mesh="ico/3")
     fresh = distance(
-        fourier_transform(icosphere(3), study.lattice, threads=1, orders=study.orders), sphere, study.orders
+        fourier_transform(icosphere(3), SMALL_LATTICE, threads=1, orders=study.orders), sphere, study.orders
     )
     stored = distance(field, variable(tree, "fourier", "fourier").sel(mesh="reference"), study.orders)
     for name in ("truncation", "aliasing"):

@@ -29,8 +29,8 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Path) -> None:
     store = Store.prepare(store_path, small_plan())
     plan = small_plan()
-    place = plan.study.lattice.place(plan.blocks[0])
-    store.write_field(1, place, np.zeros(plan.study.lattice.shape, dtype=complex))
+    place = plan.lattice.place(plan.blocks[0])
+    store.write_field(1, place, np.zeros(plan.lattice.shape, dtype=complex))
     fields = store.read_fields([0, 1], place)
     assert np.isnan(fields[0]).all()
     assert (fields[1] == 0).all()
@@ -62,8 +62,8 @@ def test_a_damaged_record_is_an_error(store_path: Path) -> None:
 def test_a_flipped_bit_in_a_field_raises_and_names_the_mesh(store_path: Path) -> None:
     plan = small_plan()
     store = Store.prepare(store_path, plan)
-    place = plan.study.lattice.place(plan.blocks[0])
-    store.write_field(3, place, np.ones(plan.study.lattice.shape, dtype=complex))
+    place = plan.lattice.place(plan.blocks[0])
+    store.write_field(3, place, np.ones(plan.lattice.shape, dtype=complex))
     chunk = store_path / "fourier/fourier/c/3/0/0/0"
     data = bytearray(chunk.read_bytes())
     data[1000] ^= 4

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sobolev_batch import Study, StudyError
+from sobolev_batch import Lattice, Study, StudyError
 from tests.batch.conftest import small_table
 
 WORKFLOWS = Path(__file__).parents[2] / "workflows"
@@ -49,7 +49,7 @@ def test_reads_every_key(tmp_path: Path) -> None:
     path.write_text(FULL.replace("1e-7", "1e-6"))
     study = Study.from_toml(path)
     assert (study.name, study.title) == ("two words", "A title")
-    assert (study.lattice.xi_max, study.lattice.M) == (4.0, 32)
+    assert study.lattice == Lattice(4.0, 32)
     assert study.orders == (-2.0, -3.5)
     assert study.pairs == "reference"
     assert (study.transform.accuracy, study.transform.precision) == (1e-6, "complex64")

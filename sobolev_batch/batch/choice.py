@@ -1,0 +1,185 @@
+"""The lattice and precision of a study's fields: given, or chosen for an accuracy from a few pilot pairs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.batch.study import Study
+from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.spectral.accuracy import Accuracy, good_intervals
+from sobolev_batch.spectral.budget import Assessed, support_widths
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.probe import Probe
+from sobolev_batch.spectral.pursuit import Pilot, pilot_of
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.surfaces.similarity import Similarity, Surface
+from sobolev_batch.surfaces.sources import Member
+
+_log = logging.getLogger(__name__)
+
+# Pilots: the coarsest and the finest member of each family, of so many families.
+_MOST_FAMILIES = 6
+# Surfaces that are no pilots may reach a little further than those that are.
+_REACH_MARGIN = 1.03
+# A lattice grows by no more than this at a time.
+_LARGEST_GROWTH = 2.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What all fields of a study have in common.
+
+    Attributes:
+        lattice: of all fields.
+        precision: of all fields.
+        closest: for each order the smallest distance to the reference that a pilot showed; empty
+            where the lattice was given.
+        reasons: one line each, for people.
+        basis: identifies what the choice was made from; empty where the lattice was given.
+    """
+
+    lattice: Lattice
+    precision: Precision
+    closest: tuple[float, ...] = ()
+    reasons: tuple[str, ...] = ()
+    basis: str = ""
+
+    def to_table(self) -> dict[str, Any]:
+        """The choice as JSON takes it."""
+        return {
+            "xi_max": self.lattice.xi_max,
+            "M": self.lattice.M,
+            "dtype": self.precision,
+            "closest": list(self.closest),
+            "reasons": list(self.reasons),
+            "basis": self.basis,
+        }
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Self:
+        """The choice that a table holds."""
+        lattice = Lattice(table["xi_max"], table["M"])
+        return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"])
+
+    def grown(self, found: Assessed, orders: Sequence[float], accuracy: Accuracy) -> Choice | None:
+        """A larger or finer lattice where distances (orders, meshes) fall short of an accuracy.
+
+        None where they do not, where the lattice is not what limits them, or where no larger one fits
+        into the memory.
+        """
+        highest, period = self.lattice.xi_max, 1 / self.lattice.spacing
+        short = ~accuracy.met(found) & (found.values > 0)
+        for k, order in enumerate(orders):
+            if not short[k].any():
+                continue
+            values = found.values[k][short[k]]
+            tail = float(np.max(found.truncation[k][short[k]] / values)) / accuracy.truncation_part(order)
+            images = float(np.max(found.aliasing[k][short[k]] / values)) / accuracy.aliasing_part
+            if tail > 1 and order < -1.5:
+                # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
+                growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)
+                highest = max(highest, self.lattice.xi_max * growth)
+            if images > 1:
+                period = max(period, 1 / self.lattice.spacing + math.log(images) / (2 * math.pi) * 1.1)
+        intervals = good_intervals(2 * highest * period)
+        if (highest, period) == (self.lattice.xi_max, 1 / self.lattice.spacing):
+            return None
+        if intervals > accuracy.largest_intervals:
+            return None
+        lattice = Lattice(intervals / (2 * period), intervals)
+        reason = f"grown from xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}, whose errors were too large"
+        return Choice(lattice, self.precision, self.closest, (*self.reasons, reason), self.basis)
+
+
+def basis_of(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
+    """Identifies what the choice for a study rests on. Its families do not count: they may gain meshes."""
+    if study.accuracy is None:
+        return ""
+    parts = {
+        "accuracy": [study.accuracy.rtol, study.accuracy.memory],
+        "orders": study.orders,
+        "dtype": study.dtype,
+        "similarity": [similarity.scale, *similarity.origin],
+        "reference": dict(reference),
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def choose(
+    study: Study, similarity: Similarity, reference: Surface, members: Mapping[str, tuple[str, Member]], basis: str
+) -> Choice:
+    """The lattice and precision for the accuracy that a study asks for.
+
+    The coarsest and the finest member of each family are compared with the reference on a small
+    lattice; the choice is what the most demanding of these pairs needs.
+
+    Args:
+        study: with an accuracy.
+        similarity: of the study.
+        reference: in the study's unit.
+        members: label -> (family, member), without the reference.
+        basis: see `basis_of`.
+
+    Raises:
+        AccuracyError: a pilot shows that the accuracy cannot be met within the memory.
+        StudyError: no pilot could be made.
+    """
+    accuracy = study.accuracy
+    if accuracy is None:
+        raise ValueError("only a study that asks for an accuracy leaves a choice")
+    surfaces = _pilots(members, similarity)
+    extents = [Quality.of_surface(surface, Probe()) for surface in (reference, *surfaces.values())]
+    widths = _REACH_MARGIN * support_widths(extents)
+    pilots: dict[str, Pilot] = {
+        label: pilot_of(surface, reference, study.orders, accuracy, widths, what=label)
+        for label, surface in surfaces.items()
+    }
+    if not pilots:
+        raise StudyError(
+            "no surface of the study's families can be made, so there is nothing to choose a lattice from; "
+            "see what is wrong with them, or give a [lattice] instead of an [accuracy]"
+        )
+    highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)
+    finest = max(pilots, key=lambda label: 1 / pilots[label].lattice.spacing)
+    xi_max, period = pilots[highest].lattice.xi_max, 1 / pilots[finest].lattice.spacing
+    # Each pair alone fits into the memory, or it would have been refused.
+    intervals = min(good_intervals(2 * xi_max * period), accuracy.largest_intervals)
+    lattice = Lattice(intervals / (2 * period), intervals)
+    single = study.dtype is None and all(pilot.single for pilot in pilots.values())
+    precision: Precision = "complex64" if single else study.dtype or "complex128"
+    closest = np.min([pilot.values for pilot in pilots.values()], axis=0)
+    reasons = (
+        f"xi_max {lattice.xi_max:.4g} for truncation, which {highest} needs most of {len(pilots)} pilot pairs",
+        f"spacing {lattice.spacing:.4g} for aliasing: the surfaces reach over {widths.max():.4g} units of length",
+        f"{precision} for the smallest distance of a pilot, about {_listed(closest, study.orders)}",
+    )
+    return Choice(lattice, precision, tuple(closest.tolist()), reasons, basis)
+
+
+def _pilots(members: Mapping[str, tuple[str, Member]], similarity: Similarity) -> dict[str, Surface]:
+    families: dict[str, list[str]] = {}
+    for label, (family, _) in members.items():
+        families.setdefault(family, []).append(label)
+    surfaces: dict[str, Surface] = {}
+    for labels in list(families.values())[:_MOST_FAMILIES]:
+        by_level = sorted(labels, key=lambda label: members[label][1].level)
+        for label in dict.fromkeys((by_level[0], by_level[-1])):
+            try:
+                surfaces[label] = similarity.apply(members[label][1].load())
+            except InputError as error:
+                _log.warning("%s serves as no pilot: %s", label, error)
+    return surfaces
+
+
+def _listed(values: NDArray[np.float64], orders: Sequence[float]) -> str:
+    return ", ".join(f"{value:.2g} at order {order:g}" for value, order in zip(values.tolist(), orders, strict=True))
