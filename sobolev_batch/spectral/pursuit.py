@@ -29,6 +29,8 @@ _ROUNDS = 4
 _ESTIMATE_CAUTION = 0.7
 # The surfaces of a pair have equal parts in what both fields may err.
 _PAIR = 2
+# No field is exact to less than this part of its area. Twins are that close: no relative accuracy is theirs.
+_ROUNDING = 1e-13
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -84,7 +86,8 @@ def pursue(
         samples = _samples(surfaces, lattice, orders)
         if values is None:
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
-        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy).tightened(strictness * meshes)
+        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas))
+        goal = goal.tightened(strictness * meshes)
         precision = _precision(surfaces, lattice, goal)
         fields = tuple(
             field_for(
@@ -94,11 +97,11 @@ def pursue(
         )
         found = _assessed(fields, lattice, orders, areas, widths)
         values = found.assessed.values
-        if accuracy.met(found.assessed).all():
+        if accuracy.met(found.assessed).all() or (values <= _ROUNDING * areas / accuracy.rtol).any():
             break
         lattice = refined(lattice, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
         if not pilot:
-            excess = found.assessed.discretisation / np.array(goal_of(values, orders, accuracy).norms)
+            excess = found.assessed.discretisation / np.array(goal_of(values, orders, accuracy, float(areas)).norms)
             strictness *= max(1.0, 2 * float(excess.max()))
         pilot = False
     return found
@@ -145,15 +148,15 @@ def pilot_of(
     """
     lattice, _ = first_lattice(widths, orders, accuracy)
     samples = _samples((surface, reference), lattice, orders)
-    goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy)).tightened(_PAIR)
+    area = surface.area + reference.area
+    goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
     fields = [
         field_for(each, lattice, goal, Transform(), sample=sample, threads=threads)
         for each, sample in zip((surface, reference), samples, strict=True)
     ]
-    areas = np.array(surface.area + reference.area)
-    found = _assessed(fields, lattice, orders, areas, widths)
-    needed = refined(lattice, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
-    final = goal_of(found.assessed.values, orders, accuracy).tightened(_PAIR)
+    found = _assessed(fields, lattice, orders, np.array(area), widths)
+    needed = refined(lattice, found.sums, orders, accuracy, areas=np.array(area), widths=widths, what=what)
+    final = goal_of(found.assessed.values, orders, accuracy, area).tightened(_PAIR)
     single = all(permits_single(each, needed, final) for each in (surface, reference))
     return Pilot(found.assessed.values, needed, single)
 
@@ -180,14 +183,13 @@ class Aim:
         if self.reference is not None:
             sample = Sample.of(surface, self.reference.draws)
             values = _ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
-        return goal_of(values, self.orders, self.accuracy).tightened(_PAIR)
+        return goal_of(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
 
 
-def goal_of(values: Reals, orders: Sequence[float], accuracy: Accuracy) -> Goal:
-    """What the fields of a pair at these distances (orders,) may err, both together."""
+def goal_of(values: Reals, orders: Sequence[float], accuracy: Accuracy, area: float) -> Goal:
+    """What the fields of a pair at these distances (orders,) may err, both together: never below rounding."""
     parts = np.array([accuracy.discretisation_part(order) for order in orders])
-    # Twins have no distance that could be kept to a relative accuracy: rounding is all there is.
-    return Goal(tuple(orders), tuple(np.maximum(parts * values, 1e-300).tolist()))
+    return Goal(tuple(orders), tuple(np.maximum(parts * values, _ROUNDING * area).tolist()))
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:

@@ -22,9 +22,9 @@ from sobolev_batch.surfaces.sphere import Sphere
 # another version are then computed again instead of being compared with new ones.
 NUMERICS_VERSION = 3
 
-# Points of one NUFFT call: 4 million take 0.5 GB with their strengths and their sorting, and make
+# Points of one NUFFT call: 2 million take 0.3 GB with their strengths and their sorting, and make
 # the FFT of a call a small part of it.
-DEFAULT_BATCH = 1 << 22
+DEFAULT_BATCH = 1 << 21
 
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
 FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
