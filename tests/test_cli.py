@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
     output, errors = (folder / "run.out").read_text(), (folder / "run.err").read_text()
     assert "Sobolev distance of order -10 to reference" in output
-    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \d\.\d{3}\n", output)
+    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \de-\d\d\n", output)
     assert "3 computed, 0 reused, 0 failed; store: storage/cli.zarr" in output
     assert re.search(r"dashboard: http://127\.0\.0\.1:\d+/status", errors)
     assert re.search(r"\[3/3\] \S+: complete, \d+\.\d\d s", errors)

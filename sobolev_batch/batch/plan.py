@@ -76,7 +76,8 @@ class Plan:
     @property
     def transform(self) -> Transform:
         """How fields are computed; where an accuracy is asked for, eps and tolerance follow for each."""
-        return replace(self.study.transform, precision=self.choice.precision)
+        given = self.study.transform
+        return given if self.study.accuracy is None else Transform(None, self.choice.precision, given.quadrature)
 
     def aim(self, row: Row) -> Aim | None:
         """What the field of a row is computed for, where an accuracy is asked for."""

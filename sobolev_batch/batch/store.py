@@ -26,7 +26,7 @@ from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 Place = tuple[slice, slice, slice]
 

@@ -138,7 +138,7 @@ def _cells(line: dict[str, Any]) -> list[str]:
         _number(line["edge_length"], ".4g"),
         _with_error(line["distance"], line["error"], ".6e", ".0e") + _mark(line),
         _number(line["relative"], ".5e"),
-        _with_error(line["rate"], line["rate_error"], ".3f", ".3f"),
+        _with_error(line["rate"], line["rate_error"], ".3f", ".0e"),
     ]
 
 

@@ -74,7 +74,10 @@ def evaluate(case: Case) -> tuple[float, float] | None:
             reachable = 1.5 * refusal.reachable
             if not reachable <= _LARGEST_RTOL:
                 return None
-            found = distance(*case.pair, case.order, rtol=reachable, memory=_MEMORY)
+            try:
+                found = distance(*case.pair, case.order, rtol=reachable, memory=_MEMORY)
+            except AccuracyError:
+                return None
     return found["distance"].item(), found["error"].item()
 
 

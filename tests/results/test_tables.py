@@ -31,6 +31,7 @@ def tree() -> xr.DataTree:
             "rate": (("mesh", "order"), rate),
             "rate_error": (("mesh", "order"), 0.01 * rate),
             "resolved": (("mesh", "order"), np.array([[True, True], [True, False], [False, False], [False, False]])),
+            "within": (("mesh", "order"), np.array([[True, False], [True, False], [False, False], [True, True]])),
             "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan]),
         },
         coords={"mesh": MESHES, "order": [-10.0, -2.5]},
@@ -60,8 +61,8 @@ def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
     text = format_table(tree, "text", [-2.5])
     assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
     rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
-    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "±", "8e-04", "2.00000e-01"]
-    assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "±", "2e-04*", "5.00000e-02", "2.000", "±", "0.020"]
+    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "±", "8e-04!", "2.00000e-01"]
+    assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "±", "2e-04*", "5.00000e-02", "2.000", "±", "2e-02"]
     assert rows[2] == ["f_1/2", *["missing"] * 5]
     assert text.endswith("f_1/2 is failed: no 50% of it | is <there>")
 
@@ -80,7 +81,7 @@ def test_programs_get_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) ->
     assert records[1]["rate"] == 2.0
     lines = format_table(tree, "csv", [-10.0]).splitlines()
     assert len(lines) == 4
-    assert lines[3].endswith(",,,,,False")
+    assert lines[3].endswith(",,,,,False,False")
 
 
 def test_latex_escapes_labels(tree: xr.DataTree) -> None:
