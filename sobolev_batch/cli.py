@@ -138,18 +138,30 @@ def plot_command(store: Path, output: Path) -> None:
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
-@click.option("--xi-max", type=float, default=5.0, show_default=True, help="Highest frequency per axis.")
-@click.option("--M", "intervals", type=int, default=64, show_default=True, help="Lattice intervals per axis.")
+@click.option("--rtol", type=float, help="Largest error relative to the distance; instead of a lattice.")
+@click.option("--xi-max", type=float, help="Highest frequency per axis. [default: 5]")
+@click.option("--M", "intervals", type=int, help="Lattice intervals per axis. [default: 64]")
 @click.option("--no-scaling", is_flag=True, help="Keep the files' own unit instead of fitting B into the unit sphere.")
 def compare_command(
-    a: Path, b: Path, orders: tuple[float, ...], xi_max: float, intervals: int, no_scaling: bool
+    a: Path,
+    b: Path,
+    orders: tuple[float, ...],
+    rtol: float | None,
+    xi_max: float | None,
+    intervals: int | None,
+    no_scaling: bool,
 ) -> None:
     """Print the distance of the mesh files A and B, B being the reference."""
-    lattice = Lattice(xi_max, intervals)
+    if rtol is not None and (xi_max is not None or intervals is not None):
+        raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
+    lattice = None if rtol is not None else Lattice(xi_max or 5.0, intervals or 64)
     first, second = read_mesh(a), read_mesh(b)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
-    found = distance(similarity.apply(first), similarity.apply(second), orders or (-2.0,), lattice=lattice)
+    pair = similarity.apply(first), similarity.apply(second)
+    found = distance(*pair, orders or (-2.0,), lattice=lattice, rtol=rtol)
     click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
+    if rtol is not None:
+        click.echo(f"xi_max {found.attrs['xi_max']:.4g}, M {found.attrs['M']}, {found.attrs['dtype']}")
     for order in found["order"].values:
         here = found.sel(order=order)
         parts = ", ".join(f"{name} {here[name].item():.0e}" for name in ("truncation", "aliasing", "discretisation"))

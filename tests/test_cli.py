@@ -108,6 +108,36 @@ def test_plot_draws_both_pictures(folder: Path) -> None:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 
 
+def test_compare_to_an_accuracy(folder: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-6", "--rtol", "1e-3", folder=folder)
+    assert done.returncode == 0
+    assert re.search(r"^xi_max \d\.\d+, M \d+, complex", done.stdout, re.M)
+    value, error = map(float, re.findall(r"order -6: (\S+) ± (\S+)", done.stdout)[0])
+    assert error <= 1e-3 * value
+
+
+def test_an_accuracy_out_of_reach_is_wrong_input(folder: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-6", folder=folder)
+    assert done.returncode == 2
+    assert re.search(r"^error: .*rtol 1e-06 is out of reach at order -1", done.stderr)
+    assert done.stderr.count("\n") == 1
+    done = call("compare", "1.off", "3.off", "--rtol", "1e-3", "--M", "64", folder=folder)
+    assert done.returncode == 2
+    assert "--rtol chooses the lattice" in done.stderr
+
+
+def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
+    text = (
+        '[study]\nname = "asking"\n[accuracy]\nrtol = 1e-3\n[norm]\norders = [-8]\n'
+        '[reference]\nsource = "sphere"\n[[family]]\nname = "a"\nsource = "icosphere"\nlevels = [0, 2]\n'
+    )
+    (folder / "asking.toml").write_text(text)
+    done = call("plan", "asking.toml", folder=folder)
+    assert done.returncode == 0
+    assert re.search(r"^accuracy: +rtol 0\.001 of every distance to reference$", done.stdout, re.M)
+    assert len(re.findall(r"^chosen: ", done.stdout, re.M)) == 3
+
+
 def test_compare_two_files(folder: Path) -> None:
     for level in (1, 3):
         mesh = icosphere(level)

@@ -175,10 +175,12 @@ def refined(
             parts = tail(max(most / (2 * period), lattice.xi_max)) / allowed
             worst = int(np.argmax(parts))
             reachable = _rounded_up(_PROMISE * float(parts[worst]) * accuracy.rtol)
+            within = f"within {accuracy.memory / 1e9:.3g} GB (M <= {most})"
+            instead = f"{within} about {reachable:g} can be reached; ask for that, allow more memory, or take"
+            if reachable >= 1:
+                instead = f"{within} not even one digit can be had; allow more memory or take"
             raise AccuracyError(
-                f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: within "
-                f"{accuracy.memory / 1e9:.3g} GB (M <= {most}) about {reachable:g} can be reached; "
-                "ask for that, allow more memory, or take a lower order",
+                f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: {instead} a lower order",
                 accuracy.rtol,
                 reachable,
             )
