@@ -108,20 +108,30 @@ def test_plot_draws_both_pictures(folder: Path) -> None:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_compare_to_an_accuracy(folder: Path) -> None:
-    done = call("compare", "1.off", "3.off", "--order", "-6", "--rtol", "1e-3", folder=folder)
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two files that hold triangulated spheres."""
+    folder = tmp_path_factory.mktemp("pair")
+    for level in (1, 3):
+        mesh = icosphere(level)
+        trimesh.Trimesh(2.0 * mesh.vertices, mesh.triangles, process=False).export(folder / f"{level}.off")
+    return folder
+
+
+def test_compare_to_an_accuracy(pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-6", "--rtol", "1e-3", folder=pair)
     assert done.returncode == 0
     assert re.search(r"^xi_max \d\.\d+, M \d+, complex", done.stdout, re.M)
     value, error = map(float, re.findall(r"order -6: (\S+) ± (\S+)", done.stdout)[0])
     assert error <= 1e-3 * value
 
 
-def test_an_accuracy_out_of_reach_is_wrong_input(folder: Path) -> None:
-    done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-6", folder=folder)
+def test_an_accuracy_out_of_reach_is_wrong_input(pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-6", folder=pair)
     assert done.returncode == 2
     assert re.search(r"^error: .*rtol 1e-06 is out of reach at order -1", done.stderr)
     assert done.stderr.count("\n") == 1
-    done = call("compare", "1.off", "3.off", "--rtol", "1e-3", "--M", "64", folder=folder)
+    done = call("compare", "1.off", "3.off", "--rtol", "1e-3", "--M", "64", folder=pair)
     assert done.returncode == 2
     assert "--rtol chooses the lattice" in done.stderr
 
@@ -138,11 +148,8 @@ def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
     assert len(re.findall(r"^chosen: ", done.stdout, re.M)) == 3
 
 
-def test_compare_two_files(folder: Path) -> None:
-    for level in (1, 3):
-        mesh = icosphere(level)
-        trimesh.Trimesh(2.0 * mesh.vertices, mesh.triangles, process=False).export(folder / f"{level}.off")
-    done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=folder)
+def test_compare_two_files(pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=pair)
     assert done.returncode == 0, done.stderr
     assert re.match(
         r"scale 0\.5\d*, origin \S+ \S+ \S+\norder -4: \S+e-01 ± .*\norder -2: \S+e\+00 ± \S+ \(truncation .*\)\n$",
