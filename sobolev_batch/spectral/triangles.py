@@ -32,7 +32,7 @@ _PLAIN_CYCLES = 16.0
 # Triangles whose area is a smaller part of a squared edge than this lose digits in a plain cross product.
 _FLATNESS = 1e-2
 # Triangles at a time: their temporaries stay in cache.
-_CHUNK = 1 << 14
+_CHUNK = 1 << 13
 
 
 def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
@@ -120,38 +120,40 @@ def _sums(corners: Corners, frequencies: Reals) -> Complexes:
     doubled = doubled_areas(corners)
     longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
     centroids = a + (ab + ac) / 3
-    waves = -2 * np.pi * frequencies
-    gaps = zip(waves @ ab, waves @ ac, strict=True)
+    reach = float(np.abs(centroids).max()) + longest
     values = np.empty(len(frequencies), dtype=np.complex128)
-    for row, (frequency, (first, second)) in enumerate(zip(frequencies, gaps, strict=True)):
+    for row, frequency in enumerate(frequencies):
+        first, second = (_dots(-2 * np.pi * frequency, edge) for edge in (ab, ac))
+        plain = reach * np.abs(frequency).sum() <= _PLAIN_CYCLES
         widest = 2 * np.pi * float(np.linalg.norm(frequency)) * longest
         if widest < _SERIES_REACH:
-            values[row] = _near(doubled, centroids, frequency, first, second, widest)
+            values[row] = _near(doubled, _phases(centroids, frequency, plain), first, second, widest)
             continue
         close = np.maximum(np.maximum(np.abs(first), np.abs(second)), np.abs(second - first)) < _SERIES_REACH
+        phases = _phases(centroids[:, close], frequency, plain)
+        values[row] = _near(doubled[close], phases, first[close], second[close], _SERIES_REACH)
         apart = ~close
-        values[row] = _near(
-            doubled[close], centroids[:, close], frequency, first[close], second[close], _SERIES_REACH
-        ) + doubled[apart] @ _quotient(
-            [_joined(*cosine_and_sine(_phases(corner[:, apart], frequency))) for corner in corners],
-            first[apart],
-            second[apart],
-        )
+        exponentials = [_joined(*cosine_and_sine(_phases(corner[:, apart], frequency, plain))) for corner in corners]
+        values[row] += np.sum(doubled[apart] * _quotient(exponentials, first[apart], second[apart]))
     return values
 
 
-def _near(doubled: Reals, centroids: Reals, frequency: Reals, ab: Reals, ac: Reals, widest: float) -> complex:
-    """The transform at one frequency of triangles whose gaps are small."""
-    phases = _phases(centroids, frequency)
+def _near(doubled: Reals, phases: Reals, ab: Reals, ac: Reals, widest: float) -> complex:
+    """The transform of triangles whose gaps are small, from the phases of their centroids."""
     cosines, sines = (doubled * part for part in cosine_and_sine(phases))
     real, imaginary = _series(ab, ac, widest)
-    return complex(cosines @ real - sines @ imaginary, cosines @ imaginary + sines @ real)
+    return complex(np.sum(cosines * real - sines * imaginary), np.sum(cosines * imaginary + sines * real))
 
 
-def _phases(points: Reals, frequency: Reals) -> Reals:
-    """-2π ξ·p at points (3, k), in radians and up to whole turns, which are taken off before rounding."""
-    if np.abs(points).max(initial=0.0) * np.abs(frequency).sum() <= _PLAIN_CYCLES:
-        return np.asarray((-2 * np.pi * frequency) @ points)
+def _dots(direction: Reals, points: Reals) -> Reals:
+    """Dot products of a vector with points (3, k): for so few numbers, threads of a BLAS only get in the way."""
+    return np.asarray(direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2])
+
+
+def _phases(points: Reals, frequency: Reals, plain: bool) -> Reals:
+    """-2π ξ·p at points (3, k), in radians; where that is not plain, whole turns are taken off before rounding."""
+    if plain:
+        return _dots(-2 * np.pi * frequency, points)
     cycles: compensated.Pair = (np.zeros(points.shape[1]), np.zeros(points.shape[1]))
     for axis in range(3):
         high, low = compensated.two_product(points[axis], np.broadcast_to(frequency[axis], points.shape[1]))
