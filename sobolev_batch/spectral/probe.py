@@ -23,7 +23,7 @@ Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle and a frequency in between.
-_MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 4_000_000
+_MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 # The estimate comes from few draws: it is raised by this over the root of their number.
 _CAUTION = 3.0
 

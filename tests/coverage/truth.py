@@ -42,6 +42,8 @@ _POINTS_ROUGH, _POINTS_SMOOTH = 40_000, 10_000
 # their images away.
 _FINE_ROUGH, _FINE_SMOOTH = Lattice(16.0, 160), Lattice(10.0, 120)
 # Rounding of sums of some thousand terms, relative to the squared norms.
+# The last change of an extrapolation was seen to be half of its error where levels are few.
+_EXTRAPOLATION_CAUTION = 3.0
 _ROUNDING = 1e-14
 
 
@@ -117,7 +119,7 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
 def summed_in_real_space(
     a: Surface, b: Surface, orders: Sequence[float], most: int = _POINTS_SMOOTH
 ) -> tuple[Truth, ...]:
-    """By double sums over points, extrapolated; the uncertainty is what the last extrapolation changed.
+    """By double sums over points, extrapolated; the uncertainty is a multiple of what the last extrapolation changed.
 
     The kernel of a = -s has the term r^(2a-3), which leaves an error of h^(2a-1) beside the rule's h^6.
     """
@@ -141,7 +143,7 @@ def summed_in_real_space(
         last = table[-1]
         table.append([fine + (fine - coarse) / (rate - 1) for coarse, fine in pairwise(last)])
     best, before = table[-1][-1], table[-2][-1]
-    slack = np.abs(best - before) + _ROUNDING * scale
+    slack = _EXTRAPOLATION_CAUTION * np.abs(best - before) + _ROUNDING * scale
     return tuple(map(Truth.of_square, best.tolist(), slack.tolist()))
 
 
