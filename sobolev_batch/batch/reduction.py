@@ -22,6 +22,8 @@ Complexes = NDArray[np.complex128]
 _TILE_BYTES = 384 << 20
 _GROUP = 32
 _READ_AT_ONCE = 8
+# The others of a tile per row of it: they only pass through, and its rows are read but once for them.
+_TILE_LENGTH = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +50,21 @@ class Reducer:
     errors: Reals
     widths: Reals
 
-    def rows_per_tile(self) -> int:
-        """How many rows make a tile side so that they fit into a task's memory with what meets them."""
-        return max(1, self._capacity - self._group - self._read_at_once)
+    def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+        """Rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
+
+        The others of a tile either begin with its rows or have none of them.
+        """
+        for strip in self.strips(rows, workers):
+            remaining = rows[rows.index(strip[0]) :]
+            for part in _parts(len(remaining), _TILE_LENGTH * len(strip)):
+                yield strip, remaining[part]
+
+    def strips(self, rows: Sequence[int], workers: int) -> list[Sequence[int]]:
+        """The rows in parts that fit into a task's memory with what meets them and occupy the workers."""
+        fitting = max(1, self._capacity - self._group - self._read_at_once)
+        shared = max(_GROUP, -(-len(rows) // (2 * max(workers, 1))))
+        return [rows[part] for part in _parts(len(rows), min(fitting, shared))]
 
     @property
     def _capacity(self) -> int:
@@ -88,17 +102,21 @@ class Reducer:
         return norms, self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> Assessed:
-        """Distances of rows to other rows, over (orders, rows, others)."""
-        same = tuple(rows) == tuple(others)
-        found = [self._block_sums(rows, others, block, same) for block in self.blocks]
+        """Distances of rows to other rows, over (orders, rows, others).
+
+        Args:
+            rows: of one side.
+            others: of the other side; they either begin with all of the rows or have none of them.
+        """
+        shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
+        found = [self._block_sums(rows, others, block, shared) for block in self.blocks]
         products, left, right = (add_sums(parts) for parts in zip(*found, strict=True))
         sums, cancelled = differences(products, left, right)
-        for i, j in np.argwhere(np.triu(cancelled) if same else cancelled).tolist():
+        for i, j in np.argwhere(np.triu(cancelled) if shared else cancelled).tolist():
             direct = self._direct(rows[i], others[j])
             sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
-        if same:
-            for part in (sums.squares, sums.outer):
-                part[...] = np.triu(part) + np.swapaxes(np.triu(part, 1), -1, -2)
+        for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
+            square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = (self.areas[list(rows)][:, None] + self.areas[list(others)]) * unequal
         errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal
@@ -108,11 +126,11 @@ class Reducer:
         return assess(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
 
     def _block_sums(
-        self, rows: Sequence[int], others: Sequence[int], block: Block, same: bool
+        self, rows: Sequence[int], others: Sequence[int], block: Block, shared: int
     ) -> tuple[Sums, Sums, Sums]:
         """One block's products of rows and others, and the squares of either.
 
-        Where both are the same, only the products on and above the diagonal.
+        Of the first ``shared`` others, which are the rows, only the products on and above the diagonal.
         """
         arrangement = Arrangement.of(self.lattice, block, self.orders)
         place = self.lattice.place(block)
@@ -129,16 +147,18 @@ class Reducer:
         held = read(rows, np.empty((len(rows), block.size), dtype=np.complex128))
         left = arrangement.squares(held)
         products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
-        room = held if same else np.empty((min(self._group, len(others)), block.size), dtype=np.complex128)
-        for part in _parts(len(others), self._group):
-            above = slice(part.stop if same else len(rows))
-            group = held[part] if same else read(others[part], room)
-            found = arrangement.products(held[above], group)
-            products.squares[:, :, above, part], products.outer[:, above, part] = found.squares, found.outer
-            if not same:
-                of_group = arrangement.squares(group)
-                right.squares[..., part], right.outer[..., part] = of_group.squares, of_group.outer
-        return products, left, left if same else right
+
+        def meet(part: slice, group: Complexes, above: int) -> None:
+            found, squares = arrangement.products(held[:above], group), arrangement.squares(group)
+            products.squares[:, :, :above, part], products.outer[:, :above, part] = found.squares, found.outer
+            right.squares[..., part], right.outer[..., part] = squares.squares, squares.outer
+
+        for part in _parts(shared, self._group):
+            meet(part, held[part], part.stop)
+        room = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
+        for part in _parts(len(others), self._group, shared):
+            meet(part, read(others[part], room), len(rows))
+        return products, left, right
 
     def _direct(self, row: int, other: int) -> Sums:
         """The sums of one pair, from the difference of its fields."""
@@ -150,6 +170,6 @@ class Reducer:
         return sums_of_shells(sums, self.lattice, self.orders)
 
 
-def _parts(count: int, size: int) -> Iterator[slice]:
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))
+def _parts(count: int, size: int, start: int = 0) -> Iterator[slice]:
+    for first in range(start, count, size):
+        yield slice(first, min(first + size, count))

@@ -176,7 +176,7 @@ def truncated(
         power = np.where(outer < ceiling / 2, np.maximum(power, 1.0), power)
         start = 1 + (highest or lattice.xi_max) ** 2
         reached = (middles[1] * lattice.xi_max) * (ceiling / outer) ** (1 / power)
-    saturated = np.maximum(1 + np.nan_to_num(reached, nan=0.0, posinf=1e150) ** 2, start)
+    saturated = np.maximum(1 + np.minimum(np.nan_to_num(reached, nan=0.0), 1e150) ** 2, start)
     # With q = 1 + r², dr = dq / (2 √(q-1)), and √(q-1) is at least this part of √q from xi_max on.
     part = np.sqrt(1 - 1 / start)
     tails = []
