@@ -169,7 +169,7 @@ def truncated(
     inner, outer = sums.outer
     ceiling = np.maximum(2 * areas, outer)
     middles = [(low + high) / 2 for low, high in _WINDOWS]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         power = np.log(outer / inner) / np.log(middles[1] / middles[0])
         power = np.clip(np.nan_to_num(power, nan=0.0), 0.0, 4.0)
         # Below half the ceiling the growth must still come, whatever two windows say.
