@@ -12,6 +12,10 @@ from distributed import Client, LocalCluster
 from sobolev_batch.errors import ClusterError
 
 _CONNECT_SECONDS = 15
+# Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
+# for each cost more than half of a reduction's time. What glibc may keep is bounded.
+_KEPT_BYTES = 64 << 20
+_LARGEST_KEPT_BYTES = 32 << 20
 
 
 @contextmanager
@@ -24,7 +28,13 @@ def local_client(workers: int | None = None) -> Iterator[Client]:
     count = workers or available_cores()
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
-        dask.config.set({"distributed.worker.memory.pause": 0.9}),
+        dask.config.set(
+            {
+                "distributed.worker.memory.pause": 0.9,
+                "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
+                "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,
+            }
+        ),
         LocalCluster(
             n_workers=count,
             threads_per_worker=1,

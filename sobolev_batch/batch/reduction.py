@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +10,20 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.store import Store
 from sobolev_batch.spectral.budget import Assessed, Sums, add_sums, assess, sums_of_shells
-from sobolev_batch.spectral.gram import differences, gram_blocks
+from sobolev_batch.spectral.gram import Arrangement, differences
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.shells import shell_sums
 
 Reals = NDArray[np.float64]
-Place = tuple[slice, slice, slice]
+Complexes = NDArray[np.complex128]
 
-# Fields that a task holds at a time, in all.
-_TILE_BYTES = 256 << 20
+# Fields that a task holds at a time, in all: the rows of a tile; a group of the others, for which a
+# matrix product is nearly as fast as for all of them; and fields as they are read.
+_TILE_BYTES = 384 << 20
+_GROUP = 32
+_READ_AT_ONCE = 8
+# The others of a tile per row of it: they only pass through, and its rows are read but once for them.
+_TILE_LENGTH = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +50,33 @@ class Reducer:
     errors: Reals
     widths: Reals
 
-    def rows_per_tile(self) -> int:
-        """How many rows make a tile side so that two sides fit into a task's memory."""
-        return max(1, _TILE_BYTES // (2 * self.blocks[0].size * 16))
+    def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+        """Rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
+
+        The others of a tile either begin with its rows or have none of them.
+        """
+        for strip in self.strips(rows, workers):
+            remaining = rows[rows.index(strip[0]) :]
+            for part in _parts(len(remaining), _TILE_LENGTH * len(strip)):
+                yield strip, remaining[part]
+
+    def strips(self, rows: Sequence[int], workers: int) -> list[Sequence[int]]:
+        """The rows in parts that fit into a task's memory with what meets them and occupy the workers."""
+        fitting = max(1, self._capacity - self._group - self._read_at_once)
+        shared = max(_GROUP, -(-len(rows) // (2 * max(workers, 1))))
+        return [rows[part] for part in _parts(len(rows), min(fitting, shared))]
+
+    @property
+    def _capacity(self) -> int:
+        return _TILE_BYTES // (self.blocks[0].size * 16)
+
+    @property
+    def _group(self) -> int:
+        return max(1, min(_GROUP, self._capacity // 4))
+
+    @property
+    def _read_at_once(self) -> int:
+        return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
     def norms(self, rows: Sequence[int]) -> tuple[Assessed, Assessed]:
         """Norms of rows and their distances to the center, each over (orders, rows); NaN without a center."""
@@ -56,11 +85,12 @@ class Reducer:
         for block in self.blocks:
             place = self.lattice.place(block)
             center = None if self.center is None else self.store.read_fields([self.center], place)[0]
-            for i, row in enumerate(rows):
-                values = self.store.read_fields([row], place)[0]
-                own[i] += shell_sums(values, None, self.lattice, block)
+            for part in _parts(len(rows), self._read_at_once):
+                values = self.store.read_fields(rows[part], place)
+                own[part] += shell_sums(values, None, self.lattice, block)
                 if center is not None:
-                    to_center[i] += shell_sums(values - center, None, self.lattice, block)
+                    values -= center
+                    to_center[part] += shell_sums(values, None, self.lattice, block)
         of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
         norms = self._assess(sums_of_shells(own, self.lattice, self.orders), *of_rows)
         if self.center is None:
@@ -72,43 +102,63 @@ class Reducer:
         return norms, self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> Assessed:
-        """Distances of rows to other rows, over (orders, rows, others)."""
-        same = tuple(rows) == tuple(others)
-        products, left, right = [], [], []
-        for block in self.blocks:
-            place = self.lattice.place(block)
-            center = 0.0 if self.center is None else self.store.read_fields([self.center], place)
-            first = self._differences(rows, place, center)
-            second = first if same else self._differences(others, place, center)
-            products.append(gram_blocks(first, second, self.lattice, block, self.orders))
-            left.append(self._squares(first, block))
-            right.append(left[-1] if same else self._squares(second, block))
-        total = add_sums(products)
-        if same:
-            # Each half of a weighted product rounds in its own way; a distance matrix is symmetric.
-            total = Sums(*((part + np.swapaxes(part, -1, -2)) / 2 for part in (total.squares, total.outer)))
-        found, cancelled = differences(total, add_sums(left), add_sums(right))
-        for i, j in np.argwhere(cancelled).tolist():
+        """Distances of rows to other rows, over (orders, rows, others).
+
+        Args:
+            rows: of one side.
+            others: of the other side; they either begin with all of the rows or have none of them.
+        """
+        shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
+        found = [self._block_sums(rows, others, block, shared) for block in self.blocks]
+        products, left, right = (add_sums(parts) for parts in zip(*found, strict=True))
+        sums, cancelled = differences(products, left, right)
+        for i, j in np.argwhere(np.triu(cancelled) if shared else cancelled).tolist():
             direct = self._direct(rows[i], others[j])
-            found.squares[:, :, i, j], found.outer[:, i, j] = direct.squares, direct.outer
+            sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
+        for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
+            square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = (self.areas[list(rows)][:, None] + self.areas[list(others)]) * unequal
         errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal
-        return self._assess(found, areas, errors)
+        return self._assess(sums, areas, errors)
 
     def _assess(self, sums: Sums, areas: Reals, errors: Reals) -> Assessed:
         return assess(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
 
-    def _squares(self, fields: NDArray[np.complex128], block: Block) -> Sums:
-        sums = [shell_sums(field.reshape(block.shape), None, self.lattice, block) for field in fields]
-        return sums_of_shells(np.stack(sums), self.lattice, self.orders)
+    def _block_sums(
+        self, rows: Sequence[int], others: Sequence[int], block: Block, shared: int
+    ) -> tuple[Sums, Sums, Sums]:
+        """One block's products of rows and others, and the squares of either.
 
-    def _differences(
-        self, rows: Sequence[int], place: Place, center: NDArray[np.complex128] | float
-    ) -> NDArray[np.complex128]:
-        values = self.store.read_fields(rows, place).astype(np.complex128, copy=False)
-        values -= center
-        return values.reshape(len(rows), -1)
+        Of the first ``shared`` others, which are the rows, only the products on and above the diagonal.
+        """
+        arrangement = Arrangement.of(self.lattice, block, self.orders)
+        place = self.lattice.place(block)
+        center = None if self.center is None else self.store.read_fields([self.center], place)
+
+        def read(wanted: Sequence[int], room: Complexes) -> Complexes:
+            for part in _parts(len(wanted), self._read_at_once):
+                values = self.store.read_fields(wanted[part], place).astype(np.complex128, copy=False)
+                if center is not None:
+                    values -= center
+                np.take(values.reshape(len(values), -1), arrangement.order, axis=1, out=room[part], mode="clip")
+            return room[: len(wanted)]
+
+        held = read(rows, np.empty((len(rows), block.size), dtype=np.complex128))
+        left = arrangement.squares(held)
+        products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
+
+        def meet(part: slice, group: Complexes, above: int) -> None:
+            found, squares = arrangement.products(held[:above], group), arrangement.squares(group)
+            products.squares[:, :, :above, part], products.outer[:, :above, part] = found.squares, found.outer
+            right.squares[..., part], right.outer[..., part] = squares.squares, squares.outer
+
+        for part in _parts(shared, self._group):
+            meet(part, held[part], part.stop)
+        room = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
+        for part in _parts(len(others), self._group, shared):
+            meet(part, read(others[part], room), len(rows))
+        return products, left, right
 
     def _direct(self, row: int, other: int) -> Sums:
         """The sums of one pair, from the difference of its fields."""
@@ -118,3 +168,8 @@ class Reducer:
                 a, b = self.store.read_fields([row, other], self.lattice.place(block))
                 sums += shell_sums(a - b, None, self.lattice, block)
         return sums_of_shells(sums, self.lattice, self.orders)
+
+
+def _parts(count: int, size: int, start: int = 0) -> Iterator[slice]:
+    for first in range(start, count, size):
+        yield slice(first, min(first + size, count))

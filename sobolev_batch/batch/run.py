@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -222,14 +222,13 @@ def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notif
     others = range(len(rows)) if every_pair else [reference]
     distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
 
-    tiles = list(_slices(complete, reducer.rows_per_tile()))
+    workers = sum(client.nthreads().values())
     jobs: dict[Future, tuple[Sequence[int], Sequence[int] | None]] = {
-        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in tiles
+        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in reducer.strips(complete, workers)
     }
     if every_pair:
-        for k, tile in enumerate(tiles):
-            for partner in tiles[k:]:
-                jobs[client.submit(reducer.tile, tile, partner, pure=False)] = (tile, partner)
+        for tile, others_of_tile in reducer.tiles(complete, workers):
+            jobs[client.submit(reducer.tile, tile, others_of_tile, pure=False)] = (tile, others_of_tile)
     notify(Progress("reduction", 0, len(jobs)))
     for done, future in enumerate(as_completed(list(jobs)), 1):
         tile, other = jobs.pop(future)
@@ -319,8 +318,3 @@ def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record 
         "reference": plan.reference,
     }
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _slices(items: Sequence[int], size: int) -> Iterator[Sequence[int]]:
-    for start in range(0, len(items), size):
-        yield items[start : start + size]

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 import zarr
 from numpy.typing import NDArray
+from zarr.buffer.cpu import NDBuffer
 from zarr.codecs import Crc32cCodec
 
 from sobolev_batch.batch.choice import Choice
@@ -123,7 +124,8 @@ class Store:
         values = np.empty((len(rows), *(part.stop - part.start for part in place)), dtype=array.dtype)
         for i, row in enumerate(rows):
             try:
-                values[i] = array[(row, *place)]
+                # Into its place: a copy of a field costs as much as reading it.
+                array.get_basic_selection((row, *place), out=NDBuffer.from_numpy_array(values[i]))
             except (OSError, ValueError) as error:
                 raise StoreError(
                     f"{self.path}: the field of {self.labels()[row]} is damaged ({error}); "

@@ -169,14 +169,14 @@ def truncated(
     inner, outer = sums.outer
     ceiling = np.maximum(2 * areas, outer)
     middles = [(low + high) / 2 for low, high in _WINDOWS]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         power = np.log(outer / inner) / np.log(middles[1] / middles[0])
         power = np.clip(np.nan_to_num(power, nan=0.0), 0.0, 4.0)
         # Below half the ceiling the growth must still come, whatever two windows say.
         power = np.where(outer < ceiling / 2, np.maximum(power, 1.0), power)
         start = 1 + (highest or lattice.xi_max) ** 2
         reached = (middles[1] * lattice.xi_max) * (ceiling / outer) ** (1 / power)
-    saturated = np.maximum(1 + np.nan_to_num(reached, nan=0.0, posinf=1e150) ** 2, start)
+    saturated = np.maximum(1 + np.minimum(np.nan_to_num(reached, nan=0.0), 1e150) ** 2, start)
     # With q = 1 + r², dr = dq / (2 √(q-1)), and √(q-1) is at least this part of √q from xi_max on.
     part = np.sqrt(1 - 1 / start)
     tails = []

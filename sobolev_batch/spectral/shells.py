@@ -37,22 +37,26 @@ def shell_sums(
     """Trapezoidal sums of Re(a conj b) over each shell of one block of the half lattice.
 
     Args:
-        values: a, complex (block.shape).
+        values: a, complex (..., *block.shape).
         others: b, likewise; None stands for a itself.
         lattice: where the values lie.
         block: which part of it they are.
 
     Returns:
-        float64 (lattice.shell_count,): indexed by |k|². The sums of all blocks add up to those of
+        float64 (..., lattice.shell_count): indexed by |k|². The sums of all blocks add up to those of
         the whole lattice, conjugate half included. NaN anywhere makes its shells NaN.
     """
-    if others is None:
-        products = values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2
-    else:
-        products = values.real.astype(np.float64) * others.real + values.imag.astype(np.float64) * others.imag
-    products *= lattice.trapezoid_weights(block)
-    shells = lattice.shells(block).ravel()
-    sums: Reals = np.bincount(shells, weights=products.ravel(), minlength=lattice.shell_count).astype(np.float64)
+    # The type that counting needs, and the weights, once for all fields.
+    shells = lattice.shells(block).ravel().astype(np.intp)
+    weights = lattice.trapezoid_weights(block)
+    sums = np.empty((*values.shape[:-3], lattice.shell_count))
+    for i in np.ndindex(sums.shape[:-1]):
+        a = values[i]
+        b = a if others is None else others[i]
+        products = a.real.astype(np.float64) * b.real
+        products += a.imag.astype(np.float64) * b.imag
+        products *= weights
+        sums[i] = np.bincount(shells, weights=products.ravel(), minlength=lattice.shell_count)
     return sums
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.budget import Sums, add_sums, sums_of_shells
-from sobolev_batch.spectral.gram import differences, gram_blocks
+from sobolev_batch.spectral.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.surfaces.similarity import Surface
 
@@ -21,10 +22,10 @@ def test_blocks_of_products_give_every_distance() -> None:
     center = fourier_transform(Sphere(), LATTICE)
     parts, own = [], []
     for block in LATTICE.split(2_000):
-        part = np.stack([(f - center).values[LATTICE.place(block)].ravel() for f in fields])
-        parts.append(gram_blocks(part, part, LATTICE, block, ORDERS))
-        shells = np.stack([shell_sums(row.reshape(block.shape), None, LATTICE, block) for row in part])
-        own.append(sums_of_shells(shells, LATTICE, ORDERS))
+        arrangement = Arrangement.of(LATTICE, block, ORDERS)
+        part = np.stack([(f - center).values[LATTICE.place(block)].ravel()[arrangement.order] for f in fields])
+        parts.append(arrangement.products(part, part))
+        own.append(arrangement.squares(part))
     found, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))
     for i in range(4):
         for j in range(i):
@@ -33,9 +34,55 @@ def test_blocks_of_products_give_every_distance() -> None:
             shells = shell_sums((fields[i] - fields[j]).values, None, LATTICE, LATTICE.half)
             direct = sums_of_shells(shells, LATTICE, ORDERS)
             assert found.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
-            assert found.outer[:, i, j] == pytest.approx(direct.outer, rel=0.3)  # from one sample in eight
+            assert found.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
     assert not cancelled[~np.eye(4, dtype=bool)].any()
     assert cancelled.diagonal().all()
+
+
+def random_fields(count: int, lattice: Lattice) -> NDArray[np.complex128]:
+    rng = np.random.default_rng(0)
+    shape = count, lattice.half.size
+    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+
+@pytest.mark.parametrize("intervals", [2, 24, 40])
+def test_sums_are_those_of_shells(intervals: int) -> None:
+    lattice = Lattice(4.0, intervals)
+    fields = random_fields(3, lattice)
+    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    squares = arrangement.squares(np.take(fields, arrangement.order, axis=1))
+    expected = sums_of_shells(
+        shell_sums(fields.reshape(3, *lattice.shape), None, lattice, lattice.half), lattice, ORDERS
+    )
+    assert squares.squares == pytest.approx(expected.squares, rel=1e-13)
+    # Of noise, the mean of n samples is known to 1/√n, and n is 1024 or more in each window.
+    assert squares.outer == pytest.approx(expected.outer, rel=1e-13 if intervals == 2 else 0.15)
+
+
+def test_an_arrangement_has_every_sample_once_and_few_of_the_outer_ones() -> None:
+    lattice = Lattice(4.0, 64)
+    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    assert np.array_equal(np.sort(arrangement.order), np.arange(lattice.half.size))
+    ends = [(piece.samples.start, piece.samples.stop) for piece in arrangement.pieces]
+    assert [start for start, _ in ends] == [0, *(stop for _, stop in ends[:-1])]
+    assert ends[-1][1] == lattice.half.size
+    for piece in arrangement.pieces:
+        assert np.all(arrangement.shells[piece.samples] % 4 == piece.residue)
+    sampled = sum(piece.samples.stop - piece.samples.start for piece in arrangement.pieces if piece.window is not None)
+    assert sampled < lattice.half.size / 15
+
+
+def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
+    # They come from the same samples as the squares, so that what cancels leaves no noise behind.
+    lattice = Lattice(4.0, 40)
+    one, two = random_fields(2, lattice)
+    twin = one + 1e-2 * two
+    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    pair = np.stack([one[arrangement.order], twin[arrangement.order]])
+    squares = arrangement.squares(pair)
+    found, _ = differences(arrangement.products(pair, pair), squares, squares)
+    expected = arrangement.squares((twin - one)[arrangement.order][None])
+    assert found.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
 
 
 def single(value: float, *shape: int) -> Sums:

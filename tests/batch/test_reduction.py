@@ -1,0 +1,96 @@
+"""Tiles of rows: that they cover every pair, fit, and measure what pair by pair would give."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import Study
+from sobolev_batch.batch import plan as planning
+from sobolev_batch.batch import reduction
+from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.reduction import Reducer
+from sobolev_batch.batch.store import Store
+from sobolev_batch.spectral.shells import shell_sums, shell_weights
+from tests.batch.conftest import small_table
+
+ROWS = 11
+CENTER = 4
+TWINS = 2, 9
+
+
+@pytest.fixture
+def fields() -> NDArray[np.complex128]:
+    rng = np.random.default_rng(0)
+    shape = ROWS, *Study.from_table(small_table()).lattice.shape
+    fields = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    # So near to each other that their distance cannot come from products with the others.
+    fields[TWINS[1]] = fields[TWINS[0]] * (1 + 1e-7)
+    return fields
+
+
+@pytest.fixture
+def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytest.MonkeyPatch) -> Reducer:
+    """Of fields in several chunks, with room for three rows, one that meets them, and one that is read."""
+    monkeypatch.setattr(planning, "_LARGEST_CHUNK_BYTES", 16_000)
+    family = {"name": "ico", "source": "icosphere", "levels": list(range(ROWS - 1))}
+    study = Study.from_table(small_table(family=[family]))
+    plan = make_plan(study)
+    assert len(plan.blocks) > 2
+    store = Store.prepare(store_path, plan)
+    for block in plan.blocks:
+        place = study.lattice.place(block)
+        for row, field in enumerate(fields):
+            store.write_field(row, place, field[place])
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 5 * 16 * plan.blocks[0].size)
+    areas, errors = np.ones(ROWS), np.zeros((2, ROWS))
+    return Reducer(store, study.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13))
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 500])
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 11, 200])
+def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int) -> None:
+    rows = list(range(5, 5 + 3 * count, 3))
+    pairs = []
+    for side, others in reducer.tiles(rows, workers):
+        assert len(side) <= 3
+        assert list(others[: len(side)]) == list(side) or not set(side) & set(others)
+        shared = set(side) & set(others)
+        pairs += [(i, j) for i in side for j in others if i <= j or not {i, j} <= shared]
+    assert sorted(pairs) == list(combinations_with_replacement(rows, 2))
+    assert [row for strip in reducer.strips(rows, workers) for row in strip] == rows
+
+
+def test_many_workers_get_smaller_tiles(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 1 << 30)
+    rows = range(500)
+    assert [len(strip) for strip in reducer.strips(rows, 2)] == [125] * 4
+    assert len(list(reducer.tiles(rows, 2))) == 4
+    assert len(list(reducer.tiles(rows, 8))) >= 16
+
+
+def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
+    lattice = reducer.lattice
+    found = np.full((2, ROWS, ROWS), np.nan)
+    for rows, others in reducer.tiles(list(range(ROWS)), 1):
+        values = reducer.tile(rows, others).values
+        found[:, np.array(rows)[:, None], np.array(others)] = values
+        found[:, np.array(others)[:, None], np.array(rows)] = np.swapaxes(values, 1, 2)
+    assert np.array_equal(found, np.swapaxes(found, 1, 2))
+    assert (np.diagonal(found, axis1=1, axis2=2) == 0).all()
+    weights = shell_weights(lattice, reducer.orders)
+    for i in range(ROWS):
+        sums = shell_sums(fields - fields[i], None, lattice, lattice.half)
+        assert found[:, i] == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-10)
+
+
+def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
+    norms, to_center = reducer.norms([1, 3, CENTER])
+    weights = shell_weights(reducer.lattice, reducer.orders)
+    for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
+        sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
+        assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)
