@@ -16,7 +16,7 @@ from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store
 from sobolev_batch.spectral.shells import shell_sums, shell_weights
-from tests.batch.conftest import small_table
+from tests.batch.conftest import SMALL_LATTICE, small_table
 
 ROWS = 11
 CENTER = 4
@@ -26,7 +26,7 @@ TWINS = 2, 9
 @pytest.fixture
 def fields() -> NDArray[np.complex128]:
     rng = np.random.default_rng(0)
-    shape = ROWS, *Study.from_table(small_table()).lattice.shape
+    shape = ROWS, *SMALL_LATTICE.shape
     fields = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
     # So near to each other that their distance cannot come from products with the others.
     fields[TWINS[1]] = fields[TWINS[0]] * (1 + 1e-7)
@@ -43,12 +43,12 @@ def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytes
     assert len(plan.blocks) > 2
     store = Store.prepare(store_path, plan)
     for block in plan.blocks:
-        place = study.lattice.place(block)
+        place = plan.lattice.place(block)
         for row, field in enumerate(fields):
             store.write_field(row, place, field[place])
     monkeypatch.setattr(reduction, "_TILE_BYTES", 5 * 16 * plan.blocks[0].size)
     areas, errors = np.ones(ROWS), np.zeros((2, ROWS))
-    return Reducer(store, study.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13))
+    return Reducer(store, plan.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13))
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2, 500])
