@@ -139,6 +139,7 @@ def plot_command(store: Path, output: Path) -> None:
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
 @click.option("--rtol", type=float, help="Largest error relative to the distance; instead of a lattice.")
+@click.option("--memory-gb", type=float, help="What a transform may take with --rtol. [default: 2]")
 @click.option("--xi-max", type=float, help="Highest frequency per axis. [default: 5]")
 @click.option("--M", "intervals", type=int, help="Lattice intervals per axis. [default: 64]")
 @click.option("--no-scaling", is_flag=True, help="Keep the files' own unit instead of fitting B into the unit sphere.")
@@ -147,6 +148,7 @@ def compare_command(
     b: Path,
     orders: tuple[float, ...],
     rtol: float | None,
+    memory_gb: float | None,
     xi_max: float | None,
     intervals: int | None,
     no_scaling: bool,
@@ -158,14 +160,16 @@ def compare_command(
     first, second = read_mesh(a), read_mesh(b)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)
-    found = distance(*pair, orders or (-2.0,), lattice=lattice, rtol=rtol)
+    memory = None if memory_gb is None else 1e9 * memory_gb
+    found = distance(*pair, tuple(dict.fromkeys(orders)) or (-2.0,), lattice=lattice, rtol=rtol, memory=memory)
     click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
     if rtol is not None:
         click.echo(f"xi_max {found.attrs['xi_max']:.4g}, M {found.attrs['M']}, {found.attrs['dtype']}")
     for order in found["order"].values:
         here = found.sel(order=order)
         parts = ", ".join(f"{name} {here[name].item():.0e}" for name in ("truncation", "aliasing", "discretisation"))
-        click.echo(f"order {order:g}: {here['distance'].item():.9e} ± {here['error'].item():.0e} ({parts})")
+        short = "" if rtol is None or here["within"].item() else f", more than rtol {rtol:g}"
+        click.echo(f"order {order:g}: {here['distance'].item():.9e} ± {here['error'].item():.0e} ({parts}){short}")
 
 
 def main() -> None:
@@ -249,7 +253,8 @@ def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
     )
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
     if study.accuracy is not None:
-        yield "accuracy", f"rtol {study.accuracy.rtol:g} of every distance to {plan.reference}"
+        allowed = f"{_size(study.accuracy.memory)} for a transform, M <= {study.accuracy.largest_intervals}"
+        yield "accuracy", f"rtol {study.accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
         for reason in plan.choice.reasons:
             yield "chosen", reason
         yield "transform", f"{transform.precision}, eps and quadrature for each surface from its distance"

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.spectral.accuracy import Accuracy, good_intervals
+from sobolev_batch.spectral.accuracy import Accuracy, lattice_of
 from sobolev_batch.spectral.budget import Assessed, support_widths
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.nufft import Precision
 from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.pursuit import Pilot, pilot_of
+from sobolev_batch.spectral.pursuit import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member
@@ -91,12 +91,11 @@ class Choice:
                 highest = max(highest, self.lattice.xi_max * growth)
             if images > 1:
                 period = max(period, 1 / self.lattice.spacing + math.log(images) / (2 * math.pi) * 1.1)
-        intervals = good_intervals(2 * highest * period)
         if (highest, period) == (self.lattice.xi_max, 1 / self.lattice.spacing):
             return None
-        if intervals > accuracy.largest_intervals:
+        if 2 * highest * period > accuracy.largest_intervals:
             return None
-        lattice = Lattice(intervals / (2 * period), intervals)
+        lattice = lattice_of(highest, period, accuracy.largest_intervals)
         reason = f"grown from xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}, whose errors were too large"
         return Choice(lattice, self.precision, self.closest, (*self.reasons, reason), self.basis)
 
@@ -139,9 +138,9 @@ def choose(
         raise ValueError("only a study that asks for an accuracy leaves a choice")
     surfaces = _pilots(members, similarity)
     extents = [Quality.of_surface(surface, Probe()) for surface in (reference, *surfaces.values())]
-    widths = _REACH_MARGIN * support_widths(extents)
+    widths, reach = _REACH_MARGIN * support_widths(extents), _REACH_MARGIN * reach_of(extents)
     pilots: dict[str, Pilot] = {
-        label: pilot_of(surface, reference, study.orders, accuracy, widths, what=label)
+        label: pilot_of(surface, reference, study.orders, accuracy, widths, reach, what=label)
         for label, surface in surfaces.items()
     }
     if not pilots:
@@ -153,8 +152,7 @@ def choose(
     finest = max(pilots, key=lambda label: 1 / pilots[label].lattice.spacing)
     xi_max, period = pilots[highest].lattice.xi_max, 1 / pilots[finest].lattice.spacing
     # Each pair alone fits into the memory, or it would have been refused.
-    intervals = min(good_intervals(2 * xi_max * period), accuracy.largest_intervals)
-    lattice = Lattice(intervals / (2 * period), intervals)
+    lattice = lattice_of(xi_max, period, accuracy.largest_intervals)
     single = study.dtype is None and all(pilot.single for pilot in pilots.values())
     precision: Precision = "complex64" if single else study.dtype or "complex128"
     closest = np.min([pilot.values for pilot in pilots.values()], axis=0)

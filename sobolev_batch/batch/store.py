@@ -236,11 +236,11 @@ class Store:
         # A lattice that was chosen may be chosen anew; one that was given is part of the study.
         chosen = plan.study.accuracy is not None
         differences = [
-            f"{what} {old!r}, not {new!r}"
+            f"{what} {old}, not {new}"
             for what, old, new in (
-                ("the study", study["name"], plan.study.name),
-                ("the lattice", study["lattice"], _lattice_entry(plan)["lattice"]),
-                ("dtype", study["dtype"], plan.choice.precision),
+                ("the study", repr(study["name"]), repr(plan.study.name)),
+                ("a lattice of", *map(_described, (study["lattice"], _lattice_entry(plan)["lattice"]))),
+                ("dtype", repr(study["dtype"]), repr(plan.choice.precision)),
             )
             if old != new and not (chosen and what != "the study" and study.get("choice"))
         ]
@@ -297,6 +297,10 @@ def stored_choice(path: str | Path) -> Choice | None:
         return None
     table = Store.open(path).attributes()["study"].get("choice")
     return Choice.from_table(table) if table else None
+
+
+def _described(lattice: dict[str, Any]) -> str:
+    return f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:

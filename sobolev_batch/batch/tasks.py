@@ -15,7 +15,7 @@ from distributed import get_worker
 
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
-from sobolev_batch.errors import InputError
+from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.forecast import settle
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -72,6 +72,9 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     try:
         surface = job.similarity.apply(job.member.load())
         quality, points = _compute(job, surface, blocks)
+    except LatticeError as error:
+        advice = "" if job.aim is None else "; it was chosen for surfaces that reach less far: name another store"
+        return Part(Facts(), time.perf_counter() - started, f"{error}{advice}")
     except InputError as error:
         return Part(Facts(), time.perf_counter() - started, str(error))
     except Exception as error:

@@ -36,7 +36,11 @@ _DEFAULT_MEMORY = 2e9
 _IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
 # Where those laws ask for more than this, a lattice of this size finds out first.
 _PILOT_M = 64
+# Before an accuracy is refused, a larger one may look further.
+_LARGER_PILOT_M = 128
 _HIGHEST_FREQUENCY = 1e4
+# Surfaces end this much short of the period.
+_ROOM = 1.001
 # What is called reachable must hold when it is asked for, on a pilot that differs a little.
 _PROMISE = 1.5
 _STEP = 1.04
@@ -58,13 +62,17 @@ class Accuracy:
     memory: float = _DEFAULT_MEMORY
 
     def __post_init__(self) -> None:
+        for name in ("rtol", "memory"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.floating | np.integer):
+                raise InputError(f"{name} must be a number, found {value!r}")
         if not 0 < self.rtol < 1:
             raise InputError(f"rtol must lie between 0 and 1, found {self.rtol!r}")
         if not (math.isfinite(self.memory) and self.memory > 0):
             raise InputError(f"memory must be a positive number of bytes, found {self.memory!r}")
 
     def met(self, found: Assessed) -> NDArray[np.bool_]:
-        """Which numbers have an error within rtol of them; a distance of exactly zero has."""
+        """Which numbers have an error within rtol of them; of a zero, only where nothing is uncertain about it."""
         return np.asarray(found.errors <= self.rtol * found.values)
 
     @property
@@ -90,7 +98,9 @@ class Accuracy:
         candidates = range(2, LARGEST_M + 1, 2)
         fitting = bisect_right(candidates, self.memory, key=self._bytes)
         if not fitting:
-            raise InputError(f"memory of {self.memory:.3g} bytes is too little: {self._bytes(2):.3g} are needed")
+            raise InputError(
+                f"{self.memory / 1e9:.3g} GB of memory are too little, {self._bytes(2) / 1e9:.3g} GB the least"
+            )
         return candidates[fitting - 1]
 
     @staticmethod
@@ -99,7 +109,7 @@ class Accuracy:
         return memory_bytes(half, Transform()) + 2 * 16 * half.size
 
 
-def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
+def first_lattice(widths: Reals, reach: float, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
     """The lattice that two surfaces close to each other need, before anything else is known of them.
 
     Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. Where that is
@@ -107,13 +117,14 @@ def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
 
     Args:
         widths: extents (13,) of all surfaces together, see `support_widths`.
+        reach: their largest |coordinate|: the period is above twice that.
         orders: s, each.
         accuracy: what is asked for.
 
     Returns:
         A lattice, and whether it is a pilot that is likely to be `refined`.
     """
-    period = _first_period(widths, orders, accuracy)
+    period = max(_first_period(widths, orders, accuracy), _ROOM * 2 * reach)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
     highest = radii[0]
     for order in orders:
@@ -122,11 +133,26 @@ def first_lattice(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
         allowed = accuracy.truncation_part(order) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
         enough = np.flatnonzero(tails <= allowed)
         highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
-    intervals = good_intervals(2 * highest * period)
     most = min(_PILOT_M, accuracy.largest_intervals)
-    if intervals > most:
-        return Lattice(most / (2 * period), most), True
-    return Lattice(intervals / (2 * period), intervals), False
+    return lattice_of(highest, period, most), 2 * highest * period > most
+
+
+def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
+    """A pilot that sees further than one from which an accuracy seemed out of reach, or None."""
+    intervals = min(_LARGER_PILOT_M, accuracy.largest_intervals)
+    return Lattice(intervals * lattice.spacing / 2, intervals) if intervals > lattice.M else None
+
+
+def lattice_of(highest: float, period: float, most: int) -> Lattice:
+    """The lattice of a period 1/h that reaches to a frequency, or as far as M allows.
+
+    Args:
+        highest: the frequency, in cycles per unit length; what a good M leaves over goes beyond it.
+        period: 1/h, in units of length.
+        most: bound of M.
+    """
+    intervals = most if 2 * highest * period > most else min(good_intervals(2 * highest * period), most)
+    return Lattice(intervals / (2 * period), intervals)
 
 
 def refined(
@@ -180,12 +206,12 @@ def refined(
             if reachable >= 1:
                 instead = f"{within} not even one digit can be had; allow more memory or take"
             raise AccuracyError(
-                f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: {instead} a lower order",
+                f"{what}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: {instead} "
+                "a more negative order",
                 accuracy.rtol,
                 reachable,
             )
-    intervals = min(good_intervals(2 * highest * period), most)
-    return Lattice(intervals / (2 * period), intervals)
+    return lattice_of(highest, period, most)
 
 
 def good_intervals(least: float) -> int:

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gamma, kv
+from scipy.special import gammaln, kve
 
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import shell_weights
@@ -33,6 +33,8 @@ _WINDOWS = ((0.5, 0.75), (0.75, 1.0))
 
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
 DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
+# Which of them are the axes x, y, z.
+AXIS_DIRECTIONS = tuple(int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3))
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -224,10 +226,12 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
     distances = np.maximum((offsets - widths).max(axis=1), 0.0)
     # Of order above -3/2 the kernel has no finite peak, but the same decay: the nearest order that has.
     nu = max(-order - 1.5, 0.25)
+    # In logarithms, since powers of both signs overflow at low orders; at small arguments K does, at the peak.
     arguments = np.maximum(2 * np.pi * distances, 1e-6)
-    peak = 2 ** (nu - 1) * gamma(nu)
+    with np.errstate(over="ignore"):
+        logs = nu * np.log(arguments) + np.log(kve(nu, arguments)) - arguments - gammaln(nu) - (nu - 1) * np.log(2)
     # Never exactly zero, so that ratios of it exist: 1e-280 is as good as nothing.
-    return float(np.sum(np.maximum(arguments**nu * kv(nu, arguments) / peak, 1e-280)))
+    return float(np.sum(np.maximum(np.exp(np.minimum(logs, 0.0)), 1e-280)))
 
 
 def _exprel(x: Reals) -> Reals:

@@ -85,7 +85,7 @@ def settle(mesh: Mesh, lattice: Lattice, goal: Goal, transform: Transform) -> Tr
 
 def loosest_tolerance(mesh: Mesh, lattice: Lattice, goal: Goal) -> float:
     """The largest tolerance of the triangle rules whose error is forecast to keep a goal."""
-    census = _Census.of(mesh)
+    census = Census.of(mesh)
     decades = math.log10(_LOOSEST_TOLERANCE / FINEST_TOLERANCE)
     tolerances = _LOOSEST_TOLERANCE * 10 ** -np.linspace(0, decades, round(decades * _STEPS_PER_DECADE) + 1)
     low, high = 0, len(tolerances) - 1
@@ -98,13 +98,8 @@ def loosest_tolerance(mesh: Mesh, lattice: Lattice, goal: Goal) -> float:
     return float(tolerances[low])
 
 
-def quadrature_error(mesh: Mesh, lattice: Lattice, orders: Sequence[float], tolerance: float) -> Reals:
-    """The norm of the quadrature's part of a field's error that is to be expected (orders,)."""
-    return _Census.of(mesh).quadrature_error(lattice, orders, tolerance)
-
-
 @dataclass(frozen=True, eq=False)
-class _Census:
+class Census:
     """The triangles of a mesh by size: centroid radii of each class, sum of areas and of their squares."""
 
     smallest: Reals
@@ -113,7 +108,8 @@ class _Census:
     squares: Reals
 
     @classmethod
-    def of(cls, mesh: Mesh) -> _Census:
+    def of(cls, mesh: Mesh) -> Census:
+        """The census of a mesh."""
         radii, areas = mesh.centroid_radii, mesh.areas
         largest = float(radii.max())
         smallest = max(float(radii.min()), 1e-6 * largest)
@@ -124,7 +120,7 @@ class _Census:
         return cls(edges[:-1], edges[1:], *sums)
 
     def quadrature_error(self, lattice: Lattice, orders: Sequence[float], tolerance: float) -> Reals:
-        """See `quadrature_error`.
+        """The norm of the quadrature's part of a field's error that is to be expected (orders,).
 
         The even parts of the triangles' errors add up like the surface's transform itself, whose
         energy on |ξ| = r is area² near zero and area / (2π r²) on average far out; the odd parts add

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, refined
-from sobolev_batch.spectral.budget import Assessed, Sums, assess, sums_of_shells, support_widths
+from sobolev_batch.errors import AccuracyError
+from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.forecast import Goal, permits_single
 from sobolev_batch.spectral.lattice import Lattice
@@ -20,7 +21,7 @@ from sobolev_batch.spectral.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.similarity import Similarity, Surface
 
 Reals = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ _ESTIMATE_CAUTION = 0.7
 _PAIR = 2
 # No field is exact to less than this part of its area. Twins are that close: no relative accuracy is theirs.
 _ROUNDING = 1e-13
+# Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
+_OFF_CENTER = 1e-3
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -75,19 +78,19 @@ def pursue(
     Raises:
         AccuracyError: a pilot shows that it cannot be met within the memory.
     """
+    surfaces = _centered(surfaces)
     extents = [Quality.of_surface(surface, Probe()) for surface in surfaces]
     widths = support_widths(extents)
     areas = np.array(sum(extent.area for extent in extents))
-    lattice, pilot = first_lattice(widths, orders, accuracy)
+    lattice, pilot = first_lattice(widths, reach_of(extents), orders, accuracy)
     meshes = max(1, sum(isinstance(surface, Mesh) for surface in surfaces))
     values: Reals | None = None
-    strictness = 1.0
-    for _ in range(_ROUNDS):
+    for remaining in reversed(range(_ROUNDS)):
         samples = _samples(surfaces, lattice, orders)
         if values is None:
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
-        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas))
-        goal = goal.tightened(strictness * meshes)
+        _refuse_below_rounding(values, orders, accuracy, float(areas), what)
+        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(meshes)
         precision = _precision(surfaces, lattice, goal)
         fields = tuple(
             field_for(
@@ -97,14 +100,68 @@ def pursue(
         )
         found = _assessed(fields, lattice, orders, areas, widths)
         values = found.assessed.values
-        if accuracy.met(found.assessed).all() or (values <= _ROUNDING * areas / accuracy.rtol).any():
+        twins = values <= _ROUNDING * areas
+        if not remaining or np.all(accuracy.met(found.assessed) | twins):
             break
-        lattice = refined(lattice, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
-        if not pilot:
-            excess = found.assessed.discretisation / np.array(goal_of(values, orders, accuracy, float(areas)).norms)
-            strictness *= max(1.0, 2 * float(excess.max()))
-        pilot = False
+        lattice, pilot = _next(lattice, pilot, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
     return found
+
+
+def _next(
+    lattice: Lattice,
+    pilot: bool,
+    sums: Sums,
+    orders: Sequence[float],
+    accuracy: Accuracy,
+    *,
+    areas: Reals,
+    widths: Reals,
+    what: str,
+) -> tuple[Lattice, bool]:
+    """The lattice of the next round, and whether it is but a larger pilot."""
+    try:
+        return refined(lattice, sums, orders, accuracy, areas=areas, widths=widths, what=what), False
+    except AccuracyError:
+        larger = larger_pilot(lattice, accuracy) if pilot else None
+        if larger is None:
+            raise
+        return larger, True
+
+
+def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
+    """The surfaces moved together to where a lattice's period is centred; distances do not notice."""
+    extents = [Quality.of_surface(surface, Probe()) for surface in surfaces]
+    lowest = np.min([extent.lowest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
+    highest = np.max([extent.highest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
+    if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
+        return surfaces
+    x, y, z = ((lowest + highest) / 2).tolist()
+    move = Similarity(1.0, (x, y, z))
+    return [move.apply(surface) for surface in surfaces]
+
+
+def reach_of(extents: Sequence[Quality]) -> float:
+    """The largest |coordinate| of surfaces, in units of length."""
+    axes = list(AXIS_DIRECTIONS)
+    return float(
+        max(np.abs(np.array(part)[axes]).max() for extent in extents for part in (extent.lowest, extent.highest))
+    )
+
+
+def _refuse_below_rounding(values: Reals, orders: Sequence[float], accuracy: Accuracy, area: float, what: str) -> None:
+    parts = np.array([accuracy.discretisation_part(order) for order in orders])
+    floor = _ROUNDING * area
+    # A distance of no more than rounding is that of twins, for whom no relative accuracy exists.
+    below = (parts * values < floor) & (values > floor)
+    if below.any():
+        worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
+        reachable = 2 * accuracy.rtol * floor / float(parts[worst] * values[worst])
+        raise AccuracyError(
+            f"{what}: rtol {accuracy.rtol:g} of about {values[worst]:.2g} at order {orders[worst]:g} is below the "
+            f"rounding of double precision; about {reachable:.1g} can be reached",
+            accuracy.rtol,
+            reachable,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +185,7 @@ def pilot_of(
     orders: Sequence[float],
     accuracy: Accuracy,
     widths: Reals,
+    reach: float,
     *,
     what: str,
     threads: int = 1,
@@ -140,25 +198,34 @@ def pilot_of(
         orders: s, each.
         accuracy: what is asked for.
         widths: extents (13,) of all surfaces that share the lattice.
+        reach: their largest |coordinate|.
         what: names the surface in messages.
         threads: to compute with.
 
     Raises:
         AccuracyError: it cannot be met within the memory.
     """
-    lattice, _ = first_lattice(widths, orders, accuracy)
-    samples = _samples((surface, reference), lattice, orders)
+    lattice, pilot = first_lattice(widths, reach, orders, accuracy)
     area = surface.area + reference.area
-    goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
-    fields = [
-        field_for(each, lattice, goal, Transform(), sample=sample, threads=threads)
-        for each, sample in zip((surface, reference), samples, strict=True)
-    ]
-    found = _assessed(fields, lattice, orders, np.array(area), widths)
-    needed = refined(lattice, found.sums, orders, accuracy, areas=np.array(area), widths=widths, what=what)
-    final = goal_of(found.assessed.values, orders, accuracy, area).tightened(_PAIR)
+    while True:
+        samples = _samples((surface, reference), lattice, orders)
+        goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
+        fields = [
+            field_for(each, lattice, goal, Transform(), sample=sample, threads=threads)
+            for each, sample in zip((surface, reference), samples, strict=True)
+        ]
+        found = _assessed(fields, lattice, orders, np.array(area), widths)
+        values = found.assessed.values
+        _refuse_below_rounding(values, orders, accuracy, area, what)
+        needed, larger = _next(
+            lattice, pilot, found.sums, orders, accuracy, areas=np.array(area), widths=widths, what=what
+        )
+        if not larger:
+            break
+        lattice = needed
+    final = goal_of(values, orders, accuracy, area).tightened(_PAIR)
     single = all(permits_single(each, needed, final) for each in (surface, reference))
-    return Pilot(found.assessed.values, needed, single)
+    return Pilot(values, needed, single)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,14 @@ Reals = NDArray[np.float64]
 Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
+_LOWEST_ORDER = -100.0
+
 
 def check_orders(order: Orders) -> tuple[float, ...]:
     """The orders as a tuple of floats.
 
     Raises:
-        OrderError: none at all, or one that is not finite and below -1/2.
+        OrderError: none at all, or one that is not between -100 and -1/2.
     """
     orders = tuple(float(s) for s in np.atleast_1d(np.asarray(order, dtype=np.float64)))
     if not orders:
@@ -28,6 +30,8 @@ def check_orders(order: Orders) -> tuple[float, ...]:
     for s in orders:
         if not (np.isfinite(s) and s < -0.5):
             raise OrderError(f"the norm of a surface is finite only for orders below -1/2, found {s:g}")
+        if s < _LOWEST_ORDER:
+            raise OrderError(f"orders go down to {_LOWEST_ORDER:g}, where weights leave double precision, found {s:g}")
     return orders
 
 

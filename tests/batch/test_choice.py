@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from distributed import Client
 
 from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, distance, icosphere, open_store, run
@@ -61,6 +62,15 @@ def test_the_choice_is_kept_when_meshes_are_added(client: Client, store_path: Pa
     assert stored_choice(store_path) == first
     again = run(asking(family=more), store_path, client)
     assert again.computed == ()
+
+
+def test_a_mesh_that_reaches_further_says_what_to_do(client: Client, store_path: Path, tmp_path: Path) -> None:
+    run(asking(), store_path, client)
+    trimesh.creation.box(extents=(20.0, 1.0, 1.0)).export(tmp_path / "far.off")
+    far = {"name": "far", "source": "files", "paths": [str(tmp_path / "far.off")]}
+    summary = run(asking(family=[*small_table()["family"], far]), store_path, client)
+    assert set(summary.failed) == {"far/far"}
+    assert "chosen for surfaces that reach less far: name another store" in summary.failed["far/far"]
 
 
 def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:

@@ -7,7 +7,18 @@ import pickle
 import numpy as np
 import pytest
 
-from sobolev_batch import AccuracyError, InputError, Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch import (
+    AccuracyError,
+    InputError,
+    Lattice,
+    Mesh,
+    OrderError,
+    Sphere,
+    distance,
+    fourier_transform,
+    icosphere,
+    norm,
+)
 from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, good_intervals
 from sobolev_batch.spectral.budget import support_widths
 from sobolev_batch.spectral.probe import Probe
@@ -85,10 +96,53 @@ def test_refuses_what_has_no_meaning() -> None:
         distance(BOX, Sphere(), -2.0, rtol=1e-3, lattice=lattice)
     with pytest.raises(InputError, match="an rtol chooses the lattice"):
         distance(field, Sphere(), -2.0, rtol=1e-3)
+    for wrong in ({"rtol": "a"}, {"rtol": True}, {"rtol": 1e-3, "memory": "2GB"}):
+        with pytest.raises(InputError, match=r"(rtol|memory) must be a number"):
+            distance(BOX, Sphere(), -2.0, **wrong)
     with pytest.raises(InputError, match="expected a Mesh"):
         distance("box.ply", Sphere(), -2.0, rtol=1e-3)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="memory of 1e\\+03 bytes is too little"):
+    with pytest.raises(InputError, match=r"1e-06 GB of memory are too little"):
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
+
+
+def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
+    a, b = icosphere(2), icosphere(3)
+    here = distance(a, b, -3.0, rtol=1e-3)
+    away = np.array([1000.0, -2000.0, 500.0])
+    there = distance(Mesh(a.vertices + away, a.triangles), Mesh(b.vertices + away, b.triangles), -3.0, rtol=1e-3)
+    assert there["within"].item()
+    assert abs(here["distance"].item() - there["distance"].item()) <= here["error"].item() + there["error"].item()
+    apart = distance(Sphere(1.0, (500.0, 0, 0)), Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
+    exact = distance(Sphere(), Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
+    assert abs(apart["distance"].item() - exact) <= apart["error"].item()
+
+
+def test_a_larger_pilot_looks_before_an_accuracy_is_refused() -> None:
+    # The first pilot, up to some 8 cycles, sees the distance of near meshes still growing.
+    found = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
+    assert found["within"].item()
+    assert found.attrs["M"] > 64
+
+
+def test_what_lies_below_rounding_is_refused() -> None:
+    with pytest.raises(AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
+        distance(icosphere(3), Sphere(), -10.0, rtol=1e-12)
+    assert 1e-12 < caught.value.reachable < 1e-8
+    assert distance(icosphere(3), Sphere(), -10.0, rtol=1.5 * caught.value.reachable)["within"].item()
+
+
+@pytest.mark.parametrize("order", [-40.0, -100.0])
+def test_very_negative_orders(order: float) -> None:
+    exact = distance(Sphere(), Sphere(0.9), order)["distance"].item()
+    found = distance(Sphere(), Sphere(0.9), order, rtol=1e-4)
+    assert abs(found["distance"].item() - exact) <= found["error"].item() <= 1e-4 * exact
+    with pytest.raises(OrderError, match="orders go down to -100"):
+        distance(Sphere(), Sphere(0.9), [order, -1e6], rtol=1e-4)
+
+
+def test_many_orders_at_once_end_soon() -> None:
+    with pytest.raises(AccuracyError, match=r"not even one digit|can be reached"):
+        distance(Sphere(), Sphere(1.01), [-0.6, -2.0, -20.0], rtol=1e-4)
 
 
 def test_memory_limits_the_lattice() -> None:
@@ -110,8 +164,10 @@ def test_intervals_suit_ffts() -> None:
 def test_first_lattices_hold_the_surfaces_with_room_for_their_images() -> None:
     widths = support_widths([Quality.of_surface(Sphere(), Probe())])
     for order in (-3.0, -6.0, -12.0):
-        loose, tight = (first_lattice(widths, [order], Accuracy(rtol))[0] for rtol in (1e-2, 1e-6))
+        loose, tight = (first_lattice(widths, 1.0, [order], Accuracy(rtol))[0] for rtol in (1e-2, 1e-6))
         assert 1 / loose.spacing > 2.5
         assert tight.spacing < loose.spacing
-    assert first_lattice(widths, [-1.0], Accuracy(1e-2))[1]  # the tail has no closed form: a pilot
-    assert not first_lattice(widths, [-10.0], Accuracy(1e-4))[1]
+        far, _ = first_lattice(widths, 40.0, [order], Accuracy(1e-2))
+        assert far.half_period > 40.0
+    assert first_lattice(widths, 1.0, [-1.0], Accuracy(1e-2))[1]  # the tail has no closed form: a pilot
+    assert not first_lattice(widths, 1.0, [-10.0], Accuracy(1e-4))[1]

@@ -10,7 +10,7 @@ import trimesh
 
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.forecast import Goal, loosest_tolerance, permits_single, quadrature_error, settle
+from sobolev_batch.spectral.forecast import Census, Goal, loosest_tolerance, permits_single, settle
 from sobolev_batch.spectral.transform import Transform, transform_block
 from tests.spectral.test_quadrature import BOX
 
@@ -65,7 +65,7 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
         settings = Transform(1e-13, tolerance=tolerance)
         made = transform_block(mesh, lattice, lattice.half, settings)
         true = norm(exact.copy(data=made.values - exact.values), orders)["norm"].values
-        forecast = quadrature_error(mesh, lattice, orders, tolerance)
+        forecast = Census.of(mesh).quadrature_error(lattice, orders, tolerance)
         assert (forecast > 0.5 * true).all()
         assert (forecast < 15 * true).all()
 
