@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -49,6 +50,7 @@ class Case:
     goal: Goal
 
     @classmethod
+    @cache
     def of(cls, level: int, intervals: int, effort: Effort, precision: Precision = "complex128") -> Case:
         """An icosphere on a lattice up to 5 cycles per unit length."""
         mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
