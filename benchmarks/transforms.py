@@ -173,10 +173,11 @@ def _speed_up_and_distance(item: str, precision: Precision, effort: Effort) -> I
     case = Case.of(level, intervals, effort, precision)
     ours, papers = case.times(effort.repeats)
     what = f"T_{level}, M = {intervals}, {precision}"
-    yield Row(item, f"{what}: transform", as_seconds(ours), as_seconds(papers), papers / ours, _SPEED_UP)
-    near, far = case.distances()
     # Single precision holds six digits of a field, hence about one of so small a distance.
-    target = _SAME_DISTANCE if precision == "complex128" else None
+    double = precision == "complex128"
+    speed_up, target = (_SPEED_UP, _SAME_DISTANCE) if double else (None, None)
+    yield Row(item, f"{what}: transform", as_seconds(ours), as_seconds(papers), papers / ours, speed_up)
+    near, far = case.distances()
     difference = abs(near - far) / far
     yield Row(item, f"{what}: distance, relative difference", f"{near:.6e}", f"{far:.6e}", difference, target)
 

@@ -24,9 +24,9 @@ from sobolev_batch.surfaces.mesh import Corners, Mesh
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# Gaps below this (radians) go through the series: it then needs at most 12 terms, and above it the
-# quotient loses less than one digit.
-_SERIES_REACH = 0.5
+# Gaps below this (radians) go through the series: it then needs at most 19 terms, which take a fraction of
+# the time of the quotient.
+_SERIES_REACH = 2.0
 # Below this many cycles a plain dot product keeps the phase of exp to 5e-14 radians.
 _PLAIN_CYCLES = 16.0
 # Triangles whose area is a smaller part of a squared edge than this lose digits in a plain cross product.
