@@ -31,6 +31,8 @@ def local_client(workers: int | None = None) -> Iterator[Client]:
         dask.config.set(
             {
                 "distributed.worker.memory.pause": 0.9,
+                # Sampling the stack of every worker a hundred times a second takes from the tasks.
+                "distributed.worker.profile.enabled": False,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,
             }
