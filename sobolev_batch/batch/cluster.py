@@ -13,7 +13,7 @@ from sobolev_batch.errors import ClusterError
 
 _CONNECT_SECONDS = 15
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
-# for each cost more than half of a reduction's time. What glibc may keep is bounded.
+# for each took a third of a reduction's time. What glibc may keep is bounded.
 _KEPT_BYTES = 64 << 20
 _LARGEST_KEPT_BYTES = 32 << 20
 

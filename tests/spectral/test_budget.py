@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch.spectral.budget import Sums, truncated
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.similarity import Surface
 from tests.spectral.test_quadrature import BOX
@@ -88,3 +89,12 @@ def test_truncation_only_adds() -> None:
     exact = norm(Sphere(), -2.0)["norm"].item()
     found = norm(Sphere(), -2.0, lattice=Lattice(3.0, 48))
     assert found["norm"].item() < exact <= found["norm"].item() + found["truncation"].item()
+
+
+@pytest.mark.parametrize("growth", [1e-4, 3e-4, 1e-3, 1e-2])
+def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
+    lattice = Lattice(4.0, 16)
+    sums = Sums(np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
+    bound = truncated(sums, lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    assert bound == pytest.approx(flat, rel=0.3)
