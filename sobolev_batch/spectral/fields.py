@@ -117,8 +117,8 @@ def compute_field(
     """
     block = lattice.half
     made = transform_block(surface, lattice, block, settings, threads=threads)
-    usable = sample is not None and settings.lowest_degree(surface, lattice) <= USUAL_DEGREE
-    if sample is not None and usable and needs_probe(surface, settings):
+    probed = needs_probe(surface, settings)
+    if probed and sample is not None and settings.lowest_degree(surface, lattice) <= USUAL_DEGREE:
         probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
     else:
         probe = probe_block(surface, lattice, settings, orders, block, made.values)

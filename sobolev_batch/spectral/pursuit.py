@@ -78,8 +78,7 @@ def pursue(
     Raises:
         AccuracyError: a pilot shows that it cannot be met within the memory.
     """
-    surfaces = _centered(surfaces)
-    extents = [Quality.of_surface(surface, Probe()) for surface in surfaces]
+    surfaces, extents = _centered(surfaces)
     widths = support_widths(extents)
     areas = np.array(sum(extent.area for extent in extents))
     lattice, pilot = first_lattice(widths, reach_of(extents), orders, accuracy)
@@ -128,16 +127,17 @@ def _next(
         return larger, True
 
 
-def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
-    """The surfaces moved together to where a lattice's period is centred; distances do not notice."""
+def _centered(surfaces: Sequence[Surface]) -> tuple[Sequence[Surface], list[Quality]]:
+    """The surfaces moved together to where a lattice's period is centred, which no distance notices; their extents."""
     extents = [Quality.of_surface(surface, Probe()) for surface in surfaces]
     lowest = np.min([extent.lowest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
     highest = np.max([extent.highest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
     if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
-        return surfaces
+        return surfaces, extents
     x, y, z = ((lowest + highest) / 2).tolist()
     move = Similarity(1.0, (x, y, z))
-    return [move.apply(surface) for surface in surfaces]
+    moved = [move.apply(surface) for surface in surfaces]
+    return moved, [Quality.of_surface(surface, Probe()) for surface in moved]
 
 
 def reach_of(extents: Sequence[Quality]) -> float:
