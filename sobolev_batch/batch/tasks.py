@@ -132,13 +132,13 @@ def _whole(qualities: Sequence[Quality]) -> Quality:
 def _facts(surface: Surface, points: int) -> Facts:
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area)
-    lengths, counts = surface.edge_lengths, surface.counts
+    (mean_length, longest), counts = surface.edge_length_range, surface.counts
     return Facts(
         vertices=len(surface.vertices),
         triangles=len(surface.triangles),
         area=surface.area,
-        edge_length_mean=float(lengths.mean()),
-        edge_length_max=float(lengths.max()),
+        edge_length_mean=mean_length,
+        edge_length_max=longest,
         zero_area_triangles=counts.zero_area,
         duplicate_triangles=counts.duplicate,
         boundary_edges=counts.boundary_edges,

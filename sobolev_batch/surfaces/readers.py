@@ -42,9 +42,13 @@ def read_mesh(path: str | Path) -> Mesh:
     suffix = mesh_format(path).removesuffix(".gz")
     if suffix not in _PARSERS:
         raise MeshError(f"{path}: no mesh format has this name; known are {', '.join(_PARSERS)}, each also with .gz")
-    data = read_bytes(path)
+    data = [read_bytes(path)]
     try:
-        return Mesh(*_PARSERS[suffix](data, path))
+        # The parser alone holds the bytes, and lets go of them as soon as it can.
+        vertices, triangles = _PARSERS[suffix](data.pop(), path)
+        for array in (vertices, triangles):
+            array.setflags(write=False)
+        return Mesh(vertices, triangles)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
     except Exception as error:
@@ -124,7 +128,7 @@ def _parse_gifti(data: bytes, path: Path) -> Raw:
 
 
 _PARSERS: dict[str, Callable[[bytes, Path], Raw]] = {
-    ".ply": lambda data, _: parse_ply(data),
+    ".ply": parse_ply,
     ".obj": lambda data, _: parse_obj(data),
     ".stl": lambda data, _: parse_stl(data),
     ".off": lambda data, _: parse_off(data),
