@@ -13,6 +13,7 @@ task; a reduction over what the tasks stored makes the tables. Data flows one wa
 
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.submission import Submission, submit
 from sobolev_batch.errors import (
     AccuracyError,
     ClusterError,
@@ -49,6 +50,7 @@ __all__ = [
     "StoreError",
     "Study",
     "StudyError",
+    "Submission",
     "Summary",
     "distance",
     "fourier_transform",
@@ -58,4 +60,5 @@ __all__ = [
     "open_store",
     "read_mesh",
     "run",
+    "submit",
 ]

@@ -83,6 +83,14 @@ class Mesh:
                 "degenerate, so there is no surface measure to compare"
             )
 
+    @classmethod
+    def of_checked(cls, vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> Mesh:
+        """A mesh of arrays that were checked before, such as parts of a mesh; they become its own."""
+        mesh = object.__new__(cls)
+        object.__setattr__(mesh, "vertices", _frozen(vertices))
+        object.__setattr__(mesh, "triangles", _frozen(triangles))
+        return mesh
+
     def corners(self, part: slice | NDArray[np.int64] = _EVERYTHING) -> Corners:
         """The first, second and third corners of all or some triangles, each (k, 3)."""
         chosen = self.triangles[part]
@@ -150,23 +158,21 @@ class Mesh:
             nonmanifold_edges=many,
         )
 
-    def parts(self, size: int) -> Iterator[Mesh]:
-        """The mesh in parts of at most ``size`` triangles, each with the vertices that it uses alone.
+    def parts(self, size: int) -> Iterator[tuple[int, Mesh]]:
+        """The mesh in numbered parts of at most ``size`` triangles, each with the vertices that it uses alone.
 
         Parts without area are left out: what they would add to a transform is zero.
         """
         number = np.empty(len(self.vertices), dtype=np.int64)
-        for start in range(0, len(self.triangles), size):
+        for part, start in enumerate(range(0, len(self.triangles), size)):
             triangles = self.triangles[start : start + size]
+            if not np.any(self.areas[start : start + size] > 0):
+                continue
             used = np.zeros(len(self.vertices), dtype=bool)
             used[triangles] = True
             there = np.flatnonzero(used)
             number[there] = np.arange(len(there))
-            try:
-                yield Mesh(_frozen(self.vertices[there]), _frozen(number[triangles]))
-            except MeshError:
-                if np.any(self.areas[start : start + size]):
-                    raise
+            yield part, Mesh.of_checked(self.vertices[there], number[triangles])
 
     @cached_property
     def digest(self) -> str:

@@ -33,7 +33,7 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     """
     start = data.find(_END)
     header, length = data[: max(start, 0)], len(data) - start - len(_END)
-    counts = {name.decode(): int(count) for name, count in re.findall(rb"^element\s+(\w+)\s+(\d+)", header, re.M)}
+    counts = _announced(header)
     if start < 0 or "vertex" not in counts or "face" not in counts:
         raise MeshError("the PLY header does not announce vertices and faces")
     # Every element takes at least a byte: a count beyond that would only reserve memory.
@@ -58,6 +58,15 @@ def parse_ply(data: bytes, path: Path) -> Raw:
         raise MeshError(f"the PLY header announces {counts}, but {left} bytes more follow")
     vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
     return vertices, _triangles(ply["face"])
+
+
+def announced_faces(header: bytes) -> int:
+    """How many faces the beginning of a file announces; 0 where it does not."""
+    return _announced(header).get("face", 0)
+
+
+def _announced(header: bytes) -> dict[str, int]:
+    return {name.decode(): int(count) for name, count in re.findall(rb"^element\s+(\w+)\s+(\d+)", header, re.M)}
 
 
 def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:
