@@ -15,6 +15,7 @@ from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import (
     AccuracyError,
+    BackendError,
     ClusterError,
     InputError,
     LatticeError,
@@ -36,6 +37,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
     "AccuracyError",
+    "BackendError",
     "ClusterError",
     "InputError",
     "Lattice",
