@@ -16,6 +16,7 @@ from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submission import Submission, submit
 from sobolev_batch.errors import (
     AccuracyError,
+    BackendError,
     ClusterError,
     InputError,
     LatticeError,
@@ -37,6 +38,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
     "AccuracyError",
+    "BackendError",
     "ClusterError",
     "InputError",
     "Lattice",

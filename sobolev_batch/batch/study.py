@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
