@@ -7,8 +7,12 @@ import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
+# What this process has: one device at most, since CUDA settles on what it sees at its start.
+_held: set[str] = set()
+_claiming = Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +29,7 @@ class Claim:
     def release(self) -> None:
         """Let another process have the device."""
         self._hold.close()
+        _held.discard(self.device)
 
 
 def visible_devices() -> tuple[str, ...]:
@@ -70,18 +75,21 @@ def chosen_devices(wanted: str, uuids: Sequence[str]) -> tuple[str, ...]:
 def claim_device(devices: Sequence[str]) -> Claim | None:
     """Take the first device that no other process of this host has taken, and make it the only visible one.
 
-    None where all are taken. A claim is a socket bound to a name that Linux keeps in memory: it is
-    exclusive, needs no permissions, leaves no file, and ends with the process however that ends.
+    None where all are taken, or this process has one already. A claim is a socket bound to a name that
+    Linux keeps in memory: it is exclusive, needs no permissions, leaves no file, and ends with the
+    process however that ends.
     """
     if not sys.platform.startswith("linux"):
         return None
-    for device in devices:
-        hold = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
-            hold.bind(f"\0sobolev-batch/{device}")
-        except OSError:
-            hold.close()
-            continue
-        os.environ[_VISIBLE] = device
-        return Claim(device, hold)
+    with _claiming:
+        for device in () if _held else devices:
+            hold = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                hold.bind(f"\0sobolev-batch/{device}")
+            except OSError:
+                hold.close()
+                continue
+            _held.add(device)
+            os.environ[_VISIBLE] = device
+            return Claim(device, hold)
     return None

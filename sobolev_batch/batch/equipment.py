@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from threading import Lock
 from typing import Any
 
 import psutil
@@ -21,7 +20,6 @@ _NAME = "sobolev-batch"
 # Of a worker's memory limit, what tasks may take together: Dask pauses a worker near its limit and
 # ends it at it, and an idle process with its libraries takes the constant part.
 _USABLE, _IDLE_BYTES = 0.85, 300e6
-_one_device = Lock()
 
 
 class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -65,19 +63,17 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
 
     def _find_backend(self) -> None:
         devices = visible_devices()
-        # Workers may be threads of one process, which has one GPU at most.
-        with _one_device:
-            claim = claim_device(devices)
-            try:
-                if devices and claim is None:
-                    raise BackendError(f"other workers have all {len(devices)} GPUs of the host")
-                self.backend = gpu_backend()
-                self.note = self.backend.device
-                self._claim = claim
-            except BackendError as error:
-                self.note = str(error)
-                if claim is not None:
-                    claim.release()
+        claim = claim_device(devices)
+        try:
+            if devices and claim is None:
+                raise BackendError(f"other workers have all of the {len(devices)} GPUs that it may use")
+            self.backend = gpu_backend()
+            self.note = self.backend.library
+            self._claim = claim
+        except BackendError as error:
+            self.note = str(error)
+            if claim is not None:
+                claim.release()
 
 
 def enlist(client: Client) -> Crew:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.errors import ClusterError
@@ -90,5 +91,5 @@ def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Cre
     # A task computes as many blocks as leaves two for every thread: each makes the mesh anew.
     count = len(blocks) if parts > 1 else min(len(blocks), max(1, math.ceil(2 * crew.threads / max(rows, 1))))
     ends = [len(blocks) * k // count for k in range(count + 1)]
-    groups = tuple(tuple(blocks[first:last]) for first, last in zip(ends, ends[1:], strict=False))
+    groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
     return Layout(parts, groups, spent, max(making, task) if parts == 1 else making, task)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class Cut:
     there: frozenset[int] = frozenset()
     settings: Transform | None = None
     draws: Draws | None = None
-    facts: Facts = Facts()
+    facts: Facts = field(default_factory=Facts)
     quality: Quality | None = None
     seconds: float = 0.0
     error: str = ""

@@ -231,8 +231,8 @@ def _compute_fields(
         if future.status == "error":
             # The task itself reports bad meshes; what arrives here is a worker that died or a store
             # that cannot be written any more.
-            error = future.exception()
-            record = Record(key=row.key, status="failed", reason=f"{type(error).__name__}: {error}")
+            failure = future.exception()
+            record = Record(key=row.key, status="failed", reason=f"{type(failure).__name__}: {failure}")
             _log.error("%s: %s", row.label, record.reason)
             store.write_record(i, record)
         else:

@@ -143,7 +143,11 @@ class Store:
         for name in _PIECE_ARRAYS:
             values = getattr(mesh, name)
             root.create_array(
-                _piece(row, number, name), data=values, chunks=values.shape, compressors=(Crc32cCodec(),), overwrite=True
+                _piece(row, number, name),
+                data=values,
+                chunks=values.shape,
+                compressors=(Crc32cCodec(),),
+                overwrite=True,
             )
 
     def read_piece(self, row: int, number: int) -> Mesh:

@@ -13,7 +13,6 @@ from sobolev_batch.batch.layout import Layout
 from sobolev_batch.batch.pieces import add_partials, cut_mesh, store_block, transform_piece
 from sobolev_batch.batch.study import Backends
 from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
-from sobolev_batch.spectral.lattice import Block
 
 
 @dataclass(frozen=True, eq=False)

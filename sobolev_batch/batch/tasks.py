@@ -119,9 +119,7 @@ def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quali
             goal = job.aim.goal(surface)
             field = field_for(surface, job.lattice, goal, job.transform, backend=backend, memory=job.memory)
         else:
-            field = compute_field(
-                surface, job.lattice, job.transform, job.orders, backend=backend, memory=job.memory
-            )
+            field = compute_field(surface, job.lattice, job.transform, job.orders, backend=backend, memory=job.memory)
         job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
         return field.quality, field.points, (field.backend,)
     settings = settings_of(job, surface)

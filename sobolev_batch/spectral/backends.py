@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 
 import finufft
 
+from sobolev_batch.errors import BackendError
 from sobolev_batch.spectral.division import Costs, Shape
 from sobolev_batch.spectral.precision import Precision
 
@@ -94,3 +95,12 @@ class _Cpu(Backend):
 
 
 CPU: Backend = _Cpu("cpu", "finufft", _CPU_COSTS)
+
+
+def gpu_backend() -> Backend:
+    """The GPU that this process sees.
+
+    Raises:
+        BackendError: there is none.
+    """
+    raise BackendError("transforms on a GPU are not built yet")

@@ -14,6 +14,7 @@ from sobolev_batch.batch.cluster import local_client, remote_client
 from tests.batch.conftest import variable
 from tests.batch.processes import SCHEDULER, dask, scheduler_address, stop, tcp_cluster
 
+
 @pytest.fixture
 def tcp_scheduler() -> Iterator[str]:
     """The address of a `dask scheduler` with two `dask worker` processes."""

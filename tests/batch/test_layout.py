@@ -18,7 +18,8 @@ TRANSFORM = Transform()
 def crew(*spare_gigabytes: float, threads: int = 1) -> Crew:
     return Crew(
         tuple(
-            CrewMember(f"tcp://{number}", threads, 1e9 * spare, "cpu", "") for number, spare in enumerate(spare_gigabytes)
+            CrewMember(f"tcp://{number}", threads, 1e9 * spare, "cpu", "")
+            for number, spare in enumerate(spare_gigabytes)
         )
     )
 

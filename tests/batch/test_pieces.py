@@ -111,7 +111,7 @@ def test_a_piece_that_is_gone_fails_with_its_number(plan: Plan, store_path: Path
 
 
 def test_errors_survive_the_sum() -> None:
-    total = add_partials(Partial(np.ones(2)), Partial(error="gone"))
+    total = add_partials(Partial(np.ones(2, dtype=np.complex128)), Partial(error="gone"))
     assert (total.error, add_partials(Partial(error="first"), total).error) == ("gone", "first")
 
 
