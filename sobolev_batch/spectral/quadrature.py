@@ -93,7 +93,13 @@ class Quadrature:
 
     def lowest_degree(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
         """The lowest degree among the rules that triangles get: the one whose error shows first."""
-        return min(group.rule.degree for group in self._groups(mesh, highest_frequency, tolerance))
+        if self.method != "auto":
+            return self._groups(mesh, highest_frequency, tolerance)[0].rule.degree
+        rules, reach = reaches(tolerance)
+        degrees = np.array([rule.degree for rule in rules])
+        # Slice by slice: of tens of millions of triangles, groups take gigabytes.
+        slices = (mesh.centroid_radii[first : first + _SLICE] for first in range(0, len(mesh.triangles), _SLICE))
+        return min(int(degrees[choose_rules(2 * np.pi * highest_frequency * part, reach)[1]].min()) for part in slices)
 
     def sizes(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> tuple[float, int]:
         """The expected number of points of a mesh, and a bound that holds before shared ones are merged."""
