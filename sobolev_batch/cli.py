@@ -12,6 +12,7 @@ from typing import Any, Self
 import click
 
 from sobolev_batch.batch.cluster import remote_client
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan, make_plan
 from sobolev_batch.batch.run import Progress, Summary, run
 from sobolev_batch.batch.store import Store, stored_choice
@@ -26,6 +27,8 @@ from sobolev_batch.surfaces.similarity import Similarity
 
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 1, 2, 3, 130
 _DEFAULT_FOLDER = Path("storage")
+# Of object storage, by the names of their loggers.
+_DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -46,6 +49,9 @@ def cli(context: click.Context, debug: bool) -> None:
         format="%(levelname)s %(name)s: %(message)s",
         stream=sys.stderr,
     )
+    for driver in _DRIVERS:
+        # What they send is logged with its signature, and with a session's token.
+        logging.getLogger(driver).setLevel(logging.INFO)
     if not debug:
         # The cluster's own messages at shutdown are of no use to someone who reads a table.
         logging.getLogger("distributed").setLevel(logging.ERROR)
@@ -53,18 +59,18 @@ def cli(context: click.Context, debug: bool) -> None:
 
 @cli.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+@click.option("--store", type=Location.of, metavar="PATH|URL", help="Where results go. [default: storage/NAME.zarr]")
 @click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
 @click.pass_context
 def run_command(
-    context: click.Context, study: Path, store: Path | None, scheduler: str | None, workers: int | None
+    context: click.Context, study: Path, store: Location | None, scheduler: str | None, workers: int | None
 ) -> None:
     """Compute what is missing of STUDY, reduce it, print the tables."""
     if scheduler and workers:
         raise click.UsageError("--workers is for a cluster on this machine; one with a scheduler has its own")
     parsed = Study.from_toml(study)
-    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
     with _Reporter() as reporter:
         if scheduler:
             with remote_client(scheduler) as client:
@@ -79,20 +85,22 @@ def run_command(
 
 @cli.command("plan")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--store", type=click.Path(path_type=Path), help="Where results would go. [default: storage/NAME.zarr]")
-def plan_command(study: Path, store: Path | None) -> None:
+@click.option(
+    "--store", type=Location.of, metavar="PATH|URL", help="Where results would go. [default: storage/NAME.zarr]"
+)
+def plan_command(study: Path, store: Location | None) -> None:
     """Show what running STUDY would do: tasks, lattice, bytes, memory, what is already there."""
     parsed = Study.from_toml(study)
-    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
     plan = make_plan(parsed, stored_choice(place))
     for name, value in _plan_lines(plan, place):
         click.echo(f"{name + ':':<14} {value}")
 
 
 @cli.command("status")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of)
 @click.pass_context
-def status_command(context: click.Context, store: Path) -> None:
+def status_command(context: click.Context, store: Location) -> None:
     """Show how far STORE is, and what failed and why."""
     place = Store.open(store)
     labels, records = place.labels(), place.records()
@@ -105,27 +113,27 @@ def status_command(context: click.Context, store: Path) -> None:
     click.echo(f"{store}: {complete} of {len(labels)} complete, {len(failed)} failed")
     for label, record in failed:
         click.echo(f"{label}: {record.reason}")
-    if place.read_table("convergence") is None:
+    if place.table_attributes("convergence") is None:
         click.echo("no tables yet: run the study to its end")
     if failed:
         context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("table")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of)
 @click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
 @click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
-def table_command(store: Path, style: Format, orders: tuple[float, ...]) -> None:
+def table_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
     """Print the convergence tables of STORE."""
     click.echo(format_table(open_store(store), style, orders or None))
 
 
 @cli.command("plot")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of)
 @click.option(
     "--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures."
 )
-def plot_command(store: Path, output: Path) -> None:
+def plot_command(store: Location, output: Path) -> None:
     """Draw the convergence and the transforms of STORE."""
     # Imported here: it takes as long as everything that the other commands do at their start.
     from sobolev_batch.results.plots import plot_store
@@ -237,7 +245,7 @@ class _Reporter:
             self._bar = None
 
 
-def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
+def _plan_lines(plan: Plan, place: Location) -> Iterator[tuple[str, str]]:
     study, lattice, transform = plan.study, plan.lattice, plan.transform
     origin = " ".join(f"{x:.9g}" for x in plan.similarity.origin)
     tasks = len(plan.rows) * len(plan.blocks)
@@ -271,7 +279,7 @@ def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
     yield "store", f"{place}, {done} of {len(plan.rows)} already there"
 
 
-def _stored_keys(place: Path) -> dict[str, str]:
+def _stored_keys(place: Location) -> dict[str, str]:
     if not place.exists():
         return {}
     store = Store.open(place)

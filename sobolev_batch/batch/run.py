@@ -16,9 +16,11 @@ from distributed import Client, Future, as_completed
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.choice import Choice
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan, Row, make_plan
+from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store, stored_choice
@@ -63,7 +65,7 @@ class Summary:
     """What a run did.
 
     Attributes:
-        store: the path of the store.
+        store: the path or URL of the store.
         computed: labels of the meshes whose fields were computed now.
         reused: labels of those that were already there.
         failed: the reason for each mesh that could not be computed.
@@ -77,7 +79,7 @@ class Summary:
 
 def run(
     study: Study,
-    store: str | Path,
+    store: str | Path | Location,
     client: Client | None = None,
     *,
     workers: int | None = None,
@@ -87,7 +89,7 @@ def run(
 
     Args:
         study: what to compute.
-        store: path of a new or existing store; the workers must reach it under the same path.
+        store: path or URL of a new or existing store; the workers must reach it under the same name.
         client: of the cluster to compute on. Without one, a cluster of single-threaded processes on
             this machine serves for the time of the call; a script that relies on it must guard its
             main part by ``if __name__ == "__main__"``, as all that starts processes must. Where
@@ -101,30 +103,35 @@ def run(
     Raises:
         StudyError, MeshError, LatticeError: the study cannot be carried out.
         AccuracyError: the accuracy that the study asks for is out of reach; nothing was computed.
-        StoreError: the store cannot be written or belongs to another study.
+        StoreError: the store cannot be reached or written, or belongs to another study.
     """
-    plan = make_plan(study, stored_choice(store))
-    place = Store.prepare(store, plan)
+    location = Location.of(store)
+    known = stored_choice(location)
+    if client is not None:
+        require_reach(client, location)
+    plan = make_plan(study, known)
+    place = Store.prepare(location, plan)
     rows = rows_of(place, plan)
-    records = place.records()
+    records = list(place.records())
     notify = on_progress or (lambda progress: None)
-    missing = _missing(place, rows)
+    own_client = thread_client if location.is_of_this_process else local_client
+    missing = _missing(records, rows)
     if missing or not _is_reduced(place, plan, rows, records):
-        with nullcontext(client) if client is not None else local_client(workers) as active:
+        with nullcontext(client) if client is not None else own_client(workers) as active:
             notify(Progress("cluster", 0, 0, active.dashboard_link))
-            _compute_fields(active, place, plan, rows, missing, notify)
-            found = _reduce(active, place, plan, rows, notify)
+            _compute_fields(active, place, plan, rows, missing, records, notify)
+            found = _reduce(active, place, plan, rows, records, notify)
             for _ in range(_MOST_ROUNDS - 1):
                 choice = _grown(plan, found)
                 if choice is None:
                     break
                 plan = plan.on(choice)
-                place = Store.prepare(store, plan)
+                place = Store.prepare(location, plan)
                 rows = rows_of(place, plan)
-                missing = _missing(place, rows)
-                _compute_fields(active, place, plan, rows, missing, notify)
-                found = _reduce(active, place, plan, rows, notify)
-    records = place.records()
+                records = list(place.records())
+                missing = _missing(records, rows)
+                _compute_fields(active, place, plan, rows, missing, records, notify)
+                found = _reduce(active, place, plan, rows, records, notify)
     failed = {
         row.label: record.reason if record else "not computed"
         for row, record in zip(rows, records, strict=True)
@@ -139,9 +146,8 @@ def run(
     )
 
 
-def _missing(store: Store, rows: Sequence[Row]) -> list[int]:
+def _missing(records: Sequence[Record | None], rows: Sequence[Row]) -> list[int]:
     """The rows whose fields are not there."""
-    records = store.records()
     return [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
 
 
@@ -166,8 +172,10 @@ def _compute_fields(
     plan: Plan,
     rows: Sequence[Row],
     missing: Sequence[int],
+    records: list[Record | None],
     notify: Notify,
 ) -> None:
+    """Compute what is missing; its records, as they are stored, take their places in the list."""
     notify(Progress("fields", 0, len(missing)))
     futures: dict[Future, int] = {}
     for i in missing:
@@ -197,6 +205,7 @@ def _compute_fields(
             store.write_record(i, record)
         else:
             record = future.result()
+        records[i] = record
         notify(Progress("fields", done, len(missing), row.label, record))
 
 
@@ -207,9 +216,10 @@ def _submit(client: Client, job: Job, plan: Plan) -> Future:
     return client.submit(finish_mesh, job, parts, pure=False)
 
 
-def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify) -> Assessed | None:
+def _reduce(
+    client: Client, store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None], notify: Notify
+) -> Assessed | None:
     """Make the tables; the distances to the reference, or None where the tables were there."""
-    records = store.records()
     if _is_reduced(store, plan, rows, records):
         return None
     complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
@@ -297,8 +307,8 @@ def _write_tables(
 
 
 def _is_reduced(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
-    tables = store.read_table("convergence")
-    return tables is not None and tables.attrs.get("digest") == _reduction_digest(plan, rows, records)
+    attributes = store.table_attributes("convergence")
+    return attributes is not None and attributes.get("digest") == _reduction_digest(plan, rows, records)
 
 
 def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
