@@ -49,10 +49,11 @@ def cli(context: click.Context, debug: bool) -> None:
         format="%(levelname)s %(name)s: %(message)s",
         stream=sys.stderr,
     )
-    for driver in _DRIVERS:
-        # What they send is logged with its signature, and with a session's token.
-        logging.getLogger(driver).setLevel(logging.INFO)
-    if not debug:
+    if debug:
+        # Below that they log what they send, with its signature and a session's token.
+        for driver in _DRIVERS:
+            logging.getLogger(driver).setLevel(logging.INFO)
+    else:
         # The cluster's own messages at shutdown are of no use to someone who reads a table.
         logging.getLogger("distributed").setLevel(logging.ERROR)
 

@@ -56,9 +56,14 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
     Args:
         workers: how many threads; default one per core that this process may use.
     """
-    # The protocol opens no port; the dashboard's default is every interface.
+    # The protocol opens no port; the dashboard's default is every interface, and its link would name another.
     with (
-        dask.config.set({"distributed.worker.profile.enabled": False}),
+        dask.config.set(
+            {
+                "distributed.worker.profile.enabled": False,
+                "distributed.dashboard.link": "http://127.0.0.1:{port}/status",
+            }
+        ),
         LocalCluster(
             n_workers=1,
             threads_per_worker=workers or available_cores(),

@@ -23,6 +23,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.buffer import Buffer
+from zarr.abc.store import Store as ZarrStore
 from zarr.buffer.cpu import Buffer as BytesBuffer
 from zarr.buffer.cpu import NDBuffer
 from zarr.codecs import Crc32cCodec
@@ -122,6 +123,11 @@ class Store:
                 self._documents.setdefault(name, document)
             self._documents[""] = root
         return True
+
+    def keys(self, name: str = _FIELD) -> ZarrStore:
+        """What zarr and xarray take to read the store, with an eye to the chunks of one array."""
+        chunk = self._document(name)["chunk_grid"]["configuration"]["chunk_shape"]
+        return self.location.keys(math.prod(chunk) * np.dtype(np.complex128).itemsize)
 
     def attributes(self) -> dict[str, Any]:
         """The attributes of the root: title, study, similarity, versions.
@@ -251,10 +257,7 @@ class Store:
             ) from error
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        document = self._document(name)
-        chunk = document["chunk_grid"]["configuration"]["chunk_shape"]
-        keys = self.location.keys(16 * math.prod(chunk))
-        return zarr.Array.from_dict(StorePath(keys, name), document)
+        return zarr.Array.from_dict(StorePath(self.keys(name), name), self._document(name))
 
     def _read_texts(self, name: str) -> tuple[str, ...]:
         array = self._array(name)
