@@ -56,7 +56,8 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
     Args:
         workers: how many threads; default one per core that this process may use.
     """
-    # The protocol opens no port; the dashboard's default is every interface, and its link would name another.
+    # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
+    # and the link would name one of them.
     with (
         dask.config.set(
             {
@@ -70,6 +71,7 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
             processes=False,
             protocol="inproc://",
             dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
         ) as cluster,
         Client(cluster) as client,
     ):

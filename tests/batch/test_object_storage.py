@@ -263,9 +263,9 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
     unknown = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
     cases: list[tuple[tuple[str, ...], dict[str, str], str]] = [
         (("status", there), {}, "no store of a study is there"),
-        (("status", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
         (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
-        (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "Could not connect"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
         (("run", "study.toml", "--store", there), {"AWS_ENDPOINT_URL": deaf}, "nothing answers there within 20 s"),
         (("table", there), unknown, "no credentials (Unable to locate credentials); set those of s3://"),
     ]
@@ -336,10 +336,10 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
 def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     def kill(progress: Progress) -> None:
         if progress.stage == "fields" and progress.done == 1:
-            server.process.kill()
+            brief.process.kill()
 
-    with serving() as server:
-        for name, value in server.environment().items():
+    with serving() as brief:
+        for name, value in brief.environment().items():
             monkeypatch.setenv(name, value)
         forget_drivers()
         try:
@@ -394,8 +394,8 @@ def test_a_cluster_of_threads_listens_on_loopback_only() -> None:
     before = listening()
     with thread_client(1) as client:
         opened = listening() - before
-        assert client.dashboard_link == f"http://127.0.0.1:{opened.pop()[1]}/status"
-        assert not opened
+        assert client.dashboard_link in {f"http://{ip}:{port}/status" for ip, port in opened}
+        assert {ip for ip, _ in opened} == {"127.0.0.1"}
 
 
 def listening() -> set[tuple[str, int]]:
