@@ -142,7 +142,7 @@ def transform_block(
     require_inside(surface, lattice)
     division = Division(batch)
     if memory is not None:
-        division = _division(surface, lattice, block, settings, CPU.costs, memory=memory, batch=batch)
+        division, _ = _division(surface, lattice, block, settings, CPU.costs, memory=memory, batch=batch)
     failure = ""
     if isinstance(backend, Gpu):
         made = _on_gpu(surface, lattice, block, settings, batch, backend)
@@ -165,11 +165,7 @@ def _on_gpu(
         with backend.work():
             room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.precision)
             for _ in range(_ATTEMPTS):
-                division = _division(mesh, lattice, block, settings, backend.costs, memory=room, batch=batch)
-                load = _load(mesh, lattice)
-                taken = transform_bytes(
-                    block.shape, settings.accuracy, settings.precision, load, division, backend.costs
-                )
+                division, taken = _division(mesh, lattice, block, settings, backend.costs, memory=room, batch=batch)
                 backend.make_room(taken)
                 try:
                     values, points = _computed(mesh, lattice, block, settings, division, backend, 1)
@@ -247,20 +243,22 @@ def memory_bytes(
 
 def _division(
     mesh: Mesh, lattice: Lattice, block: Block, settings: Transform, costs: Costs, *, memory: float, batch: int
-) -> Division:
-    """How the transform of a mesh is divided to fit into memory; raises InputError where it cannot be."""
+) -> tuple[Division, int]:
+    """How the transform of a mesh is divided to fit into memory, and what it then takes, in bytes.
+
+    Raises:
+        InputError: the memory is too little.
+    """
     shape, eps, precision = block.shape, settings.accuracy, settings.precision
-    load = _load(mesh, lattice)
+    low, high = mesh.bounds
+    fill = float(np.prod((high - low) / (2 * lattice.half_period)))
+    load = Load(math.inf, triangles=len(mesh.triangles), fill=fill)
     if transform_bytes(shape, eps, precision, load, Division(batch), costs) > memory:
+        # Only now do the points need counting.
         points, most = settings.quadrature.sizes(mesh, lattice.highest_frequency, settings.rule_tolerance)
         load = replace(load, points=points, most_points=most)
-    return divide(shape, eps, precision, load, costs, memory=memory, batch=batch)
-
-
-def _load(mesh: Mesh, lattice: Lattice) -> Load:
-    """What transforming a mesh has to deal with, short of the number of points."""
-    low, high = mesh.bounds
-    return Load(math.inf, math.inf, len(mesh.triangles), float(np.prod((high - low) / (2 * lattice.half_period))))
+    division = divide(shape, eps, precision, load, costs, memory=memory, batch=batch)
+    return division, transform_bytes(shape, eps, precision, load, division, costs)
 
 
 def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, precision: Precision) -> Complexes:
