@@ -51,7 +51,7 @@ GPU_COSTS = Costs(
     point_bytes=250,
     triangle_bytes=60,
     fixed_bytes=50_000_000,
-    work_grids=1,
+    work_grids=2,  # cuFFT's work area, and at worst as much for bins of a single cell
     scattered=False,
     most_cells=2**31 - 1,  # cuFINUFFT counts cells in 32 bits and does not check
 )
