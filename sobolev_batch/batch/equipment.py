@@ -57,14 +57,14 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
             self._claim.release()
 
     def _find_backend(self) -> None:
-        devices = visible_devices()
-        claim = claim_device(devices)
+        claim = None
         try:
-            if devices and claim is None:
-                raise BackendError(f"other workers have all of the {len(devices)} GPUs that it may use")
-            self.backend = gpu_backend()
-            self.note = self.backend.library
-            self._claim = claim
+            devices = visible_devices()
+            claim = claim_device(devices)
+            if claim is None:
+                raise BackendError(f"no GPU left: other workers have all of the {len(devices)} that it may use")
+            backend = gpu_backend()
+            self.backend, self.note, self._claim = backend, backend.description, claim
         except BackendError as error:
             self.note = str(error)
             if claim is not None:
