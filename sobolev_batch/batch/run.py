@@ -248,6 +248,8 @@ def _compute_fields(
             store.discard_pieces(i)
         records[i] = record
         notify(Progress("fields", done, len(missing), row.label, record))
+    if any(layout.parts > 1 for layout in layouts.values()):
+        store.discard_pieces()
 
 
 def _reduce(
