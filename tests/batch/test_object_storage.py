@@ -17,9 +17,9 @@ import psutil
 import pytest
 import xarray as xr
 from distributed import Client
+from zarr.storage import FsspecStore
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch import location as location_module
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.run import Progress
@@ -222,19 +222,19 @@ def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -
         store.read_fields([1, 3], place)
 
 
-def test_large_chunks_are_written_and_read_in_parts(server: Server, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(location_module, "_PART_BYTES", 1 << 20)
-    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 192})))
+def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 240})))
     store = Store.prepare(url, plan)
     place = plan.lattice.place(plan.blocks[0])
-    values = (
-        np.random.default_rng(0).standard_normal((*store.read_fields([], place).shape[1:], 2)).view(complex)[..., 0]
-    )
-    assert values.nbytes > 50 << 20
-    store.write_field(0, place, values)
+    values = np.arange(plan.lattice.half.size, dtype=complex).reshape(plan.lattice.shape)
+    assert values.nbytes > 100 << 20
     server.requests()
+    store.write_field(0, place, values)
+    assert sum("partNumber=" in path for _, path in server.requests()) > 1
     assert np.array_equal(store.read_fields([0], place)[0], values)
-    assert len(server.requests()) > 2
+    # Small keys are read without a look at their size, large ones in parts at once.
+    readers = [store.location.keys(size) for size in (1 << 20, 100 << 20)]
+    assert [reader.fs.max_concurrency > 1 for reader in readers if isinstance(reader, FsspecStore)] == [False, True]
 
 
 def test_places_that_hold_something_else(server: Server, url: str) -> None:
