@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
@@ -19,9 +20,11 @@ import xarray as xr
 from distributed import Client
 from zarr.storage import FsspecStore
 
-from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch import Lattice, StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
@@ -156,15 +159,25 @@ def test_meshes_added_to_a_study_join_its_store(s3_client: Client, url: str) -> 
     assert np.isfinite(variable(open_store(url), "norms", "norm").values).all()
 
 
-def test_another_lattice_leaves_nothing_of_the_first(server: Server, s3_client: Client, url: str) -> None:
+def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
     table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
     del table["lattice"]
-    run(Study.from_table(table), url, s3_client)
-    keys = len(server.keys(url.removeprefix(f"s3://{BUCKET}/")))
-    finer = Study.from_table({**table, "accuracy": {"rtol": 0.03}})
-    assert len(run(finer, url, s3_client).computed) == 5
-    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == keys
-    assert np.isfinite(variable(open_store(url), "fourier", "fourier").values).all()
+    plan = make_plan(Study.from_table(table))
+    store = Store.prepare(url, plan)
+    prefix = url.removeprefix(f"s3://{BUCKET}/")
+    empty = server.keys(prefix)
+    store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
+    store.write_record(1, Record("key", "complete"))
+    store.write_table("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
+    store.consolidate()
+    assert len(server.keys(prefix)) == len(empty) + 5
+    finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
+    again = Store.prepare(url, finer)
+    assert server.keys(prefix) == empty
+    assert again.records() == (None,) * 5
+    assert again.table_attributes("norms") is None
+    assert np.isnan(again.read_fields([1], finer.lattice.place(finer.blocks[0]))).all()
+    assert Store.open(url).labels() == store.labels()
 
 
 def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Path) -> None:
@@ -402,3 +415,15 @@ def listening() -> set[tuple[str, int]]:
     """The addresses at which this process takes connections."""
     found = psutil.Process().net_connections(kind="inet")
     return {(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
+    location, key = Location.of(url), url.removeprefix(f"s3://{BUCKET}/") + "/a/b"
+    assert not location.exists()
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"1")
+    assert location.exists()
+    assert location.read("a/b") == b"1"
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"2")
+    assert location.read("a/b") == b"2"
+    server.client().delete_object(Bucket=BUCKET, Key=key)
+    assert not location.exists()
