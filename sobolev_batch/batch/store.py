@@ -160,14 +160,15 @@ class Store:
 
     def write_record(self, row: int, record: Record) -> None:
         """Write the completion record of a row: one chunk, replaced as a whole."""
+        array = self._array(_RECORD)
         with self.location.access("written"):
-            self._array(_RECORD)[row] = record.to_json()
+            array[row] = record.to_json()
 
     def write_field(self, row: int, place: Place, values: NDArray[Any]) -> None:
         """Write one block of a row's field, which must be whole chunks."""
-        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        array = self._array(_FIELD)
         with self.location.access("written"):
-            self._array(_FIELD).with_config({"write_empty_chunks": True})[(row, *place)] = values
+            array[(row, *place)] = values
 
     def read_fields(self, rows: Sequence[int], place: Place) -> NDArray[Any]:
         """One block of several rows' fields, complex (len(rows), ...).
@@ -253,8 +254,9 @@ class Store:
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
         """Set the coordinate `quality` of all fields."""
+        array = self._array(_QUALITY)
         with self.location.access("written"):
-            self._array(_QUALITY)[:] = np.array(qualities, dtype=object)
+            array[:] = np.array(qualities, dtype=object)
 
     def write_table(self, group: str, dataset: xr.Dataset) -> None:
         """Replace a group of small arrays, each in one chunk; `consolidate` makes it known to readers."""
@@ -312,7 +314,10 @@ class Store:
             ) from error
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        return zarr.Array.from_dict(StorePath(self.keys(name), name), self._document(name))
+        place = StorePath(self.keys(name), name)
+        known = zarr.AsyncArray.from_dict(place, self._document(name))
+        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": True}))
 
     def _read_texts(self, name: str) -> tuple[str, ...]:
         array = self._array(name)
