@@ -135,7 +135,7 @@ def run(
                 crew = enlist(active)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
-                place.discard_pieces()
+                place.scratch.discard()
 
                 def note(progress: Progress) -> None:
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
@@ -243,11 +243,11 @@ def _compute_fields(
             _log.error("%s: %s", row.label, record.reason)
             store.write_record(i, record)
         if layouts[row.label].parts > 1:
-            store.discard_pieces(i)
+            store.scratch.discard(i)
         records[i] = record
         notify(Progress("fields", done, len(missing), row.label, record))
     if any(layout.parts > 1 for layout in layouts.values()):
-        store.discard_pieces()
+        store.scratch.discard()
 
 
 def _job(store: Store, plan: Plan, number: int, row: Row, memory: float) -> Job:
