@@ -33,6 +33,8 @@ _PLAIN_CYCLES = 16.0
 _FLATNESS = 1e-2
 # Triangles at a time: their temporaries stay in cache.
 _CHUNK = 1 << 13
+# Pairs of a triangle and a frequency that are worth a pass of their own.
+_PAIRS = 1 << 11
 
 
 def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
@@ -122,31 +124,63 @@ def _sums(corners: Corners, frequencies: Reals) -> Complexes:
     centroids = a + (ab + ac) / 3
     reach = float(np.abs(centroids).max()) + longest
     values = np.empty(len(frequencies), dtype=np.complex128)
-    for row, frequency in enumerate(frequencies):
-        first, second = (_dots(-2 * np.pi * frequency, edge) for edge in (ab, ac))
-        plain = reach * np.abs(frequency).sum() <= _PLAIN_CYCLES
-        widest = 2 * np.pi * float(np.linalg.norm(frequency)) * longest
-        if widest < _SERIES_REACH:
-            values[row] = _near(doubled, _phases(centroids, frequency, plain), first, second, widest)
-            continue
-        close = np.maximum(np.maximum(np.abs(first), np.abs(second)), np.abs(second - first)) < _SERIES_REACH
-        phases = _phases(centroids[:, close], frequency, plain)
-        values[row] = _near(doubled[close], phases, first[close], second[close], _SERIES_REACH)
-        apart = ~close
-        exponentials = [_joined(*cosine_and_sine(_phases(corner[:, apart], frequency, plain))) for corner in corners]
-        values[row] += np.sum(doubled[apart] * _quotient(exponentials, first[apart], second[apart]))
+    # Of few triangles, several frequencies at a time: calls of NumPy would take longer than their work.
+    step = max(1, _PAIRS // len(doubled))
+    for first in range(0, len(frequencies), step):
+        group = frequencies[first : first + step]
+        plain = reach * float(np.abs(group).sum(axis=1).max()) <= _PLAIN_CYCLES
+        widest = 2 * np.pi * float(np.linalg.norm(group, axis=1).max()) * longest
+        if len(group) == 1:
+            parts = _contributions(doubled, (centroids, a, b, c), (ab, ac), group[0], plain, widest)
+        else:
+            points, edges = (list(np.tile(rows, len(group))) for rows in ((centroids, a, b, c), (ab, ac)))
+            each = np.repeat(group.T, len(doubled), axis=1)
+            parts = _contributions(np.tile(doubled, len(group)), points, edges, each, plain, widest)
+        real, imaginary = (part.reshape(len(group), -1).sum(axis=1) for part in parts)
+        values[first : first + step] = _joined(real, imaginary)
     return values
 
 
-def _near(doubled: Reals, phases: Reals, ab: Reals, ac: Reals, widest: float) -> complex:
-    """The transform of triangles whose gaps are small, from the phases of their centroids."""
+def _contributions(
+    doubled: Reals, points: Sequence[Reals], edges: Sequence[Reals], frequency: Reals, plain: bool, widest: float
+) -> tuple[Reals, Reals]:
+    """Real and imaginary part of each triangle's transform, at one frequency (3,) or one of its own each (3, k).
+
+    Args:
+        doubled: areas, twice (k,).
+        points: centroids and the three corners, (3, k) each.
+        edges: from the first corner to the second and to the third, likewise.
+        frequency: ξ.
+        plain: whether phases are small enough for plain dot products.
+        widest: a bound on all gaps, in radians.
+    """
+    ab, ac = (_dots(-2 * np.pi * frequency, edge) for edge in edges)
+    if widest < _SERIES_REACH:
+        return _near(doubled, _phases(points[0], frequency, plain), ab, ac, widest)
+    real, imaginary = np.empty_like(doubled), np.empty_like(doubled)
+    close = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab)) < _SERIES_REACH
+    apart = ~close
+    near, far = (frequency if frequency.ndim == 1 else frequency[:, part] for part in (close, apart))
+    phases = _phases(points[0][:, close], near, plain)
+    real[close], imaginary[close] = _near(doubled[close], phases, ab[close], ac[close], _SERIES_REACH)
+    exponentials = [_joined(*cosine_and_sine(_phases(corner[:, apart], far, plain))) for corner in points[1:]]
+    quotients = doubled[apart] * _quotient(exponentials, ab[apart], ac[apart])
+    real[apart], imaginary[apart] = quotients.real, quotients.imag
+    return real, imaginary
+
+
+def _near(doubled: Reals, phases: Reals, ab: Reals, ac: Reals, widest: float) -> tuple[Reals, Reals]:
+    """The same for triangles whose gaps are small, from the phases of their centroids."""
     cosines, sines = (doubled * part for part in cosine_and_sine(phases))
     real, imaginary = _series(ab, ac, widest)
-    return complex(np.sum(cosines * real - sines * imaginary), np.sum(cosines * imaginary + sines * real))
+    return cosines * real - sines * imaginary, cosines * imaginary + sines * real
 
 
 def _dots(direction: Reals, points: Reals) -> Reals:
-    """Dot products of a vector with points (3, k): for so few numbers, threads of a BLAS only get in the way."""
+    """Dot products of one vector (3,), or as many (3, k), with points (3, k).
+
+    For so few numbers, threads of a BLAS only get in the way.
+    """
     return np.asarray(direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2])
 
 
