@@ -1,0 +1,138 @@
+"""Runs a study on workers that are jobs of SLURM or PBS.
+
+    export DASK_CONFIG=$HOME/jobqueue.yaml
+    python jobqueue.py STUDY --system slurm --jobs 4
+
+The scheduler is part of this process, on the node where it is started. docs/clusters.md tells the rest.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+import dask
+from dask_jobqueue import JobQueueCluster, PBSCluster, SLURMCluster
+from dask_jobqueue.local import LocalCluster
+from distributed import Adaptive, Client, Security
+
+from sobolev_batch import SobolevBatchError, Study, open_store, run
+from sobolev_batch.batch.run import Progress
+from sobolev_batch.results.tables import format_table
+
+# dask_jobqueue ends the process on Ctrl-C as if all had gone well.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+CLUSTERS: dict[str, type[JobQueueCluster]] = {"slurm": SLURMCluster, "pbs": PBSCluster, "local": LocalCluster}
+SOME_FAILED = 3  # the exit status of sobolev-batch
+
+
+class Replacing(Adaptive):
+    """Asks for a new job once the workers of one have left; dask-jobqueue notices jobs of one worker only."""
+
+    async def target(self) -> int:
+        """The number of workers that there should be, after jobs without workers are forgotten."""
+        cluster = self.cluster
+        for name, job in list(cluster.workers.items()):
+            names = {f"{name}{suffix}" for suffix in cluster.worker_spec.get(name, {}).get("group", [""])}
+            if names & cluster.observed:
+                job.had_workers = True
+            elif getattr(job, "had_workers", False):
+                del cluster.workers[name]
+                await job.close()
+        wanted: int = await super().target()
+        return wanted
+
+
+def setting(system: str, name: str) -> Any:
+    """A setting of Dask's configuration for a batch system."""
+    return dask.config.get(f"jobqueue.{system}.{name}", None)
+
+
+def check_settings(system: str) -> None:
+    """Refuse a configuration with which jobs cannot be asked for, or whose scheduler everybody could reach."""
+    for name in ("cores", "memory", "processes"):
+        if setting(system, name) is None:
+            raise click.ClickException(
+                f"jobqueue.{system}.{name} is not set: copy jobqueue.yaml, fill it in, and export DASK_CONFIG=its path"
+            )
+    if setting(system, "interface") is None and not {"host", "interface"} & set(setting(system, "scheduler-options")):
+        raise click.ClickException(
+            f"jobqueue.{system}.interface is not set, and the scheduler would listen on all: "
+            "name the network that the nodes share, such as ib0"
+        )
+
+
+def job_script(system: str) -> str:
+    """The script of one job, with names in place of what is known only when it is submitted."""
+    files = {"tls_ca_file": "CA_FILE", "tls_worker_cert": "CERTIFICATE_FILE", "tls_worker_key": "KEY_FILE"}
+    job = CLUSTERS[system].job_cls("tls://SCHEDULER:PORT", name="WORKER", protocol="tls://", security=Security(**files))
+    return str(job.job_script())
+
+
+@contextmanager
+def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueueCluster]:
+    """A cluster whose workers are jobs, cancelled at the end; encrypted, since other users share its network.
+
+    Args:
+        system: one of CLUSTERS.
+        jobs: how many there should be; jobs that end are replaced.
+        adaptive: have fewer jobs while there is little to do.
+    """
+    # Its certificates are files that the workers read, and that are removed at the end: of the folder in
+    # which the script was started, unless the configuration names another.
+    folder = setting(system, "shared-temp-directory") or str(Path.cwd())
+    options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
+    security = Security.temporary()
+    with CLUSTERS[system](security=security, shared_temp_directory=folder, scheduler_options=options) as cluster:
+        if not adaptive:
+            cluster.scale(jobs=jobs)
+        cluster.adapt(
+            Adaptive=Replacing, minimum_jobs=0 if adaptive else jobs, maximum_jobs=jobs, interval="2s", wait_count=30
+        )
+        yield cluster
+
+
+def show(progress: Progress) -> None:
+    """A line for each mesh, on standard error."""
+    if progress.record is not None:
+        outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
+        line = f"[{progress.done}/{progress.total}] {progress.label}: {progress.record.status}, {outcome}"
+        click.echo(line, err=True)
+
+
+@click.command()
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--system", type=click.Choice(list(CLUSTERS)), required=True)
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Jobs at a time.")
+@click.option("--adaptive", is_flag=True, help="Fewer jobs while there is little to do.")
+@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+@click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
+def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None, print_script: bool) -> None:
+    """Run STUDY on jobs of a batch system and print its table."""
+    check_settings(system)
+    if print_script:
+        click.echo(job_script(system))
+        return
+    try:
+        parsed = Study.from_toml(study)
+        place = store or Path("storage") / f"{parsed.name}.zarr"
+        with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
+            summary = run(parsed, place, client, on_progress=show)
+        click.echo(format_table(open_store(place)))
+    except SobolevBatchError as error:
+        raise click.ClickException(str(error)) from error
+    for label, reason in summary.failed.items():
+        click.echo(f"{label}: {reason}", err=True)
+    sys.exit(SOME_FAILED if summary.failed else 0)
+
+
+if __name__ == "__main__":
+    for ending in (signal.SIGTERM, signal.SIGHUP):  # jobs are cancelled then too
+        signal.signal(ending, lambda number, frame: sys.exit(128 + number))
+    main()
