@@ -8,10 +8,11 @@ The scheduler is part of this process, on the node where it is started. docs/clu
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import dask
 from dask_jobqueue import JobQueueCluster, PBSCluster, SLURMCluster
 from dask_jobqueue.local import LocalCluster
 from distributed import Adaptive, Client, Security
+from distributed.core import Status
 
 from sobolev_batch import SobolevBatchError, Study, open_store, run
 from sobolev_batch.batch.run import Progress
@@ -29,15 +31,22 @@ from sobolev_batch.results.tables import format_table
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CLUSTERS: dict[str, type[JobQueueCluster]] = {"slurm": SLURMCluster, "pbs": PBSCluster, "local": LocalCluster}
+INTERVAL_SECONDS = 30.0  # between looks at what jobs there are
 SOME_FAILED = 3  # the exit status of sobolev-batch
 
 
 class Replacing(Adaptive):
-    """Asks for a new job once the workers of one have left; dask-jobqueue notices jobs of one worker only."""
+    """Asks for a new job once the workers of one have left.
+
+    Left to itself dask-jobqueue notices this of jobs with one worker only, and takes a refused job for one that waits.
+    """
+
+    said = ""
 
     async def target(self) -> int:
         """The number of workers that there should be, after jobs without workers are forgotten."""
         cluster = self.cluster
+        forget_refused(cluster)
         for name, job in list(cluster.workers.items()):
             names = {f"{name}{suffix}" for suffix in cluster.worker_spec.get(name, {}).get("group", [""])}
             if names & cluster.observed:
@@ -48,19 +57,39 @@ class Replacing(Adaptive):
         wanted: int = await super().target()
         return wanted
 
+    async def adapt(self) -> None:
+        """Have as many jobs as there should be; what the batch system refuses is said once."""
+        try:
+            await super().adapt()
+        except RuntimeError as error:
+            if str(error) != self.said:
+                click.echo(f"no new job: {str(error).strip()}", err=True)
+            self.said = str(error)
+
+
+def forget_refused(cluster: JobQueueCluster) -> None:
+    """Drop the jobs that the batch system did not take: they are in the cluster's books all the same."""
+    for name, job in list(cluster.workers.items()):
+        if job.job_id is None:
+            job.status = Status.failed
+            del cluster.workers[name]
+
 
 def setting(system: str, name: str) -> Any:
     """A setting of Dask's configuration for a batch system."""
     return dask.config.get(f"jobqueue.{system}.{name}", None)
 
 
-def check_settings(system: str) -> None:
+def check_settings(system: str, printing: bool) -> None:
     """Refuse a configuration with which jobs cannot be asked for, or whose scheduler everybody could reach."""
     for name in ("cores", "memory", "processes"):
         if setting(system, name) is None:
             raise click.ClickException(
                 f"jobqueue.{system}.{name} is not set: copy jobqueue.yaml, fill it in, and export DASK_CONFIG=its path"
             )
+    command = CLUSTERS[system].job_cls.submit_command
+    if command is not None and not printing and shutil.which(command) is None:
+        raise click.ClickException(f"there is no {command} here: call this on a node from which jobs are submitted")
     if setting(system, "interface") is None and not {"host", "interface"} & set(setting(system, "scheduler-options")):
         raise click.ClickException(
             f"jobqueue.{system}.interface is not set, and the scheduler would listen on all: "
@@ -89,11 +118,25 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
     folder = setting(system, "shared-temp-directory") or str(Path.cwd())
     options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
     security = Security.temporary()
-    with CLUSTERS[system](security=security, shared_temp_directory=folder, scheduler_options=options) as cluster:
-        if not adaptive:
-            cluster.scale(jobs=jobs)
+    cluster = CLUSTERS[system](security=security, shared_temp_directory=folder, scheduler_options=options)
+
+    async def submit() -> None:
+        try:
+            await cluster
+        finally:
+            forget_refused(cluster)
+
+    with closing(cluster):
+        for _ in range(1 if adaptive else jobs):
+            # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
+            cluster.worker_spec.update(cluster.new_worker_spec())
+            cluster.sync(submit)
         cluster.adapt(
-            Adaptive=Replacing, minimum_jobs=0 if adaptive else jobs, maximum_jobs=jobs, interval="2s", wait_count=30
+            Adaptive=Replacing,
+            minimum_jobs=0 if adaptive else jobs,
+            maximum_jobs=jobs,
+            interval=INTERVAL_SECONDS,
+            wait_count=4,  # so often in a row must a job have had nothing to do before it goes
         )
         yield cluster
 
@@ -115,7 +158,7 @@ def show(progress: Progress) -> None:
 @click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
 def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None, print_script: bool) -> None:
     """Run STUDY on jobs of a batch system and print its table."""
-    check_settings(system)
+    check_settings(system, print_script)
     if print_script:
         click.echo(job_script(system))
         return
@@ -123,10 +166,11 @@ def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None
         parsed = Study.from_toml(study)
         place = store or Path("storage") / f"{parsed.name}.zarr"
         with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
+            click.echo("jobs are submitted; the study begins with the first that runs", err=True)
             summary = run(parsed, place, client, on_progress=show)
         click.echo(format_table(open_store(place)))
-    except SobolevBatchError as error:
-        raise click.ClickException(str(error)) from error
+    except (SobolevBatchError, RuntimeError) as error:  # the latter: what the batch system or Dask refuses
+        raise click.ClickException(str(error).strip()) from error
     for label, reason in summary.failed.items():
         click.echo(f"{label}: {reason}", err=True)
     sys.exit(SOME_FAILED if summary.failed else 0)
