@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -97,10 +99,20 @@ def check_settings(system: str, printing: bool) -> None:
         )
 
 
+def security_of(folder: Path) -> Security:
+    """Encryption with what make-certificates puts into a folder."""
+    files = {
+        f"tls_{role}_{part}": f"{folder}/{name}.pem"
+        for role in ("scheduler", "worker", "client")
+        for part, name in (("cert", "certificate"), ("key", "key"))
+    }
+    return Security(require_encryption=True, tls_ca_file=f"{folder}/ca.pem", **files)
+
+
 def job_script(system: str) -> str:
     """The script of one job, with names in place of what is known only when it is submitted."""
-    files = {"tls_ca_file": "CA_FILE", "tls_worker_cert": "CERTIFICATE_FILE", "tls_worker_key": "KEY_FILE"}
-    job = CLUSTERS[system].job_cls("tls://SCHEDULER:PORT", name="WORKER", protocol="tls://", security=Security(**files))
+    security = security_of(Path("CERTIFICATES"))
+    job = CLUSTERS[system].job_cls("tls://SCHEDULER:PORT", name="WORKER", protocol="tls://", security=security)
     return str(job.job_script())
 
 
@@ -113,32 +125,35 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
         jobs: how many there should be; jobs that end are replaced.
         adaptive: have fewer jobs while there is little to do.
     """
-    # Its certificates are files that the workers read, and that are removed at the end: of the folder in
-    # which the script was started, unless the configuration names another.
-    folder = setting(system, "shared-temp-directory") or str(Path.cwd())
     options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
-    security = Security.temporary()
-    cluster = CLUSTERS[system](security=security, shared_temp_directory=folder, scheduler_options=options)
+    # Certificates for this time alone, in a folder that all nodes see and nobody else can read: of the one in which
+    # this was started, unless the configuration names another.
+    with TemporaryDirectory(
+        prefix=".sobolev-batch-", dir=setting(system, "shared-temp-directory") or Path.cwd()
+    ) as work:
+        folder = Path(work, "certificates")
+        subprocess.run([Path(__file__).with_name("make-certificates"), folder], check=True, stdout=subprocess.DEVNULL)
+        cluster = CLUSTERS[system](security=security_of(folder), scheduler_options=options)
 
-    async def submit() -> None:
-        try:
-            await cluster
-        finally:
-            forget_refused(cluster)
+        async def submit() -> None:
+            try:
+                await cluster
+            finally:
+                forget_refused(cluster)
 
-    with closing(cluster):
-        for _ in range(1 if adaptive else jobs):
-            # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
-            cluster.worker_spec.update(cluster.new_worker_spec())
-            cluster.sync(submit)
-        cluster.adapt(
-            Adaptive=Replacing,
-            minimum_jobs=0 if adaptive else jobs,
-            maximum_jobs=jobs,
-            interval=INTERVAL_SECONDS,
-            wait_count=4,  # so often in a row must a job have had nothing to do before it goes
-        )
-        yield cluster
+        with closing(cluster):
+            for _ in range(1 if adaptive else jobs):
+                # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
+                cluster.worker_spec.update(cluster.new_worker_spec())
+                cluster.sync(submit)
+            cluster.adapt(
+                Adaptive=Replacing,
+                minimum_jobs=0 if adaptive else jobs,
+                maximum_jobs=jobs,
+                interval=INTERVAL_SECONDS,
+                wait_count=4,  # so often in a row must a job have had nothing to do before it goes
+            )
+            yield cluster
 
 
 def show(progress: Progress) -> None:
