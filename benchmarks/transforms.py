@@ -14,7 +14,7 @@ from benchmarks.paper import Complexes, faster_upsampling, relative_distance, wh
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.forecast import Goal, settle
-from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
 

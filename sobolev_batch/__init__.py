@@ -13,8 +13,10 @@ task; a reduction over what the tasks stored makes the tables. Data flows one wa
 
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.submission import Submission, submit
 from sobolev_batch.errors import (
     AccuracyError,
+    BackendError,
     ClusterError,
     InputError,
     LatticeError,
@@ -36,6 +38,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
     "AccuracyError",
+    "BackendError",
     "ClusterError",
     "InputError",
     "Lattice",
@@ -49,6 +52,7 @@ __all__ = [
     "StoreError",
     "Study",
     "StudyError",
+    "Submission",
     "Summary",
     "distance",
     "fourier_transform",
@@ -58,4 +62,5 @@ __all__ = [
     "open_store",
     "read_mesh",
     "run",
+    "submit",
 ]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -16,8 +18,10 @@ from sobolev_batch.batch.plan import Plan, make_plan
 from sobolev_batch.batch.run import Progress, Summary, run
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.submission import submit
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.norms import distance
@@ -26,6 +30,7 @@ from sobolev_batch.surfaces.similarity import Similarity
 
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 1, 2, 3, 130
 _DEFAULT_FOLDER = Path("storage")
+_FOLLOW_SECONDS = 5.0
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -56,13 +61,21 @@ def cli(context: click.Context, debug: bool) -> None:
 @click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
 @click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
+@click.option("--worker-memory", metavar="SIZE", help="Of each of them, such as 4GB. [default: an equal part]")
 @click.pass_context
 def run_command(
-    context: click.Context, study: Path, store: Path | None, scheduler: str | None, workers: int | None
+    context: click.Context,
+    study: Path,
+    store: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    worker_memory: str | None,
 ) -> None:
     """Compute what is missing of STUDY, reduce it, print the tables."""
-    if scheduler and workers:
-        raise click.UsageError("--workers is for a cluster on this machine; one with a scheduler has its own")
+    if scheduler and (workers or worker_memory):
+        raise click.UsageError(
+            "--workers and --worker-memory are for a cluster on this machine; one with a scheduler has its own"
+        )
     parsed = Study.from_toml(study)
     place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
     with _Reporter() as reporter:
@@ -70,11 +83,24 @@ def run_command(
             with remote_client(scheduler) as client:
                 summary = run(parsed, place, client, on_progress=reporter)
         else:
-            summary = run(parsed, place, workers=workers, on_progress=reporter)
+            summary = run(parsed, place, workers=workers, memory=worker_memory, on_progress=reporter)
     click.echo(format_table(open_store(place)))
     click.echo(_totals(summary))
     if summary.failed:
         context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("submit")
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--scheduler", metavar="ADDRESS", required=True, help="A Dask scheduler, such as tcp://host:8786.")
+@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+def submit_command(study: Path, scheduler: str, store: Path | None) -> None:
+    """Hand STUDY over to a cluster and return; it goes on without this process."""
+    parsed = Study.from_toml(study)
+    with remote_client(scheduler) as client:
+        submission = submit(parsed, store or _DEFAULT_FOLDER / f"{parsed.name}.zarr", client)
+    click.echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
+    click.echo(f"follow it by: sobolev-batch status {shlex.quote(submission.store)}")
 
 
 @cli.command("plan")
@@ -91,24 +117,20 @@ def plan_command(study: Path, store: Path | None) -> None:
 
 @cli.command("status")
 @click.argument("store", type=click.Path(path_type=Path))
+@click.option("--follow", is_flag=True, help="Show it again and again until the run has ended.")
 @click.pass_context
-def status_command(context: click.Context, store: Path) -> None:
+def status_command(context: click.Context, store: Path, follow: bool) -> None:
     """Show how far STORE is, and what failed and why."""
-    place = Store.open(store)
-    labels, records = place.labels(), place.records()
-    complete = sum(record is not None and record.status == "complete" for record in records)
-    failed = [
-        (label, record)
-        for label, record in zip(labels, records, strict=True)
-        if record is not None and record.status == "failed"
-    ]
-    click.echo(f"{store}: {complete} of {len(labels)} complete, {len(failed)} failed")
-    for label, record in failed:
-        click.echo(f"{label}: {record.reason}")
-    if place.read_table("convergence") is None:
-        click.echo("no tables yet: run the study to its end")
-    if failed:
+    status = Status.of(store)
+    while follow and status.going_on:
+        click.echo("\n".join(status.lines()) + "\n")
+        time.sleep(_FOLLOW_SECONDS)
+        status = Status.of(store)
+    click.echo("\n".join(status.lines()))
+    if status.failed:
         context.exit(EXIT_SOME_FAILED)
+    if status.lost or (status.run is not None and status.run.state == "failed"):
+        context.exit(EXIT_OTHER)
 
 
 @cli.command("table")

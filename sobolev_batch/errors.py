@@ -50,5 +50,9 @@ class StoreError(InputError):
     """A store cannot be read or written, or belongs to another study."""
 
 
+class BackendError(SobolevBatchError):
+    """A GPU was asked for and cannot be used: a library, the driver or the device is missing or fails."""
+
+
 class ClusterError(SobolevBatchError):
     """The Dask cluster cannot be reached or stopped serving."""

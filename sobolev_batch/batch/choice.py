@@ -18,7 +18,7 @@ from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy, lattice_of
 from sobolev_batch.spectral.budget import Assessed, support_widths
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.pursuit import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.quality import Quality

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import dask
+from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
 from sobolev_batch.batch.connection import check_connection
@@ -20,12 +21,20 @@ _LARGEST_KEPT_BYTES = 32 << 20
 
 
 @contextmanager
-def local_client(workers: int | None = None) -> Iterator[Client]:
+def local_client(workers: int | None = None, memory: str | None = None) -> Iterator[Client]:
     """A client of a new cluster of single-threaded worker processes, reachable from this machine only.
 
     Args:
         workers: how many; default one per core that this process may use.
+        memory: of each, such as "4GB"; default an equal part of the machine's.
+
+    Raises:
+        ClusterError: the memory is not a number of bytes.
     """
+    try:
+        limit = "auto" if memory is None else parse_bytes(memory)
+    except ValueError as error:
+        raise ClusterError(f"memory must be a number of bytes such as 4GB or 512MiB, found {memory!r}") from error
     count = workers or available_cores()
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
@@ -41,6 +50,7 @@ def local_client(workers: int | None = None) -> Iterator[Client]:
         LocalCluster(
             n_workers=count,
             threads_per_worker=1,
+            memory_limit=limit,
             processes=True,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import calendar
 import json
+import time
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, Self
 
 from sobolev_batch.errors import StoreError
 
+# Seconds are enough for people; ISO 8601.
+_TIME = "%Y-%m-%dT%H:%M:%SZ"
+
 Status = Literal["complete", "failed"]
+RunState = Literal["submitted", "running", "done", "failed"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,7 @@ class Record:
         seconds: time spent in its tasks.
         worker: address of the worker that finished it.
         backend: what computed the transform.
+        finished: when, in UTC.
     """
 
     key: str
@@ -60,6 +67,7 @@ class Record:
     seconds: float = 0.0
     worker: str = ""
     backend: str = ""
+    finished: str = ""
 
     def to_json(self) -> str:
         """The record as one line of JSON."""
@@ -83,3 +91,52 @@ class Record:
     def completes(self, key: str) -> bool:
         """Whether a field with this key need not be computed."""
         return self.status == "complete" and bool(key) and self.key == key
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """The latest run of a study, as far as its store knows.
+
+    Attributes:
+        state: "submitted" until a worker takes it up, "running", "done" or "failed".
+        driver: what drives it: the process and its host, and the cluster it computes on.
+        started: when, in UTC.
+        seen: the latest sign of life of its driver, in UTC.
+        stage: what it is doing.
+        error: why it failed; empty otherwise.
+    """
+
+    state: RunState
+    driver: str
+    started: str
+    seen: str
+    stage: str = ""
+    error: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self | None:
+        """The record that a line holds, or None where nothing was written.
+
+        Raises:
+            StoreError: the line is not a record.
+        """
+        if not text:
+            return None
+        try:
+            return cls(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise StoreError(f"the record of the latest run is damaged ({error}): {text[:80]!r}") from error
+
+
+def utc_now() -> str:
+    """The time, in UTC."""
+    return time.strftime(_TIME, time.gmtime())
+
+
+def age_seconds(moment: str) -> float:
+    """The time since a moment that `utc_now` has told, in seconds."""
+    return time.time() - calendar.timegm(time.strptime(moment, _TIME))

@@ -17,15 +17,22 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.journal import Journal
+from sobolev_batch.batch.layout import Layout, lay_out
 from sobolev_batch.batch.plan import Plan, Row, make_plan
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
-from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
+from sobolev_batch.batch.submitter import Submitter
+from sobolev_batch.batch.tasks import Job
+from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.surfaces.sources import Size
 
 _log = logging.getLogger(__name__)
 
@@ -81,6 +88,7 @@ def run(
     client: Client | None = None,
     *,
     workers: int | None = None,
+    memory: str | None = None,
     on_progress: Notify | None = None,
 ) -> Summary:
     """Compute what a store lacks of a study, then its norms, distances and convergence tables.
@@ -93,6 +101,7 @@ def run(
             main part by ``if __name__ == "__main__"``, as all that starts processes must. Where
             nothing is missing, none is started.
         workers: of the cluster on this machine; default one per core.
+        memory: of each of them, such as "4GB"; default an equal part of the machine's.
         on_progress: called in this thread at each step.
 
     Returns:
@@ -102,28 +111,40 @@ def run(
         StudyError, MeshError, LatticeError: the study cannot be carried out.
         AccuracyError: the accuracy that the study asks for is out of reach; nothing was computed.
         StoreError: the store cannot be written or belongs to another study.
+        ClusterError: no worker has the GPU that the study asks for, or memory enough for its lattice.
     """
     plan = make_plan(study, stored_choice(store))
     place = Store.prepare(store, plan)
     rows = rows_of(place, plan)
     records = place.records()
     notify = on_progress or (lambda progress: None)
-    missing = _missing(place, rows)
-    if missing or not _is_reduced(place, plan, rows, records):
-        with nullcontext(client) if client is not None else local_client(workers) as active:
-            notify(Progress("cluster", 0, 0, active.dashboard_link))
-            _compute_fields(active, place, plan, rows, missing, notify)
-            found = _reduce(active, place, plan, rows, notify)
-            for _ in range(_MOST_ROUNDS - 1):
-                choice = _grown(plan, found)
-                if choice is None:
-                    break
-                plan = plan.on(choice)
-                place = Store.prepare(store, plan)
-                rows = rows_of(place, plan)
-                missing = _missing(place, rows)
-                _compute_fields(active, place, plan, rows, missing, notify)
-                found = _reduce(active, place, plan, rows, notify)
+    missing = rows_without_field(place, rows)
+    with Journal(place) as journal:
+        if missing or not _is_reduced(place, plan, rows, records):
+            with nullcontext(client) if client is not None else local_client(workers, memory) as active:
+                journal.cluster = active.scheduler.address
+                notify(Progress("cluster", 0, 0, active.dashboard_link))
+                crew = enlist(active)
+                # Asked before anything is computed: a GPU that nobody has would be waited for.
+                crew.with_backend(study.backend)
+                place.discard_pieces()
+
+                def note(progress: Progress) -> None:
+                    journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
+                    notify(progress)
+
+                _compute_fields(active, crew, place, plan, rows, missing, note)
+                found = _reduce(active, crew, place, plan, rows, note)
+                for _ in range(_MOST_ROUNDS - 1):
+                    choice = _grown(plan, found)
+                    if choice is None:
+                        break
+                    plan = plan.on(choice)
+                    place = Store.prepare(store, plan)
+                    rows = rows_of(place, plan)
+                    missing = rows_without_field(place, rows)
+                    _compute_fields(active, crew, place, plan, rows, missing, note)
+                    found = _reduce(active, crew, place, plan, rows, note)
     records = place.records()
     failed = {
         row.label: record.reason if record else "not computed"
@@ -139,8 +160,8 @@ def run(
     )
 
 
-def _missing(store: Store, rows: Sequence[Row]) -> list[int]:
-    """The rows whose fields are not there."""
+def rows_without_field(store: Store, rows: Sequence[Row]) -> list[int]:
+    """The rows whose fields are to be computed."""
     records = store.records()
     return [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
 
@@ -162,6 +183,7 @@ def rows_of(store: Store, plan: Plan) -> tuple[Row, ...]:
 
 def _compute_fields(
     client: Client,
+    crew: Crew,
     store: Store,
     plan: Plan,
     rows: Sequence[Row],
@@ -169,8 +191,23 @@ def _compute_fields(
     notify: Notify,
 ) -> None:
     notify(Progress("fields", 0, len(missing)))
-    futures: dict[Future, int] = {}
+    equipped = crew.with_backend(plan.study.backend)
+    # A lattice that fits into no worker concerns all rows; a mesh that does not, only its own.
+    lay_out(plan.blocks, plan.transform, Size(), equipped, len(missing))
+    layouts: dict[int, Layout] = {}
+    done = 0
     for i in missing:
+        try:
+            size = rows[i].member.expected_size()
+            layouts[i] = lay_out(plan.blocks, plan.transform, size, equipped, len(missing))
+        except ClusterError as error:
+            done += 1
+            record = Record(key=rows[i].key, status="failed", reason=f"the mesh is too large: {error}")
+            store.write_record(i, record)
+            notify(Progress("fields", done, len(missing), rows[i].label, record))
+    submitter = Submitter.of(client, equipped, plan.study.backend, layouts.values())
+    futures: dict[Future, int] = {}
+    for i, layout in layouts.items():
         row = rows[i]
         job = Job(
             store,
@@ -183,31 +220,31 @@ def _compute_fields(
             plan.transform,
             plan.study.orders,
             plan.aim(row),
+            layout.transform_bytes,
+            plan.study.backend,
         )
-        futures[_submit(client, job, plan)] = i
-    for done, future in enumerate(as_completed(list(futures)), 1):
+        futures[submitter.field(job, layout)] = i
+    for future in as_completed(list(futures)):
+        done += 1
         i = futures.pop(future)
         row = rows[i]
         if future.status == "error":
             # The task itself reports bad meshes; what arrives here is a worker that died or a store
             # that cannot be written any more.
-            error = future.exception()
-            record = Record(key=row.key, status="failed", reason=f"{type(error).__name__}: {error}")
+            failure = future.exception()
+            record = Record(key=row.key, status="failed", reason=f"{type(failure).__name__}: {failure}")
             _log.error("%s: %s", row.label, record.reason)
             store.write_record(i, record)
         else:
             record = future.result()
+        if layouts[i].parts > 1:
+            store.discard_pieces(i)
         notify(Progress("fields", done, len(missing), row.label, record))
 
 
-def _submit(client: Client, job: Job, plan: Plan) -> Future:
-    if len(plan.blocks) == 1:
-        return client.submit(compute_mesh, job, plan.blocks, pure=False)
-    parts = [client.submit(compute_blocks, job, [block], pure=False) for block in plan.blocks]
-    return client.submit(finish_mesh, job, parts, pure=False)
-
-
-def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify) -> Assessed | None:
+def _reduce(
+    client: Client, crew: Crew, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify
+) -> Assessed | None:
     """Make the tables; the distances to the reference, or None where the tables were there."""
     records = store.records()
     if _is_reduced(store, plan, rows, records):
@@ -222,12 +259,11 @@ def _reduce(client: Client, store: Store, plan: Plan, rows: Sequence[Row], notif
     others = range(len(rows)) if every_pair else [reference]
     distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
 
-    workers = sum(client.nthreads().values())
     jobs: dict[Future, tuple[Sequence[int], Sequence[int] | None]] = {
-        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in reducer.strips(complete, workers)
+        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in reducer.strips(complete, crew.threads)
     }
     if every_pair:
-        for tile, others_of_tile in reducer.tiles(complete, workers):
+        for tile, others_of_tile in reducer.tiles(complete, crew.threads):
             jobs[client.submit(reducer.tile, tile, others_of_tile, pure=False)] = (tile, others_of_tile)
     notify(Progress("reduction", 0, len(jobs)))
     for done, future in enumerate(as_completed(list(jobs)), 1):

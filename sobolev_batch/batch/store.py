@@ -22,9 +22,10 @@ from zarr.codecs import Crc32cCodec
 
 from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.plan import Plan
-from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.records import Record, RunRecord
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
+from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity
 
 SCHEMA_VERSION = 2
@@ -34,6 +35,9 @@ Place = tuple[slice, slice, slice]
 _FIELD = "fourier/fourier"
 _QUALITY = "fourier/quality"
 _RECORD = "records/record"
+_RUN = "records/run"
+_SCRATCH = "scratch"
+_PIECE_ARRAYS = ("vertices", "triangles")
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
@@ -132,6 +136,63 @@ class Store:
                     "remove the store's record of it and run the study again"
                 ) from error
         return values
+
+    def write_piece(self, row: int, number: int, mesh: Mesh) -> None:
+        """Keep a piece of a row's mesh in the scratch space, until `discard_pieces`."""
+        root = self._writable_root()
+        for name in _PIECE_ARRAYS:
+            values = getattr(mesh, name)
+            root.create_array(
+                _piece(row, number, name),
+                data=values,
+                chunks=values.shape,
+                compressors=(Crc32cCodec(),),
+                overwrite=True,
+            )
+
+    def read_piece(self, row: int, number: int) -> Mesh:
+        """A piece that was written.
+
+        Raises:
+            StoreError: it is not there, or damaged.
+        """
+        try:
+            vertices, triangles = (
+                np.asarray(zarr.open_array(self.path, path=_piece(row, number, name), mode="r")[:])
+                for name in _PIECE_ARRAYS
+            )
+        except (OSError, ValueError, KeyError) as error:
+            raise StoreError(
+                f"{self.path}: piece {number} of the mesh of {self.labels()[row]} cannot be read ({error}); "
+                "run the study again"
+            ) from error
+        return Mesh.of_checked(vertices, triangles)
+
+    def discard_pieces(self, row: int | None = None) -> None:
+        """Remove the pieces of a row, or of all."""
+        root = self._writable_root()
+        path = _SCRATCH if row is None else f"{_SCRATCH}/{row}"
+        if path in root:
+            del root[path]
+
+    def read_run(self) -> RunRecord | None:
+        """The record of the latest run, or None where none was ever begun."""
+        try:
+            lines = np.asarray(zarr.open_array(self.path, path=_RUN, mode="r")[:]).tolist()
+        except FileNotFoundError:  # a store that was made before runs were recorded
+            return None
+        return RunRecord.from_json(str(lines[0]))
+
+    def write_run(self, record: RunRecord) -> None:
+        """Replace the record of the latest run."""
+        root = self._writable_root()
+        if _RUN not in root:
+            root.create_array(_RUN, shape=(1,), dtype=str, chunks=(1,), fill_value="", dimension_names=("run",))
+        zarr.open_array(self.path, path=_RUN, mode="r+")[:] = np.array([record.to_json()], dtype=object)
+
+    def _writable_root(self) -> zarr.Group:
+        # Consolidated metadata knows nothing of what was added after it.
+        return zarr.open_group(self.path, mode="r+", use_consolidated=False)
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
         """Set the coordinate `quality` of all fields."""
@@ -289,6 +350,10 @@ class Store:
                 "versions": {name: version(name) for name in _RECORDED_VERSIONS},
             }
         )
+
+
+def _piece(row: int, number: int, name: str) -> str:
+    return f"{_SCRATCH}/{row}/{number}/{name}"
 
 
 def stored_choice(path: str | Path) -> Choice | None:

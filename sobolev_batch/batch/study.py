@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
@@ -22,6 +22,9 @@ from sobolev_batch.surfaces.similarity import Similarity
 from sobolev_batch.surfaces.sources import Source, parse_source
 
 REFERENCE_LABEL = "reference"
+
+# "auto" leaves it to each worker.
+Backends = Literal["auto", "cpu", "gpu"]
 
 # One line of printable text. Names become labels in the store and never paths or keys.
 Name = Annotated[
@@ -70,6 +73,7 @@ class Study:
         accuracy: of the distances to the reference; None where the lattice is given.
         transform: accuracy, precision and quadrature.
         dtype: the precision that was asked for, if any.
+        backend: what computes the transforms; "auto" leaves it to each worker.
         orders: the Sobolev orders s < -1/2.
         pairs: "all" for the distance of every mesh to every other, "reference" for those to the
             reference alone.
@@ -86,6 +90,7 @@ class Study:
     accuracy: Accuracy | None
     transform: Transform
     dtype: Precision | None
+    backend: Backends
     orders: tuple[float, ...]
     pairs: Literal["all", "reference"]
     families: tuple[Family, ...]
@@ -145,6 +150,7 @@ class Study:
                 accuracy=None if document.accuracy is None else document.accuracy.settings(),
                 transform=document.transform.settings(),
                 dtype=document.transform.dtype,
+                backend=document.transform.backend,
                 orders=_distinct(check_orders(document.norm.orders)),
                 pairs=document.norm.pairs,
                 families=families,
@@ -193,6 +199,7 @@ class _TransformSection(_Section):
     eps: Number | None = None
     dtype: Precision | None = None
     quadrature: str | int = "auto"
+    backend: Backends = "auto"
 
     def settings(self) -> Transform:
         return Transform(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))

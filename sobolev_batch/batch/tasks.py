@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 
 from distributed import get_worker
 
-from sobolev_batch.batch.records import Facts, Record
+from sobolev_batch.batch.equipment import backend_of
+from sobolev_batch.batch.records import Facts, Record, utc_now
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study import Backends
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.forecast import settle
@@ -33,7 +35,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that the field of one row depends on, and where it goes."""
+    """Everything that the field of one row depends on, where it goes, and what it may use.
+
+    Attributes:
+        store, row: where it goes.
+        label: of the row, for people.
+        key: of the row.
+        member, similarity: the surface.
+        lattice, transform, orders, aim: the field; see `Plan`.
+        memory: what one transform may take besides its mesh and its block, in bytes.
+        backend: "auto", "cpu" or "gpu".
+    """
 
     store: Store
     row: int
@@ -45,6 +57,8 @@ class Job:
     transform: Transform
     orders: tuple[float, ...]
     aim: Aim | None = None
+    memory: float | None = None
+    backend: Backends = "auto"
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,7 @@ class Part:
     seconds: float
     error: str = ""
     quality: Quality | None = None
+    backends: tuple[str, ...] = ()
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
@@ -71,39 +86,51 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     started = time.perf_counter()
     try:
         surface = job.similarity.apply(job.member.load())
-        quality, points = _compute(job, surface, blocks)
-    except LatticeError as error:
-        advice = "" if job.aim is None else "; it was chosen for surfaces that reach less far: name another store"
-        return Part(Facts(), time.perf_counter() - started, f"{error}{advice}")
-    except InputError as error:
-        return Part(Facts(), time.perf_counter() - started, str(error))
+        quality, points, backends = _compute(job, surface, blocks)
+        facts = facts_of(surface, points)
     except Exception as error:
-        _log.exception("%s failed for a reason that is not its mesh's", job.label)
-        reason = " ".join(str(error).split()) or type(error).__name__
-        return Part(Facts(), time.perf_counter() - started, reason)
-    return Part(_facts(surface, points), time.perf_counter() - started, quality=quality)
+        return Part(Facts(), time.perf_counter() - started, reason_of(job, error))
+    return Part(facts, time.perf_counter() - started, quality=quality, backends=backends)
 
 
-def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quality, int]:
-    """Compute and store some blocks; what is known of their errors, and the points they were made from."""
-    goal = job.aim.goal(surface) if job.aim is not None and isinstance(surface, Mesh) else None
+def reason_of(job: Job, error: Exception) -> str:
+    """Why a mesh failed, in one line; what is not the fault of its input is logged with its traceback."""
+    if isinstance(error, LatticeError):
+        advice = "" if job.aim is None else "; it was chosen for surfaces that reach less far: name another store"
+        return f"{error}{advice}"
+    if isinstance(error, InputError):
+        return str(error)
+    _log.error("%s failed for a reason that is not its mesh's", job.label, exc_info=error)
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def settings_of(job: Job, surface: Surface) -> Transform:
+    """The settings of a field that is computed block by block: as forecast, not measured and mended."""
+    if job.aim is None or not isinstance(surface, Mesh):
+        return job.transform
+    return settle(surface, job.lattice, job.aim.goal(surface), job.transform)
+
+
+def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quality, int, tuple[str, ...]]:
+    """Compute and store some blocks; what is known of their errors, of how many points, by what."""
+    backend = backend_of(job.backend)
     if tuple(blocks) == (job.lattice.half,):
-        if goal is not None:
-            field = field_for(surface, job.lattice, goal, job.transform)
+        if job.aim is not None and isinstance(surface, Mesh):
+            goal = job.aim.goal(surface)
+            field = field_for(surface, job.lattice, goal, job.transform, backend=backend, memory=job.memory)
         else:
-            field = compute_field(surface, job.lattice, job.transform, job.orders)
+            field = compute_field(surface, job.lattice, job.transform, job.orders, backend=backend, memory=job.memory)
         job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
-        return field.quality, field.points
-    settings = job.transform
-    if goal is not None and isinstance(surface, Mesh):
-        settings = settle(surface, job.lattice, goal, settings)
-    probes, points = [], 0
+        return field.quality, field.points, (field.backend,)
+    settings = settings_of(job, surface)
+    probes, backends, points = [], [], 0
     for block in blocks:
-        made = transform_block(surface, job.lattice, block, settings, threads=1)
+        made = transform_block(surface, job.lattice, block, settings, backend=backend, memory=job.memory)
         job.store.write_field(job.row, job.lattice.place(block), made.values)
         probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values))
+        backends.append(made.backend)
         points = made.points
-    return Quality.of_surface(surface, join(probes)), points
+    return Quality.of_surface(surface, join(probes)), points, tuple(backends)
 
 
 def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
@@ -118,7 +145,8 @@ def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
         quality="" if errors else _whole(qualities).to_json(),
         seconds=sum(part.seconds for part in parts),
         worker=_worker_address(),
-        backend="finufft",
+        backend=", ".join(dict.fromkeys(backend for part in parts for backend in part.backends)),
+        finished=utc_now(),
     )
     job.store.write_record(job.row, record)
     _log.info("%s: %s in %.2f s by %s", job.label, record.status, record.seconds, record.backend)
@@ -129,16 +157,17 @@ def _whole(qualities: Sequence[Quality]) -> Quality:
     return replace(qualities[0], probe=join([quality.probe for quality in qualities]))
 
 
-def _facts(surface: Surface, points: int) -> Facts:
+def facts_of(surface: Surface, points: int) -> Facts:
+    """What is recorded of a surface and its points."""
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area)
-    lengths, counts = surface.edge_lengths, surface.counts
+    (mean_length, longest), counts = surface.edge_length_range, surface.counts
     return Facts(
         vertices=len(surface.vertices),
         triangles=len(surface.triangles),
         area=surface.area,
-        edge_length_mean=float(lengths.mean()),
-        edge_length_max=float(lengths.max()),
+        edge_length_mean=mean_length,
+        edge_length_max=longest,
         zero_area_triangles=counts.zero_area,
         duplicate_triangles=counts.duplicate,
         boundary_edges=counts.boundary_edges,

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.spectral.backends import CPU, Backend
 from sobolev_batch.spectral.forecast import Goal, settle
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.nufft import Complexes, Precision
+from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.probe import measure
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.quality import Quality
@@ -37,12 +38,14 @@ class Field:
         quality: what is known of its error.
         settings: that it was computed with.
         points: of the quadrature.
+        backend: see `Transformed`.
     """
 
     values: Complexes
     quality: Quality
     settings: Transform
     points: int
+    backend: str = CPU.library
 
 
 def fourier_transform(
@@ -99,7 +102,9 @@ def compute_field(
     *,
     sample: Sample | None = None,
     extent: Quality | None = None,
+    backend: Backend = CPU,
     threads: int = 1,
+    memory: float | None = None,
 ) -> Field:
     """The field of a surface with given settings, and its probe.
 
@@ -110,20 +115,23 @@ def compute_field(
         orders: that it is probed for.
         sample: of the surface, drawn for these orders and `USUAL_DEGREE`, where there is one.
         extent: the surface's quality but for its probe, where it is known.
+        backend: where to compute the transform; the probe's exact side stays on the processor.
         threads: to compute with.
+        memory: see `transform_block`.
 
     Raises:
         LatticeError: a mesh reaches beyond the lattice's half period.
+        InputError: the memory is too little.
     """
     block = lattice.half
-    made = transform_block(surface, lattice, block, settings, threads=threads)
+    made = transform_block(surface, lattice, block, settings, backend=backend, threads=threads, memory=memory)
     probed = needs_probe(surface, settings)
     if probed and sample is not None and settings.lowest_degree(surface, lattice) <= USUAL_DEGREE:
         probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
     else:
         probe = probe_block(surface, lattice, settings, orders, block, made.values)
     quality = Quality.of_surface(surface, probe) if extent is None else replace(extent, probe=probe)
-    return Field(made.values, quality, settings, made.points)
+    return Field(made.values, quality, settings, made.points, made.backend)
 
 
 def field_for(
@@ -134,7 +142,9 @@ def field_for(
     *,
     sample: Sample | None = None,
     extent: Quality | None = None,
+    backend: Backend = CPU,
     threads: int = 1,
+    memory: float | None = None,
 ) -> Field:
     """The field of a surface with an error that keeps a goal, as far as its probe can tell.
 
@@ -145,7 +155,9 @@ def field_for(
         transform: whose precision and quadrature are kept.
         sample: see `compute_field`.
         extent: likewise.
+        backend: likewise.
         threads: to compute with.
+        memory: see `transform_block`.
 
     Returns:
         The first of a few attempts that keeps the goal, or the last.
@@ -154,7 +166,17 @@ def field_for(
         return compute_field(surface, lattice, transform, goal.orders, sample=sample, extent=extent)
     for _ in range(_ATTEMPTS):
         settings = settle(surface, lattice, goal, transform)
-        field = compute_field(surface, lattice, settings, goal.orders, sample=sample, extent=extent, threads=threads)
+        field = compute_field(
+            surface,
+            lattice,
+            settings,
+            goal.orders,
+            sample=sample,
+            extent=extent,
+            backend=backend,
+            threads=threads,
+            memory=memory,
+        )
         excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
         if excess <= 1:
             break

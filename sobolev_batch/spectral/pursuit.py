@@ -14,7 +14,7 @@ from sobolev_batch.spectral.budget import AXIS_DIRECTIONS, Assessed, Sums, asses
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.forecast import Goal, permits_single
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.nufft import Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, draws_for, estimate

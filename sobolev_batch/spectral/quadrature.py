@@ -95,6 +95,12 @@ class Quadrature:
         """The lowest degree among the rules that triangles get: the one whose error shows first."""
         return min(group.rule.degree for group in self._groups(mesh, highest_frequency, tolerance))
 
+    def sizes(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> tuple[float, int]:
+        """The expected number of points of a mesh, and a bound that holds before shared ones are merged."""
+        groups = self._groups(mesh, highest_frequency, tolerance)
+        expected = sum((group.most_points / (1 if group.splits else group.rule.sharing) for group in groups), 0.0)
+        return expected, sum(group.most_points for group in groups)
+
     def _groups(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> list[_Group]:
         everything = np.arange(len(mesh.triangles))
         if self.method == "gauss8":

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.nufft import Complexes
+from sobolev_batch.spectral.precision import Complexes
 from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform

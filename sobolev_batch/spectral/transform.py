@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
 
 from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral.backends import CPU, Backend
+from sobolev_batch.spectral.division import Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.nufft import LARGEST_OVERSAMPLING, Complexes, Precision, transform_points
-from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
+from sobolev_batch.spectral.nufft import transform_points
+from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
+from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.spheres import sphere_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
@@ -29,6 +31,8 @@ DEFAULT_BATCH = 1 << 21
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
 FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
+# Samples of a closed form at a time.
+_SLAB = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -82,15 +86,17 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A block of a field, and from how many points it was made.
+    """A block of a field, and from what it was made.
 
     Attributes:
         values: complex (block.shape).
         points: of the quadrature; 0 for a closed form.
+        backend: the library that computed it; also which one failed before, and why.
     """
 
     values: Complexes
     points: int
+    backend: str = CPU.library
 
 
 def transform_block(
@@ -99,43 +105,96 @@ def transform_block(
     block: Block,
     settings: Transform,
     *,
+    backend: Backend = CPU,
     threads: int = 1,
     batch: int = DEFAULT_BATCH,
+    memory: float | None = None,
 ) -> Transformed:
     """The transform of a surface on one block of the lattice.
 
-    Memory is that of the block (about twelve times its bytes), of the mesh, and of one batch of
-    points: it does not grow with the number of points.
+    Args:
+        surface: what to transform.
+        lattice: where.
+        block: which part of it.
+        settings: how.
+        backend: where to compute.
+        threads: of FINUFFT.
+        batch: the largest number of points of one NUFFT.
+        memory: what this may take besides the mesh and the result, in bytes. What does not fit is
+            computed in smaller batches, in parts of the block and with less oversampling, whichever is
+            predicted to be the fastest; that changes the values by a small multiple of eps. Without
+            it, a transform takes what `memory_bytes` says, however many points there are.
 
     Raises:
         LatticeError: a mesh reaches beyond the lattice's half period.
+        InputError: the memory is too little for any way of computing it.
     """
     if isinstance(surface, Sphere):
-        return Transformed(sphere_block(surface, lattice, block).astype(settings.precision, copy=False), 0)
+        return Transformed(_closed_form(surface, lattice, block, settings.precision), 0)
     require_inside(surface, lattice)
-    points = 0
-
-    def counted() -> Iterator[WeightedPoints]:
-        nonlocal points
-        batches = settings.quadrature.batches(surface, lattice.highest_frequency, settings.rule_tolerance, batch)
-        for part in batches:
-            points += len(part.weights)
-            yield part
-
-    values = transform_points(
-        counted(), lattice, block, eps=settings.accuracy, precision=settings.precision, threads=threads
+    division = Division(batch)
+    if memory is not None:
+        load = _load(surface, lattice, settings)
+        eps, precision = settings.accuracy, settings.precision
+        division = divide(block.shape, eps, precision, load, CPU.costs, memory=memory, batch=batch)
+    values, points = transform_points(
+        settings.quadrature.batches(surface, lattice.highest_frequency, settings.rule_tolerance, division.batch),
+        lattice,
+        block,
+        eps=settings.accuracy,
+        precision=settings.precision,
+        threads=threads,
+        shape=division.shape,
+        oversampling=division.oversampling,
     )
     return Transformed(values, points)
 
 
-def memory_bytes(block: Block, settings: Transform, batch: int = DEFAULT_BATCH) -> int:
-    """Peak memory of `transform_block`, without the mesh itself, as an upper estimate.
+def memory_bytes(
+    block: Block,
+    settings: Transform,
+    batch: int = DEFAULT_BATCH,
+    *,
+    memory: float | None = None,
+    triangles: int = 0,
+) -> int:
+    """Peak memory of `transform_block`, its result included and the mesh itself not, as an upper estimate.
 
-    The oversampled grid, the block and its sum, and a batch's coordinates, angles, strengths,
-    phases and sorting.
+    The oversampled grid and its copy where the surface is, the block and its sum, a batch's coordinates,
+    angles, strengths, phases and sorting.
+
+    Args:
+        block: see `transform_block`.
+        settings: likewise.
+        batch: likewise.
+        memory: likewise.
+        triangles: of the mesh; each takes some bytes while its rule is chosen.
     """
-    item = 16 if settings.precision == "complex128" else 8
-    return int(block.size * item * (LARGEST_OVERSAMPLING**3 * 1.3 + 2)) + batch * 140
+    load = Load(math.inf, triangles=triangles)
+    needed: float = transform_bytes(
+        block.shape, settings.accuracy, settings.precision, load, Division(batch), CPU.costs
+    )
+    if memory is not None:
+        needed = min(needed, memory)
+    return block.size * item_bytes(settings.precision) + math.ceil(needed)
+
+
+def _load(mesh: Mesh, lattice: Lattice, settings: Transform) -> Load:
+    """What transforming a mesh has to deal with."""
+    points, most = settings.quadrature.sizes(mesh, lattice.highest_frequency, settings.rule_tolerance)
+    low, high = mesh.bounds
+    return Load(points, most, len(mesh.triangles), float(np.prod((high - low) / (2 * lattice.half_period))))
+
+
+def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, precision: Precision) -> Complexes:
+    """The transform of a sphere, slab by slab: whole temporaries would take several times the block."""
+    values: Complexes = np.empty(block.shape, dtype=precision)
+    step = max(1, _SLAB // math.prod(block.shape[1:]))
+    for first in range(0, block.shape[0], step):
+        count = min(step, block.shape[0] - first)
+        slab = Block((block.start[0] + first, *block.start[1:]), (count, *block.shape[1:]))
+        values[first : first + count] = sphere_block(sphere, lattice, slab)
+    return values
 
 
 def require_inside(mesh: Mesh, lattice: Lattice) -> None:

@@ -13,7 +13,10 @@ from pydantic import Field
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, installed_version, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, installed_version, sole_member
+
+# Measured peak of simplifying and of clustering, for each triangle of the original.
+_REDUCING_BYTES = 450
 
 TriangleCounts = Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1, strict=False)]
 
@@ -60,6 +63,16 @@ class DecimatedMember(Member):
             "triangles": self.triangles,
             "fast-simplification": installed_version("fast-simplification"),
         }
+
+    def expected_size(self) -> Size:
+        """Collapsing takes memory for the original."""
+        return reduced_size(self.original, self.triangles)
+
+
+def reduced_size(original: Member, triangles: int) -> Size:
+    """The expected size of a mesh that is made from a finer one."""
+    whole = original.expected_size()
+    return Size(triangles, max(whole.making_bytes, _REDUCING_BYTES * whole.triangles))
 
 
 def whole_mesh(original: Member, triangles: int) -> Mesh:

@@ -12,9 +12,9 @@ from typing import Annotated
 from pydantic import Field
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.readers import companion_files, mesh_format, mesh_stem, read_mesh
+from sobolev_batch.surfaces.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, file_digest
+from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, file_digest
 
 
 class Files(Source):
@@ -67,6 +67,10 @@ class FileMember(Member):
         """The digests of the file's bytes and of those it refers to, and its format."""
         beside = [file_digest(path) for path in companion_files(self.path)]
         return {"file": file_digest(self.path), "beside": beside, "format": mesh_format(self.path)}
+
+    def expected_size(self) -> Size:
+        """What the header announces, or the length of the file suggests."""
+        return Size(*expected_size(self.path))
 
 
 def _matches(folder: Path, path: str) -> list[Path]:

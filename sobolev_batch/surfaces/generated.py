@@ -10,8 +10,11 @@ from pydantic import Field
 
 from sobolev_batch.surfaces.icosphere import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, Source, installed_version
+from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, installed_version
 from sobolev_batch.surfaces.sphere import Sphere
+
+# Measured peak of the subdivision, for each triangle that it makes.
+_MAKING_BYTES = 140
 
 Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
 
@@ -41,6 +44,11 @@ class IcosphereMember(Member):
     def fingerprint(self) -> Fingerprint:
         """The level, and the version of the library that subdivides."""
         return {"icosphere": self.level, "trimesh": installed_version("trimesh")}
+
+    def expected_size(self) -> Size:
+        """Its number of triangles is known."""
+        triangles = 20 * 4**self.level
+        return Size(triangles, _MAKING_BYTES * triangles)
 
 
 class Spheres(Source):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -21,6 +21,9 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _EVERYTHING = slice(None)
 # Triangles that are measured at a time: their edges and temporaries stay in cache.
 _SLICE = 1 << 14
+
+# Odd numbers without pattern, that spread three indices over 64 bits.
+_MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 
 # Twice the rounding error of a cross product, relative to the squared longest edge: an area below
 # this is not distinguishable from zero in double precision.
@@ -52,8 +55,9 @@ class Mesh:
         vertices: real array (n, 3), finite, in the user's unit of length.
         triangles: integer array (m, 3) of indices into ``vertices``, m > 0.
 
-    Both are copied, converted to float64 and int64 and made read-only. Zero-area triangles,
-    duplicates, open boundaries and non-manifold edges are kept; `counts` reports them.
+    Both are copied, converted to float64 and int64 and made read-only; arrays that are all of this
+    already, and own their memory, are shared. Zero-area triangles, duplicates, open boundaries and
+    non-manifold edges are kept; `counts` reports them.
 
     Raises:
         MeshError: coordinates that are not finite, indices that are negative, out of range or not
@@ -73,11 +77,19 @@ class Mesh:
                 "the mesh has coordinates so large that its area overflows double precision: "
                 f"largest absolute coordinate {np.abs(checked_vertices).max():.3g}; rescale it"
             )
-        if not np.any(self.areas > self._smallest_areas()):
+        if not self._has_area():
             raise MeshError(
                 f"the total area of the {len(checked_triangles)} triangles is zero: every one is "
                 "degenerate, so there is no surface measure to compare"
             )
+
+    @classmethod
+    def of_checked(cls, vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> Mesh:
+        """A mesh of arrays that were checked before, such as parts of a mesh; they become its own."""
+        mesh = object.__new__(cls)
+        object.__setattr__(mesh, "vertices", _frozen(vertices))
+        object.__setattr__(mesh, "triangles", _frozen(triangles))
+        return mesh
 
     def corners(self, part: slice | NDArray[np.int64] = _EVERYTHING) -> Corners:
         """The first, second and third corners of all or some triangles, each (k, 3)."""
@@ -95,10 +107,20 @@ class Mesh:
         """Total area, in squared units of length."""
         return float(self.areas.sum())
 
-    @cached_property
+    @property
     def edge_lengths(self) -> NDArray[np.float64]:
         """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
         return self._per_triangle(_side_lengths)
+
+    @cached_property
+    def edge_length_range(self) -> tuple[float, float]:
+        """Mean and maximum of the `edge_lengths`, which are not held for it."""
+        total, longest = 0.0, 0.0
+        for edges in self._edges():
+            lengths = _side_lengths(edges)
+            total += float(lengths.sum())
+            longest = max(longest, float(lengths.max()))
+        return total / (3 * len(self.triangles)), longest
 
     @cached_property
     def centroid_radii(self) -> NDArray[np.float64]:
@@ -126,31 +148,31 @@ class Mesh:
     @cached_property
     def counts(self) -> MeshCounts:
         """How many triangles and edges are degenerate, duplicate, open or non-manifold."""
-        ordered = np.sort(self.triangles, axis=1)
-        low, middle, high = ordered.T
-        order = np.lexsort((high, middle, low))
-        duplicate = np.ones(len(order) - 1, dtype=bool)
-        for column in (low, middle, high):
-            duplicate &= np.diff(column[order]) == 0
-        del order
-        count = len(self.vertices)
-        # A triangle that repeats a vertex has fewer than three edges, each once.
-        edges = np.concatenate(
-            [
-                (low * count + middle)[low != middle],
-                (middle * count + high)[middle != high],
-                (low * count + high)[(low != middle) & (middle != high)],
-            ]
-        )
-        edges.sort()
-        starts = np.flatnonzero(np.diff(edges, prepend=-1))
-        sharing = np.diff(starts, append=len(edges))
+        single, many = _edge_sharing(self.triangles, len(self.vertices))
         return MeshCounts(
-            zero_area=int(np.count_nonzero(self.areas <= self._smallest_areas())),
-            duplicate=int(np.count_nonzero(duplicate)),
-            boundary_edges=int(np.count_nonzero(sharing == 1)),
-            nonmanifold_edges=int(np.count_nonzero(sharing > 2)),
+            zero_area=sum(
+                int(np.count_nonzero(self.areas[part] <= smallest)) for part, smallest in self._smallest_areas()
+            ),
+            duplicate=_duplicates(self.triangles),
+            boundary_edges=single,
+            nonmanifold_edges=many,
         )
+
+    def parts(self, size: int) -> Iterator[tuple[int, Mesh]]:
+        """The mesh in numbered parts of at most ``size`` triangles, each with the vertices that it uses alone.
+
+        Parts without area are left out: what they would add to a transform is zero.
+        """
+        number = np.empty(len(self.vertices), dtype=np.int64)
+        for part, start in enumerate(range(0, len(self.triangles), size)):
+            triangles = self.triangles[start : start + size]
+            if not np.any(self.areas[start : start + size] > 0):
+                continue
+            used = np.zeros(len(self.vertices), dtype=bool)
+            used[triangles] = True
+            there = np.flatnonzero(used)
+            number[there] = np.arange(len(there))
+            yield part, Mesh.of_checked(self.vertices[there], number[triangles])
 
     @cached_property
     def digest(self) -> str:
@@ -161,16 +183,29 @@ class Mesh:
             digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
         return digest.hexdigest()
 
-    def _smallest_areas(self) -> NDArray[np.float64]:
-        """The area of each triangle (m,) that could as well be zero, given the rounding of its sides."""
-        with np.errstate(over="ignore"):
-            longest: NDArray[np.float64] = self._per_triangle(_longest_sides)
-            return np.asarray(_AREA_RESOLUTION * longest**2)
+    def _has_area(self) -> bool:
+        return any(bool(np.any(self.areas[part] > smallest)) for part, smallest in self._smallest_areas())
+
+    def _smallest_areas(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+        """The areas of triangles that could as well be zero, given the rounding of their sides, slice by slice."""
+        for number, edges in enumerate(self._edges()):
+            with np.errstate(over="ignore"):
+                longest: NDArray[np.float64] = _side_lengths(edges).max(axis=1)
+                yield slice(number * _SLICE, (number + 1) * _SLICE), _AREA_RESOLUTION * longest**2
 
     def _per_triangle(self, measure: Callable[[_Edges], NDArray[np.float64]]) -> NDArray[np.float64]:
         """A measure of all triangles, taken slice by slice: edges of millions at once take gigabytes."""
+        parts = self._edges()
+        first = measure(next(parts))
+        values = np.empty((len(self.triangles), *first.shape[1:]))
+        values[: len(first)] = first
+        for number, edges in enumerate(parts, 1):
+            values[number * _SLICE : (number + 1) * _SLICE] = measure(edges)
+        return _frozen(values)
+
+    def _edges(self) -> Iterator[_Edges]:
+        """The edges of each slice of triangles."""
         columns = [np.ascontiguousarray(column) for column in self.vertices.T]
-        parts = []
         for start in range(0, len(self.triangles), _SLICE):
             a, b, c = np.ascontiguousarray(self.triangles[start : start + _SLICE].T)
             first, second = np.empty((3, len(a))), np.empty((3, len(a)))
@@ -178,8 +213,7 @@ class Mesh:
                 origins = column[a]
                 np.subtract(column[b], origins, out=first[axis])
                 np.subtract(column[c], origins, out=second[axis])
-            parts.append(measure((first, second)))
-        return _frozen(np.concatenate(parts))
+            yield first, second
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
@@ -198,16 +232,46 @@ def _side_lengths(edges: _Edges) -> NDArray[np.float64]:
     return np.stack([np.sqrt(np.einsum("ij,ij->j", side, side)) for side in (first, second - first, second)], axis=1)
 
 
-def _longest_sides(edges: _Edges) -> NDArray[np.float64]:
-    longest: NDArray[np.float64] = _side_lengths(edges).max(axis=1)
-    return longest
-
-
 def _centroid_radii(edges: _Edges) -> NDArray[np.float64]:
     first, second = edges
     centroid = (first + second) / 3
     squares = [np.einsum("ij,ij->j", arm, arm) for arm in (centroid, first - centroid, second - centroid)]
     return np.asarray(np.sqrt(np.maximum.reduce(squares)))
+
+
+def _edge_sharing(triangles: NDArray[np.int64], vertex_count: int) -> tuple[int, int]:
+    """How many edges belong to exactly one triangle, and to more than two."""
+    edges = np.empty(3 * len(triangles), dtype=np.int64)
+    for start in range(0, len(triangles), _SLICE):
+        low, middle, high = np.sort(triangles[start : start + _SLICE], axis=1).T
+        found = edges[3 * start : 3 * (start + len(low))].reshape(3, -1)
+        # A triangle that repeats a vertex has fewer than three edges, each once.
+        found[0] = np.where(low == middle, -1, low * vertex_count + middle)
+        found[1] = np.where(middle == high, -1, middle * vertex_count + high)
+        found[2] = np.where((low == middle) | (middle == high), -1, low * vertex_count + high)
+    edges.sort()
+    edges = edges[np.searchsorted(edges, 0) :]
+    if not edges.size:
+        return 0, 0
+    repeats = np.concatenate([[False], edges[1:] == edges[:-1], [False, False]])
+    starts, again, third = ~repeats[:-2], repeats[1:-1], repeats[2:]
+    return int(np.count_nonzero(starts & ~again)), int(np.count_nonzero(starts & again & third))
+
+
+def _duplicates(triangles: NDArray[np.int64]) -> int:
+    """How many triangles repeat the three vertices of an earlier one."""
+    hashes = np.empty(len(triangles), dtype=np.uint64)
+    for start in range(0, len(triangles), _SLICE):
+        low, middle, high = np.sort(triangles[start : start + _SLICE], axis=1).astype(np.uint64).T
+        hashes[start : start + len(low)] = (low * _MIXERS[0] + middle) * _MIXERS[1] + high
+    ordered = np.sort(hashes)
+    repeated = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
+    if not repeated.size:
+        return 0
+    # Different triangles may have one hash, so those that share one are compared themselves.
+    places = np.minimum(np.searchsorted(repeated, hashes), len(repeated) - 1)
+    suspects = np.sort(triangles[repeated[places] == hashes], axis=1)
+    return len(suspects) - len(np.unique(suspects, axis=0))
 
 
 def _array(values: ArrayLike, name: str) -> NDArray[Any]:
@@ -226,7 +290,7 @@ def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
     if found.ndim != 2 or found.shape[1] != 3:
         raise MeshError(f"vertices must have shape (n, 3), found {found.shape}")
     with np.errstate(over="ignore"):
-        converted = np.array(found, dtype=np.float64, order="C")
+        converted = _owned(found, np.float64)
     bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
     if bad.size:
         raise MeshError(f"{bad.size} of {len(found)} vertices have NaN or infinite coordinates: {_listed(bad, found)}")
@@ -241,12 +305,18 @@ def _check_triangles(triangles: ArrayLike, vertex_count: int) -> NDArray[np.int6
         raise MeshError(f"triangles must be integer indices, found dtype {found.dtype}")
     if found.ndim != 2 or found.shape[1] != 3:
         raise MeshError(f"triangles must have shape (m, 3), found {found.shape}")
-    bad = np.flatnonzero(((found < 0) | (found >= vertex_count)).any(axis=1))
-    if bad.size:
+    if found.min() < 0 or found.max() >= vertex_count:
+        bad = np.flatnonzero(((found < 0) | (found >= vertex_count)).any(axis=1))
         raise MeshError(
             f"{bad.size} of {len(found)} triangles have indices outside 0..{vertex_count - 1}: {_listed(bad, found)}"
         )
-    return _frozen(np.array(found, dtype=np.int64, order="C"))
+    return _frozen(_owned(found, np.int64))
+
+
+def _owned(array: NDArray[Any], dtype: type[_Scalar]) -> NDArray[_Scalar]:
+    """The array itself where nobody can change it any more, else a copy."""
+    settled = array.dtype == dtype and array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable
+    return array if settled else np.array(array, dtype=dtype, order="C")
 
 
 def _listed(rows: NDArray[np.intp], values: NDArray[np.generic], limit: int = 3) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import math
 import re
 import zlib
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.ply import parse_ply
+from sobolev_batch.surfaces.ply import announced_faces, parse_ply
 from sobolev_batch.surfaces.stl import parse_stl
 from sobolev_batch.surfaces.text_formats import parse_obj, parse_off
 
@@ -25,6 +26,20 @@ Raw = tuple[NDArray[Any], NDArray[Any]]
 # A bound against decompression bombs; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
 _STEP_BYTES = 1 << 20
+# Where the header of a PLY file is looked for.
+_HEADER_BYTES = 1 << 16
+# What gzip makes of mesh files, about.
+_PACKING = 4
+# Of each triangle in a file without anything but positions and triangles, and at the measured peak of reading it.
+_BYTES_PER_TRIANGLE = {
+    ".ply": (19, 90),
+    ".obj": (35, 420),
+    ".stl": (50, 270),
+    ".off": (35, 1050),
+    ".gltf": (18, 190),
+    ".glb": (18, 190),
+    ".gii": (10, 90),
+}
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -42,15 +57,40 @@ def read_mesh(path: str | Path) -> Mesh:
     suffix = mesh_format(path).removesuffix(".gz")
     if suffix not in _PARSERS:
         raise MeshError(f"{path}: no mesh format has this name; known are {', '.join(_PARSERS)}, each also with .gz")
-    data = read_bytes(path)
+    data = [read_bytes(path)]
     try:
-        return Mesh(*_PARSERS[suffix](data, path))
+        # The parser alone holds the bytes, and lets go of them as soon as it can.
+        vertices, triangles = _PARSERS[suffix](data.pop(), path)
+        for array in (vertices, triangles):
+            array.setflags(write=False)
+        return Mesh(vertices, triangles)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
     except Exception as error:
         # Damaged input makes the parsers raise anything from struct.error to RecursionError.
         reason = " ".join(str(error).split())[:200] or "no details"
         raise MeshError(f"{path}: not a readable {suffix} file: {type(error).__name__}: {reason}") from error
+
+
+def expected_size(path: Path) -> tuple[int, float]:
+    """About how many triangles a file holds, and the bytes of memory that reading it takes at its peak.
+
+    From the length of the file, but for PLY, whose header tells; zero where it cannot be read.
+    """
+    suffix = mesh_format(path)
+    each_in_file, each_in_memory = _BYTES_PER_TRIANGLE.get(suffix.removesuffix(".gz"), (math.inf, 0.0))
+    packed = suffix.endswith(".gz")
+    try:
+        length = path.stat().st_size * (_PACKING if packed else 1)
+        if suffix == ".gltf":
+            length += sum(buffer.stat().st_size for buffer in companion_files(path))
+        triangles = int(length / each_in_file)
+        if suffix.startswith(".ply"):
+            with gzip.open(path) if packed else path.open("rb") as file:
+                triangles = announced_faces(file.read(_HEADER_BYTES))
+    except (OSError, EOFError, zlib.error, MeshError):
+        return 0, 0.0
+    return triangles, triangles * each_in_memory
 
 
 def mesh_format(path: Path) -> str:
@@ -124,7 +164,7 @@ def _parse_gifti(data: bytes, path: Path) -> Raw:
 
 
 _PARSERS: dict[str, Callable[[bytes, Path], Raw]] = {
-    ".ply": lambda data, _: parse_ply(data),
+    ".ply": parse_ply,
     ".obj": lambda data, _: parse_obj(data),
     ".stl": lambda data, _: parse_stl(data),
     ".off": lambda data, _: parse_off(data),

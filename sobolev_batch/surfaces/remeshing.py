@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.decimation import TriangleCounts, whole_mesh
+from sobolev_batch.surfaces.decimation import TriangleCounts, reduced_size, whole_mesh
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, installed_version, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, installed_version, sole_member
 
 # Clustering needs several input vertices for each output vertex to make even cells; pyacvd's own
 # advice is to subdivide until there are.
@@ -77,3 +77,7 @@ class RemeshedMember(Member):
             "triangles": self.triangles,
             "pyacvd": installed_version("pyacvd"),
         }
+
+    def expected_size(self) -> Size:
+        """Clustering takes memory for the original."""
+        return reduced_size(self.original, self.triangles)

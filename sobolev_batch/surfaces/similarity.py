@@ -58,4 +58,8 @@ class Similarity:
         if isinstance(surface, Sphere):
             moved = [self.scale * (c - o) for c, o in zip(surface.center, self.origin, strict=True)]
             return Sphere(self.scale * surface.radius, (moved[0], moved[1], moved[2]))
-        return Mesh(self.scale * (surface.vertices - np.asarray(self.origin)), surface.triangles)
+        moved_vertices = surface.vertices - np.asarray(self.origin)
+        moved_vertices *= self.scale
+        # Read-only, so that the mesh takes it over: of huge meshes a copy would count.
+        moved_vertices.setflags(write=False)
+        return Mesh(moved_vertices, surface.triangles)

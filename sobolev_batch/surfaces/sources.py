@@ -45,6 +45,19 @@ class Source(BaseModel, ABC):
 
 
 @dataclass(frozen=True)
+class Size:
+    """How large a surface is going to be, told without making it.
+
+    Attributes:
+        triangles: about how many; 0 for a closed form.
+        making_bytes: about the memory that making it takes at its peak.
+    """
+
+    triangles: int = 0
+    making_bytes: float = 0.0
+
+
+@dataclass(frozen=True)
 class Member(ABC):
     """One surface of a source.
 
@@ -73,6 +86,14 @@ class Member(ABC):
         Raises:
             MeshError: a file that it depends on cannot be read.
         """
+
+    def expected_size(self) -> Size:
+        """What the surface and its making are going to take; what cannot be told counts as nothing.
+
+        Meshes of millions of triangles are cut into parts, and too large ones are refused, on the
+        strength of this.
+        """
+        return Size()
 
 
 def file_digest(path: Path) -> str:

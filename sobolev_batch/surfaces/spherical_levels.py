@@ -11,10 +11,11 @@ from pydantic import Field, SerializeAsAny, field_validator
 from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.decimation import reduced_size
 from sobolev_batch.surfaces.generated import Level
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Source, sole_member
+from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, Source, sole_member
 
 
 class SphericalLevels(NestedSource):
@@ -77,3 +78,7 @@ class LevelMember(Member):
             "surface": dict(self.surface.fingerprint()),
             "sphere": dict(self.sphere.fingerprint()),
         }
+
+    def expected_size(self) -> Size:
+        """Both surfaces are there at once, and the hull takes memory like a reduction of them."""
+        return reduced_size(self.surface, 20 * 4**self.level)

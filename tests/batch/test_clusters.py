@@ -2,54 +2,24 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from distributed import Client
 
 from sobolev_batch import ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, remote_client
 from tests.batch.conftest import variable
-
-SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-
-
-def dask(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
-
-
-def stop(process: subprocess.Popen[str]) -> None:
-    """End a process, by force if it does not go of itself: a worker may wait for a peer that is gone."""
-    process.terminate()
-    try:
-        process.communicate(timeout=20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
+from tests.batch.processes import SCHEDULER, dask, scheduler_address, stop, tcp_cluster
 
 
 @pytest.fixture
 def tcp_scheduler() -> Iterator[str]:
     """The address of a `dask scheduler` with two `dask worker` processes."""
-    scheduler = dask(*SCHEDULER)
-    processes = [scheduler]
-    try:
-        assert scheduler.stderr is not None
-        address = next(found[0] for line in scheduler.stderr if (found := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
-        worker = ["worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard", "--no-nanny"]
-        processes += [dask(*worker) for _ in range(2)]
-        with Client(address) as client:
-            client.wait_for_workers(2, timeout=60)
+    with tcp_cluster([], []) as (address, _):
         yield address
-    finally:
-        for process in reversed(processes):
-            stop(process)
 
 
 def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
@@ -78,8 +48,7 @@ def test_no_scheduler_there() -> None:
 def test_a_scheduler_without_workers() -> None:
     scheduler = dask(*SCHEDULER)
     try:
-        assert scheduler.stderr is not None
-        address = next(found[0] for line in scheduler.stderr if (found := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
+        address = scheduler_address(scheduler)
         with pytest.raises(ClusterError, match="has no workers; start some with: dask worker"), remote_client(address):
             pass
     finally:

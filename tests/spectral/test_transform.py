@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +14,10 @@ from numpy.typing import NDArray
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.nufft import transform_points
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.files import Files
 from sobolev_batch.surfaces.similarity import Similarity
@@ -99,11 +103,75 @@ def test_batches_change_nothing_but_rounding() -> None:
     assert np.abs(one - many).max() < 1e-11 * mesh.area
 
 
+@pytest.mark.parametrize("memory", [2.5e7, 1.2e7, 9.9e6])
+@pytest.mark.parametrize("precision", ["complex128", "complex64"])
+def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: float, precision: Precision) -> None:
+    lattice, mesh = Lattice(5.0, 64), bumpy(np.random.default_rng(5))
+    settings = Transform(1e-9 if precision == "complex128" else 1e-6, precision)
+    whole = transform_block(mesh, lattice, lattice.half, settings)
+    assert memory_bytes(lattice.half, settings, triangles=len(mesh.triangles)) > 3 * memory
+    divided = transform_block(mesh, lattice, lattice.half, settings, memory=memory)
+    assert divided.points == whole.points
+    assert divided.values.dtype == precision
+    assert not np.array_equal(divided.values, whole.values)
+    assert np.abs(divided.values - whole.values).max() < 5 * settings.accuracy * mesh.area
+
+
+def test_enough_memory_changes_nothing() -> None:
+    lattice, mesh = Lattice(5.0, 32), bumpy(np.random.default_rng(5))
+    settings = Transform(1e-9)
+    ample = memory_bytes(lattice.half, settings, triangles=len(mesh.triangles))
+    whole, same = (transform_block(mesh, lattice, lattice.half, settings, memory=memory) for memory in (None, ample))
+    assert np.array_equal(whole.values, same.values)
+
+
+def test_states_the_smallest_memory() -> None:
+    lattice, mesh = Lattice(5.0, 32), icosphere(2)
+    with pytest.raises(InputError, match=r"^1 MB .* 33 x 33 x 17 samples: give at least [\d.]+ MB") as caught:
+        transform_block(mesh, lattice, lattice.half, Transform(), memory=1e6)
+    least = float(str(caught.value).split("at least ")[1].split(" MB")[0]) * 1e6
+    transform_block(mesh, lattice, lattice.half, Transform(), memory=least)
+    with pytest.raises(InputError, match="give at least"):
+        transform_block(mesh, lattice, lattice.half, Transform(), memory=least - 1.1e5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("intervals", "memory"), [(128, None), (128, 6e7), (256, 3e8)])
+def test_takes_no_more_memory_than_it_says(intervals: int, memory: float | None) -> None:
+    taken, said, result = map(int, memory_of_a_transform(intervals, memory).split())
+    assert taken < said
+    if memory is not None:
+        assert said <= memory + result
+        assert taken > 0.3 * said  # an estimate far too high would divide what fits
+
+
+def memory_of_a_transform(intervals: int, memory: float | None) -> str:
+    """What a transform adds to the peak of a fresh process, what that was estimated as, and its result, in bytes."""
+    code = f"""
+import resource, sys
+import sobolev_batch as sb
+from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
+
+mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), Transform()
+mesh.areas, mesh.centroid_radii, mesh.bounds
+settings.lowest_degree(mesh, lattice)
+unit = 1 if sys.platform == "darwin" else 1024
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+values = transform_block(mesh, lattice, lattice.half, settings, memory={memory}).values
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+said = memory_bytes(lattice.half, settings, memory={memory}, triangles=len(mesh.triangles))
+print(after - before, said, values.nbytes)
+"""
+    # A shell in between: on Linux a process starts from the peak of the one that forked it.
+    command = ["sh", "-c", f"{shlex.quote(sys.executable)} -c {shlex.quote(code)}"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_weighted_points_against_the_direct_sum() -> None:
     rng = np.random.default_rng(23)
     lattice = Lattice(3.0, 12)
     points = WeightedPoints(rng.uniform(-0.9, 0.9, size=(3, 200)), rng.normal(size=200))
-    found = transform_points([points], lattice, lattice.half, eps=1e-13)
+    found, _ = transform_points([points], lattice, lattice.half, eps=1e-13)
     x, y, z = (
         np.exp(-2j * np.pi * np.outer(axis, row)) for axis, row in zip(lattice.axes, points.coordinates, strict=True)
     )
@@ -113,7 +181,7 @@ def test_weighted_points_against_the_direct_sum() -> None:
 
 def test_no_points_transform_to_zero() -> None:
     lattice = Lattice(3.0, 4)
-    assert not transform_points([], lattice, lattice.half, eps=1e-6).any()
+    assert not transform_points([], lattice, lattice.half, eps=1e-6)[0].any()
 
 
 def test_translation_rotation_order_and_subdivision() -> None:

@@ -1,0 +1,112 @@
+"""What each worker computes with: found out once when it starts, reported, and used by all its tasks."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Any
+
+import psutil
+from distributed import Client, Worker, WorkerPlugin, get_worker
+
+from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember
+from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
+from sobolev_batch.errors import BackendError, ClusterError
+from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
+
+_log = logging.getLogger(__name__)
+
+_NAME = "sobolev-batch"
+# Of a worker's memory limit, what tasks may take together: Dask pauses a worker near its limit and
+# ends it at it, and an idle process with its libraries takes the constant part.
+_USABLE, _IDLE_BYTES = 0.85, 300e6
+
+
+class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
+    """Finds a worker's backend when it starts, and declares its memory and its GPU to the scheduler.
+
+    A worker takes at most one GPU, and only one that no other worker of its host has.
+
+    Attributes:
+        backend: what the worker's tasks compute with.
+        note: the GPU's name, or why there is none.
+        spare_bytes: of memory, for all its tasks together.
+    """
+
+    idempotent = True
+
+    def __init__(self) -> None:
+        self.backend: Backend = CPU
+        self.note = ""
+        self.spare_bytes = 0.0
+        self._claim: Claim | None = None
+
+    def __reduce__(self) -> tuple[type[Equipment], tuple[()]]:
+        # It travels to workers before it has found anything.
+        return Equipment, ()
+
+    async def setup(self, worker: Worker) -> None:
+        """Find out what is there; in a thread, since loading CUDA takes seconds."""
+        limit = worker.memory_manager.memory_limit or psutil.virtual_memory().total
+        self.spare_bytes = _USABLE * limit - _IDLE_BYTES
+        await asyncio.to_thread(self._find_backend)
+        declared = [name for name in worker.state.total_resources if name.upper() == "GPU"]
+        if declared and self.backend.name != "gpu":
+            _log.warning("%s declares a GPU but computes on its CPU: %s", worker.address, self.note)
+        resources = {MEMORY: self.spare_bytes} | ({GPU: 1} if self.backend.name == "gpu" else {})
+        await worker.set_resources(**resources)
+
+    def teardown(self, worker: Worker) -> None:
+        """Let go of the GPU."""
+        if self._claim is not None:
+            self._claim.release()
+
+    def _find_backend(self) -> None:
+        devices = visible_devices()
+        claim = claim_device(devices)
+        try:
+            if devices and claim is None:
+                raise BackendError(f"other workers have all of the {len(devices)} GPUs that it may use")
+            self.backend = gpu_backend()
+            self.note = self.backend.library
+            self._claim = claim
+        except BackendError as error:
+            self.note = str(error)
+            if claim is not None:
+                claim.release()
+
+
+def enlist(client: Client) -> Crew:
+    """Equip the workers of a cluster, those that join later too, and tell what they offer.
+
+    Raises:
+        ClusterError: there are no workers.
+    """
+    client.register_plugin(Equipment(), name=_NAME)
+    found = client.run(_describe)
+    if not found:
+        raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
+    return Crew(tuple(CrewMember(address, *parts) for address, parts in sorted(found.items())))
+
+
+def _describe(dask_worker: Worker) -> tuple[int, float, str, str, bool]:
+    equipment = dask_worker.plugins[_NAME]
+    declares = any(name.upper() == "GPU" for name in dask_worker.state.total_resources)
+    return (
+        dask_worker.state.nthreads,
+        equipment.spare_bytes,
+        equipment.backend.name,
+        equipment.note,
+        declares,
+    )
+
+
+def backend_of(wanted: str) -> Backend:
+    """The backend of the worker that this task runs on; the CPU where a study wants that."""
+    if wanted == "cpu":
+        return CPU
+    try:
+        plugins: dict[str, Any] = get_worker().plugins
+    except ValueError:  # called outside a cluster
+        return CPU
+    return plugins[_NAME].backend if _NAME in plugins else CPU

@@ -1,0 +1,67 @@
+"""The record of a run in its store: kept up to date while it runs, closed when it ends."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from threading import Event, Thread
+from types import TracebackType
+from typing import Self
+
+from sobolev_batch.batch.records import RunRecord, RunState, utc_now
+from sobolev_batch.batch.store import Store
+
+_log = logging.getLogger(__name__)
+
+# Who reads the record knows from its age whether the driver still lives.
+HEARTBEAT_SECONDS = 10.0
+
+
+class Journal:
+    """Tells a store that a run is going on, from where, and how it ended.
+
+    Attributes:
+        cluster: the address of the scheduler, once there is one.
+        stage: what is being done.
+    """
+
+    def __init__(self, store: Store) -> None:
+        """Name the store."""
+        self.cluster = ""
+        self.stage = ""
+        self._store = store
+        self._started = utc_now()
+        self._ended = Event()
+        self._thread = Thread(target=self._beat, name="sobolev-batch-journal", daemon=True)
+
+    def __enter__(self) -> Self:
+        self.write("running")
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+        if error is None:
+            self.write("done")
+        elif isinstance(error, KeyboardInterrupt):
+            self.write("failed", "interrupted")
+        else:
+            self.write("failed", str(error) or type(error).__name__)
+
+    def write(self, state: RunState, error: str = "") -> None:
+        """Replace the store's record."""
+        driver = f"process {os.getpid()} on {socket.gethostname()}"
+        if self.cluster:
+            driver += f", cluster {self.cluster}"
+        self._store.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
+
+    def _beat(self) -> None:
+        while not self._ended.wait(HEARTBEAT_SECONDS):
+            try:
+                self.write("running")
+            except Exception as error:  # the store may answer again at the next beat
+                _log.warning("the run's record could not be written: %s", error)

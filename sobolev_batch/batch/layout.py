@@ -1,0 +1,95 @@
+"""How the field of one row becomes tasks: parts of its mesh, blocks of the lattice, and their memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from sobolev_batch.batch.crew import Crew
+from sobolev_batch.errors import ClusterError
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.precision import item_bytes
+from sobolev_batch.spectral.transform import Transform, memory_bytes
+from sobolev_batch.surfaces.sources import Size
+
+# Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
+# cluster, so that the same sums are formed on any; smaller ones only where memory is short. The
+# transform of such a part takes seconds, its FFT a small part of them.
+_PART_TRIANGLES = 1 << 21
+_FEWEST_TRIANGLES = 1 << 16
+# Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
+_MESH_BYTES = 100.0
+# Less makes a transform's batches and parts of a block so small that it becomes slow.
+_LEAST_ROOM_BYTES = 256e6
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The tasks of one row.
+
+    Attributes:
+        parts: of the mesh, each transformed in a task of its own; 1 leaves it whole.
+        groups: of blocks, those of one group in one task.
+        transform_bytes: what one transform may take, besides its mesh and its block.
+        making_bytes: what the task takes that makes the mesh.
+        task_bytes: what any other takes at most; the same where the mesh is whole.
+    """
+
+    parts: int
+    groups: tuple[tuple[Block, ...], ...]
+    transform_bytes: float
+    making_bytes: float
+    task_bytes: float
+
+    @property
+    def largest_bytes(self) -> float:
+        """What the most demanding task takes."""
+        return max(self.making_bytes, self.task_bytes)
+
+
+def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Crew, rows: int) -> Layout:
+    """Fit a row's tasks into the memory of workers.
+
+    Every task is kept within what a worker has for each of its threads, as long as that leaves a
+    transform enough to work in; a task that needs more runs beside fewer others.
+
+    Args:
+        blocks: of the lattice, all but the last equal.
+        transform: settings of the fields.
+        size: of the row's surface.
+        crew: the workers.
+        rows: how many rows are to be computed.
+
+    Raises:
+        ClusterError: no worker has the memory that it takes.
+    """
+    block = blocks[0]
+    block_bytes = float(block.size * item_bytes(transform.precision))
+    wanted = memory_bytes(block, transform, triangles=min(size.triangles, _PART_TRIANGLES)) - block_bytes
+    least = min(wanted, _LEAST_ROOM_BYTES)
+
+    def fixed(triangles: float) -> float:
+        # The block and what it is added to or compared with.
+        return _MESH_BYTES * triangles + 2 * block_bytes
+
+    whole = size.triangles <= 1.5 * _PART_TRIANGLES and fixed(size.triangles) + least <= crew.largest_bytes
+    part = size.triangles if whole else _PART_TRIANGLES
+    while not whole and fixed(part) + least > crew.share_bytes and part > _FEWEST_TRIANGLES:
+        part //= 2
+    making = max(size.making_bytes, _MESH_BYTES * size.triangles)
+    needed = max(making, fixed(part) + least)
+    if needed > crew.largest_bytes:
+        raise ClusterError(
+            f"it takes about {needed / 1e9:.2g} GB in one task, and no worker has more than "
+            f"{crew.largest_bytes / 1e9:.2g} GB to spare; start workers with more memory"
+        )
+    spent = min(max(least, crew.share_bytes - fixed(part)), wanted)
+    task = fixed(part) + spent
+    parts = 1 if whole else max(1, math.ceil(size.triangles / part))
+    # A task computes as many blocks as leaves two for every thread: each makes the mesh anew.
+    count = len(blocks) if parts > 1 else min(len(blocks), max(1, math.ceil(2 * crew.threads / max(rows, 1))))
+    ends = [len(blocks) * k // count for k in range(count + 1)]
+    groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
+    return Layout(parts, groups, spent, max(making, task) if parts == 1 else making, task)

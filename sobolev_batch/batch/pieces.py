@@ -1,0 +1,146 @@
+"""A huge mesh as many tasks: cut once into pieces, transformed piece by piece, added up by a tree.
+
+The pieces lie in the store's scratch space while they are needed, so that each task reads its own and
+nothing hangs on the worker that cut the mesh.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.batch.equipment import backend_of
+from sobolev_batch.batch.records import Facts
+from sobolev_batch.batch.tasks import Job, Part, facts_of, reason_of, settings_of
+from sobolev_batch.errors import MeshError
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.probe import Draws, Probe, measure
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.samples import draws_for
+from sobolev_batch.spectral.transform import Transform, require_inside, transform_block
+from sobolev_batch.spectral.triangles import exact_transform
+from sobolev_batch.surfaces.mesh import Mesh
+
+Complexes = NDArray[np.complexfloating[Any, Any]]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A mesh that was cut: everything about it but its triangles.
+
+    Attributes:
+        there: the numbers of the pieces that have triangles with an area.
+        settings: of the transform of every piece.
+        draws: the frequencies at which the field is probed.
+        facts: of the whole mesh.
+        quality: likewise, with an empty probe; None where the cut failed.
+        seconds: spent.
+        error: why it failed; empty otherwise.
+    """
+
+    there: frozenset[int] = frozenset()
+    settings: Transform | None = None
+    draws: Draws | None = None
+    facts: Facts = field(default_factory=Facts)
+    quality: Quality | None = None
+    seconds: float = 0.0
+    error: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Partial:
+    """What some pieces add to one block of a field.
+
+    Attributes:
+        values: complex (block.shape); None where they add nothing.
+        exact: complex128, the exact transform of the pieces at the block's draws, or 0.
+        points: of the quadrature.
+        backends: that computed it.
+        seconds: spent.
+        error: why it failed; empty otherwise.
+    """
+
+    values: Complexes | None = None
+    exact: NDArray[np.complex128] | complex = 0j
+    points: int = 0
+    backends: tuple[str, ...] = ()
+    seconds: float = 0.0
+    error: str = ""
+
+
+def cut_mesh(job: Job, count: int) -> Cut:
+    """Make a mesh, describe it, and store it as at most ``count`` pieces of equally many triangles."""
+    started = time.perf_counter()
+    try:
+        mesh = job.similarity.apply(job.member.load())
+        if not isinstance(mesh, Mesh):
+            raise MeshError("a closed-form surface cannot be cut into pieces")
+        require_inside(mesh, job.lattice)
+        settings = settings_of(job, mesh)
+        draws = draws_for([mesh], job.lattice, job.orders, settings.lowest_degree(mesh, job.lattice))
+        facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe())
+        size = math.ceil(len(mesh.triangles) / count)
+        there = set()
+        for number, piece in mesh.parts(size):
+            job.store.write_piece(job.row, number, piece)
+            there.add(number)
+    except Exception as error:
+        return Cut(seconds=time.perf_counter() - started, error=reason_of(job, error))
+    return Cut(frozenset(there), settings, draws, facts, quality, time.perf_counter() - started)
+
+
+def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
+    """Transform one piece onto one block of the lattice."""
+    if cut.error or number not in cut.there or cut.settings is None or cut.draws is None:
+        return Partial()
+    started = time.perf_counter()
+    try:
+        piece = job.store.read_piece(job.row, number)
+        backend = backend_of(job.backend)
+        made = transform_block(piece, job.lattice, block, cut.settings, backend=backend, memory=job.memory)
+        exact = exact_transform(piece, cut.draws.within(block).frequencies)
+    except Exception as error:
+        return Partial(seconds=time.perf_counter() - started, error=reason_of(job, error))
+    return Partial(made.values, exact, made.points, (made.backend,), time.perf_counter() - started)
+
+
+def add_partials(first: Partial, second: Partial) -> Partial:
+    """The sum of two partial blocks."""
+    started = time.perf_counter()
+    if first.values is None or second.values is None:
+        values = second.values if first.values is None else first.values
+    else:
+        values = first.values + second.values
+    return Partial(
+        values,
+        first.exact + second.exact,
+        first.points + second.points,
+        (*first.backends, *second.backends),
+        first.seconds + second.seconds + time.perf_counter() - started,
+        first.error or second.error,
+    )
+
+
+def store_block(job: Job, cut: Cut, total: Partial, block: Block) -> Part:
+    """Store a block that all pieces were added to, and probe it."""
+    error = cut.error or total.error
+    if error or cut.draws is None or cut.quality is None or total.values is None:
+        return Part(Facts(), cut.seconds + total.seconds, error or "no part of the mesh has an area")
+    started = time.perf_counter()
+    try:
+        job.store.write_field(job.row, job.lattice.place(block), total.values)
+    except Exception as failure:
+        return Part(Facts(), total.seconds, reason_of(job, failure))
+    draws = cut.draws.within(block)
+    probe = measure(draws, total.values[draws.places(block)], np.asarray(total.exact))
+    return Part(
+        replace(cut.facts, points=total.points),
+        total.seconds + time.perf_counter() - started,
+        quality=replace(cut.quality, probe=probe),
+        backends=total.backends,
+    )

@@ -1,0 +1,114 @@
+"""Handing a study over to a cluster, which then needs nobody to wait for it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from distributed import Client, Future, fire_and_forget, worker_client
+
+from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.journal import Journal
+from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.run import rows_of, rows_without_field, run
+from sobolev_batch.batch.store import Store, stored_choice
+from sobolev_batch.batch.study import Study
+from sobolev_batch.errors import ClusterError
+
+_log = logging.getLogger(__name__)
+
+_ACCEPT_SECONDS = 30.0
+_POLL_SECONDS = 0.05
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A study that a cluster has taken over.
+
+    Attributes:
+        store: where to follow it and where its results come.
+        surfaces: of the study.
+        missing: those whose fields are to be computed.
+    """
+
+    store: str
+    surfaces: int
+    missing: int
+
+
+def submit(study: Study, store: str | Path, client: Client) -> Submission:
+    """Hand a study over to a cluster and return; it goes on without this process.
+
+    One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
+    another one takes over from what is stored. `Store.read_run` and ``sobolev-batch status`` tell how far it is.
+
+    Args:
+        study: what to compute.
+        store: path or URL of a new or existing store, that this process and all workers reach alike.
+        client: of the cluster; it may be closed afterwards.
+
+    Raises:
+        StudyError, MeshError, LatticeError, AccuracyError, StoreError: see `run`; nothing was handed over.
+        ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
+    """
+    plan = make_plan(study, stored_choice(store))
+    enlist(client).with_backend(study.backend)
+    place = Store.prepare(_everywhere(store), plan)
+    missing = rows_without_field(place, rows_of(place, plan))
+    journal = Journal(place)
+    journal.cluster = client.scheduler.address
+    journal.write("submitted")
+    key = f"sobolev-batch-drive-{uuid4().hex}"
+    # Before all tasks of other studies, which it takes no thread from: it leaves its own at once.
+    future = client.submit(
+        drive, dict(study.table), str(study.folder.absolute()), place.path, key=key, pure=False, priority=1
+    )
+    fire_and_forget(future)
+    _await_acceptance(client, future)
+    return Submission(place.path, len(plan.rows), len(missing))
+
+
+def drive(table: Mapping[str, Any], folder: str, store: str) -> None:
+    """Run a study from a worker of the cluster that computes it.
+
+    It does not fail: what goes wrong is in the store, and running into it again would not help.
+    """
+    try:
+        with worker_client() as client:
+            run(Study.from_table(table, folder=folder), store, client)
+    except Exception as error:
+        _log.error("%s: the study could not be carried out: %s", store, error)
+        # Most of what goes wrong is known by now to the run's own journal, but not that a file of the
+        # study is missing on this machine.
+        Journal(Store(store)).write("failed", f"{error} (on the worker that drove the study)")
+
+
+def _await_acceptance(client: Client, future: Future) -> None:
+    """Return when the scheduler itself wants the task: the client may be killed from then on."""
+    deadline = time.monotonic() + _ACCEPT_SECONDS
+    while not future.done():
+        # A lambda travels by value, so the scheduler need not have this package.
+        if client.run_on_scheduler(
+            lambda dask_scheduler, key: (
+                key in dask_scheduler.tasks
+                and any(state.client_key == "fire-and-forget" for state in dask_scheduler.tasks[key].who_wants or ())
+            ),
+            key=future.key,
+        ):
+            return
+        if time.monotonic() > deadline:
+            raise ClusterError(
+                f"the scheduler at {client.scheduler.address} did not take the study within {_ACCEPT_SECONDS:g} s; "
+                "see its log"
+            )
+        time.sleep(_POLL_SECONDS)
+
+
+def _everywhere(store: str | Path) -> str | Path:
+    """A path that means the same in any folder; URLs do already."""
+    return store if "://" in str(store) else Path(store).absolute()

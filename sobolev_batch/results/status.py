@@ -1,0 +1,102 @@
+"""How far the study of a store is, told from the store alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from sobolev_batch.batch.journal import HEARTBEAT_SECONDS
+from sobolev_batch.batch.records import RunRecord, age_seconds
+from sobolev_batch.batch.store import Store
+
+# A driver that missed this many beats is taken for lost.
+_MISSED_BEATS = 6
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a study is.
+
+    Attributes:
+        store: where it is.
+        complete: how many surfaces are computed.
+        total: how many there are.
+        failed: the reason for each that could not be computed.
+        run: the record of the latest run, if there is one.
+        reduced: whether there are tables.
+        silence_seconds: since the latest sign of life of a run that goes on, else 0.
+    """
+
+    store: str
+    complete: int
+    total: int
+    failed: dict[str, str]
+    run: RunRecord | None
+    reduced: bool
+    silence_seconds: float
+
+    @classmethod
+    def of(cls, path: str | Path) -> Status:
+        """Read the status of a store.
+
+        Raises:
+            StoreError: no store is there.
+        """
+        store = Store.open(path)
+        labels, records, run = store.labels(), store.records(), store.read_run()
+        return cls(
+            str(path),
+            sum(record is not None and record.status == "complete" for record in records),
+            len(labels),
+            {
+                label: record.reason
+                for label, record in zip(labels, records, strict=True)
+                if record is not None and record.status == "failed"
+            },
+            run,
+            store.read_table("convergence") is not None,
+            age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
+        )
+
+    @property
+    def going_on(self) -> bool:
+        """Whether something is still to be expected."""
+        return self.run is not None and self.run.state in ("submitted", "running") and not self.lost
+
+    @property
+    def lost(self) -> bool:
+        """Whether a run began that does not give signs of life any more."""
+        running = self.run is not None and self.run.state == "running"
+        return running and self.silence_seconds > _MISSED_BEATS * HEARTBEAT_SECONDS
+
+    def lines(self) -> Iterator[str]:
+        """For people."""
+        waiting = self.total - self.complete - len(self.failed)
+        yield f"{self.store}: {self.complete} of {self.total} complete, {len(self.failed)} failed, {waiting} to go"
+        for label, reason in self.failed.items():
+            yield f"{label}: {reason}"
+        if self.run is not None:
+            yield from self._run_lines(self.run)
+        if not self.reduced:
+            yield "no tables yet" if self.going_on else "no tables yet: run the study to its end"
+
+    def _run_lines(self, run: RunRecord) -> Iterator[str]:
+        where = f"by {run.driver}, begun {run.started}"
+        if run.state == "submitted":
+            yield f"submitted {_span(self.silence_seconds)} ago, waiting for a worker; {where}"
+        elif run.state == "running":
+            yield f"running: {run.stage or 'planning'}; {where}, last sign of life {_span(self.silence_seconds)} ago"
+            if self.lost:
+                yield "the process that drove it is probably gone; run or submit the study again, it goes on from here"
+        elif run.state == "failed":
+            yield f"the latest run failed: {run.error}; {where}, ended {run.seen}"
+        else:
+            yield f"done; {where}, ended {run.seen}"
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"

@@ -1,0 +1,50 @@
+"""Schedulers and workers as users start them."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from distributed import Client
+
+SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+
+
+def dask(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
+
+
+def stop(process: subprocess.Popen[str]) -> None:
+    """End a process, by force if it does not go of itself: a worker may wait for a peer that is gone."""
+    process.terminate()
+    try:
+        process.communicate(timeout=20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+
+
+def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
+    """Where a scheduler that was just started listens."""
+    assert scheduler.stderr is not None
+    return next(found[0] for line in scheduler.stderr if (found := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
+
+
+@contextmanager
+def tcp_cluster(*workers: list[str]) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """The address of a scheduler, and its workers, each with further options."""
+    scheduler = dask(*SCHEDULER)
+    processes: list[subprocess.Popen[str]] = []
+    try:
+        address = scheduler_address(scheduler)
+        processes += [dask("worker", address, *WORKER, *options) for options in workers]
+        with Client(address) as client:
+            client.wait_for_workers(len(workers), timeout=60)
+        yield address, processes
+    finally:
+        for process in reversed([scheduler, *processes]):
+            stop(process)

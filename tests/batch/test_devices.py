@@ -1,0 +1,84 @@
+"""Workers of a host do not share a GPU."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from sobolev_batch.batch.devices import chosen_devices, claim_device
+
+HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ("0", HOST[:1]),
+        ("2,0", (HOST[2], HOST[0])),
+        ("1,1", HOST[1:2]),
+        ("GPU-cccc-3", HOST[2:]),
+        ("GPU-cc, 0", (HOST[2], HOST[0])),
+        ("GPU-aa,0", ()),  # ambiguous
+        ("MIG-7d-5", ("MIG-7d-5",)),
+        ("1,7,0", HOST[1:2]),  # ends at what is no device
+        ("1,-1,0", HOST[1:2]),
+        ("-1", ()),
+        ("", ()),
+        ("NoDevFiles", ()),
+    ],
+)
+def test_visible_devices_are_read_as_cuda_does(wanted: str, expected: tuple[str, ...]) -> None:
+    assert chosen_devices(wanted, HOST) == expected
+
+
+WORKER = """
+import os, sys
+from sobolev_batch.batch.devices import claim_device
+claim = claim_device(sys.argv[1:])
+print(claim.device if claim else None, os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are claimed on Linux only")
+def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free() -> None:
+    devices = [f"GPU-{os.getpid()}-{number}" for number in range(2)]
+    processes: list[subprocess.Popen[str]] = []
+
+    def start() -> str:
+        process = subprocess.Popen(
+            [sys.executable, "-c", WORKER, *devices],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={key: value for key, value in os.environ.items() if key != "CUDA_VISIBLE_DEVICES"},
+        )
+        processes.append(process)
+        assert process.stdout is not None
+        return process.stdout.readline().strip()
+
+    try:
+        assert [start() for _ in range(3)] == [f"{devices[0]} {devices[0]}", f"{devices[1]} {devices[1]}", "None None"]
+        processes[0].kill()
+        processes[0].wait()
+        assert start() == f"{devices[0]} {devices[0]}"
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are claimed on Linux only")
+def test_a_device_that_is_released_can_be_claimed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "before")
+    device = f"GPU-{os.getpid()}-released"
+    first = claim_device([device])
+    assert first is not None
+    assert claim_device([device]) is None
+    first.release()
+    second = claim_device([device])
+    assert second is not None
+    second.release()

@@ -1,0 +1,84 @@
+"""What workers find at their start, and what studies that ask for a GPU are told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from sobolev_batch import ClusterError, Study, open_store, run
+from sobolev_batch.batch.cluster import local_client, remote_client
+from sobolev_batch.batch.crew import GPU, MEMORY
+from sobolev_batch.batch.equipment import enlist
+from tests.batch.conftest import small_table, variable
+from tests.batch.processes import tcp_cluster
+
+
+@pytest.fixture
+def boastful_cluster() -> Iterator[str]:
+    """A scheduler with two workers, of which one declares a GPU that it does not have."""
+    with tcp_cluster([], ["--resources", "GPU=1"]) as (address, _):
+        yield address
+
+
+def study_on(backend: str) -> Study:
+    return Study.from_table(small_table(transform={"backend": backend}))
+
+
+def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
+    boastful_cluster: str, store_path: Path
+) -> None:
+    with remote_client(boastful_cluster) as client:
+        with pytest.raises(ClusterError) as caught:
+            run(study_on("gpu"), store_path, client)
+        message = str(caught.value)
+        assert "the study asks for backend 'gpu', and none of the 2 workers can compute on one" in message
+        assert message.count("(declares a GPU)") == 1
+        assert "ask for backend 'auto'" in message
+        summary = run(study_on("auto"), store_path, client)
+    assert len(summary.computed) == 5
+    assert not summary.failed
+    meshes = open_store(store_path)["meshes"].to_dataset()
+    assert set(meshes["backend"].values.tolist()) == {"finufft"}
+    assert len(set(meshes["worker"].values.tolist())) == 2
+
+
+def test_workers_declare_their_memory(client: Client) -> None:
+    crew = enlist(client)
+    assert crew.threads == 2
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    for member in crew.members:
+        assert member.backend == "cpu"
+        assert member.note
+        declared = workers[member.address]["resources"]
+        assert declared == {MEMORY: member.spare_bytes}
+        assert GPU not in declared
+        assert 0.5 < member.spare_bytes / workers[member.address]["memory_limit"] < 0.85
+
+
+def test_workers_that_join_later_are_equipped_too() -> None:
+    with local_client(1) as client:
+        enlist(client)
+        client.cluster.scale(2)
+        client.wait_for_workers(2, timeout=60)
+        assert len(enlist(client).members) == 2
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        assert all(worker["resources"][MEMORY] > 0 for worker in workers)
+
+
+def test_the_memory_of_local_workers_can_be_given() -> None:
+    with local_client(1, "3GB") as client:
+        (member,) = enlist(client).members
+    assert member.spare_bytes == pytest.approx(0.85 * 3e9 - 300e6)
+
+
+def test_a_memory_that_is_no_number() -> None:
+    with pytest.raises(ClusterError, match="memory must be a number of bytes such as 4GB or 512MiB, found 'much'"):
+        local_client(1, "much").__enter__()
+
+
+def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:
+    run(study_on("cpu"), store_path, client)
+    assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"finufft"}
