@@ -6,7 +6,6 @@ A mesh file that is a named pipe holds the worker that reads it in its task for 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from sobolev_batch import Study, icosphere, open_store, run
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
-from tests.batch.test_clusters import SCHEDULER, dask, stop
+from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop
 
 
 class Cluster:
@@ -33,8 +32,7 @@ class Cluster:
         self.address = address
 
     def start(self, *options: str) -> subprocess.Popen[str]:
-        loopback = ["--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
-        self.processes.append(dask("worker", self.address, "--nthreads", "1", *loopback, *options))
+        self.processes.append(dask("worker", self.address, *WORKER, *options))
         return self.processes[-1]
 
 
@@ -43,9 +41,7 @@ def cluster() -> Iterator[Cluster]:
     scheduler = dask(*SCHEDULER)
     made: Cluster | None = None
     try:
-        assert scheduler.stderr is not None
-        address = next(found[0] for line in scheduler.stderr if (found := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
-        made = Cluster(scheduler, address)
+        made = Cluster(scheduler, scheduler_address(scheduler))
         yield made
     finally:
         for process in reversed(made.processes if made else [scheduler]):

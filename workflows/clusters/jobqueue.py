@@ -128,9 +128,8 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
     options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
     # Certificates for this time alone, in a folder that all nodes see and nobody else can read: of the one in which
     # this was started, unless the configuration names another.
-    with TemporaryDirectory(
-        prefix=".sobolev-batch-", dir=setting(system, "shared-temp-directory") or Path.cwd()
-    ) as work:
+    parent = setting(system, "shared-temp-directory") or Path.cwd()
+    with TemporaryDirectory(prefix=".sobolev-batch-", dir=parent) as work:
         folder = Path(work, "certificates")
         subprocess.run([Path(__file__).with_name("make-certificates"), folder], check=True, stdout=subprocess.DEVNULL)
         cluster = CLUSTERS[system](security=security_of(folder), scheduler_options=options)
@@ -141,14 +140,15 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
             finally:
                 forget_refused(cluster)
 
+        least = 1 if adaptive else jobs
         with closing(cluster):
-            for _ in range(1 if adaptive else jobs):
+            for _ in range(least):
                 # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
                 cluster.worker_spec.update(cluster.new_worker_spec())
                 cluster.sync(submit)
             cluster.adapt(
                 Adaptive=Replacing,
-                minimum_jobs=0 if adaptive else jobs,
+                minimum_jobs=least,
                 maximum_jobs=jobs,
                 interval=INTERVAL_SECONDS,
                 wait_count=4,  # so often in a row must a job have had nothing to do before it goes
@@ -182,6 +182,7 @@ def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None
         place = store or Path("storage") / f"{parsed.name}.zarr"
         with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
             click.echo("jobs are submitted; the study begins with the first that runs", err=True)
+            client.wait_for_workers(1)
             summary = run(parsed, place, client, on_progress=show)
         click.echo(format_table(open_store(place)))
     except (SobolevBatchError, RuntimeError) as error:  # the latter: what the batch system or Dask refuses
