@@ -62,14 +62,15 @@ def _explanation(address: str, seconds: float, security: Any, error: BaseExcepti
             "use the certificates with which it was started"
         )
     said = " ".join(str(cause) for cause in causes if cause is not None)
-    if "ALERT" in said:
+    if "WRONG_VERSION_NUMBER" in said:
+        return f"what answers at {address} is not encrypted; start the scheduler with --protocol tls, or use {other}"
+    # The refusal itself does not always arrive before the end of the connection.
+    if isinstance(error, CommClosedError) and encrypted:
         return (
             f"the scheduler at {address} refuses the certificate {security.tls_client_cert} ({error}); "
             "use the certificates with which it was started"
         )
-    if "WRONG_VERSION_NUMBER" in said:
-        return f"what answers at {address} is not encrypted; start the scheduler with --protocol tls, or use {other}"
-    if isinstance(error, CommClosedError) and not encrypted:
+    if isinstance(error, CommClosedError):
         return (
             f"what answers at {address} closes the connection; if it is a scheduler with certificates, "
             f"use {other} and {_CONFIGURE}"

@@ -113,6 +113,8 @@ def run(
         StoreError: the store cannot be written or belongs to another study.
         ClusterError: no worker has the GPU that the study asks for, or memory enough for its lattice.
     """
+    if client is not None and "://" not in str(store):
+        store = Path(store).absolute()  # the folder in which its workers were started may be another
     plan = make_plan(study, stored_choice(store))
     place = Store.prepare(store, plan)
     rows = rows_of(place, plan)

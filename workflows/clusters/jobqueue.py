@@ -132,7 +132,12 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
     with TemporaryDirectory(prefix=".sobolev-batch-", dir=parent) as work:
         folder = Path(work, "certificates")
         subprocess.run([Path(__file__).with_name("make-certificates"), folder], check=True, stdout=subprocess.DEVNULL)
-        cluster = CLUSTERS[system](security=security_of(folder), scheduler_options=options)
+        cluster = CLUSTERS[system](
+            # Said here too: dask-jobqueue does not know the workers of its jobs by name from the configuration alone.
+            processes=setting(system, "processes"),
+            security=security_of(folder),
+            scheduler_options=options,
+        )
 
         async def submit() -> None:
             try:
