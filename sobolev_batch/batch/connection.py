@@ -58,8 +58,8 @@ def _explanation(address: str, seconds: float, security: Any, error: BaseExcepti
     causes = [error, error.__cause__]
     if any(isinstance(cause, ssl.SSLCertVerificationError) for cause in causes):
         return (
-            f"the certificate of the scheduler at {address} is not good for {security.tls_ca_file} ({error.__cause__}); "
-            "use the certificates with which it was started"
+            f"the certificate of the scheduler at {address} is not good for {security.tls_ca_file} "
+            f"({error.__cause__}); use the certificates with which it was started"
         )
     said = " ".join(str(cause) for cause in causes if cause is not None)
     if "WRONG_VERSION_NUMBER" in said:
@@ -75,10 +75,8 @@ def _explanation(address: str, seconds: float, security: Any, error: BaseExcepti
             f"what answers at {address} closes the connection; if it is a scheduler with certificates, "
             f"use {other} and {_CONFIGURE}"
         )
-    return (
-        f"no Dask scheduler answers at {address!r} within {seconds:g} s ({str(error) or 'something listens and says nothing'}); "
-        "start one with: dask scheduler"
-    )
+    reason = str(error) or "something listens and says nothing"
+    return f"no Dask scheduler answers at {address!r} within {seconds:g} s ({reason}); start one with: dask scheduler"
 
 
 def _configuration() -> str:

@@ -98,7 +98,7 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     assert [file.name for file in files] == ["ca.pem", "certificate.pem", "key.pem", "tls.yaml"]
     assert stat.S_IMODE(certificates.stat().st_mode) == 0o700
     assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
-    verify = ["openssl", "verify", "-x509_strict", "-CAfile", files[0], files[1]]
+    verify = ["openssl", "verify", "-x509_strict", "-CAfile", *map(str, files[:2])]
     assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
     before = {file: file.read_bytes() for file in files}
     again = make_certificates(certificates)

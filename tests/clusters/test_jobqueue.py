@@ -24,7 +24,9 @@ echo "Submitted batch job $!"
 SCANCEL = 'kill -- "-$1"'
 
 
-def jobqueue(home: Path, *options: str, settings: Path = SETTINGS, **variables: str) -> subprocess.CompletedProcess[str]:
+def jobqueue(
+    home: Path, *options: str, settings: Path = SETTINGS, **variables: str
+) -> subprocess.CompletedProcess[str]:
     """The documented command, with further options."""
     command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
     script, study = FOLDER / Path(command[0]).name, command[1]
@@ -44,12 +46,11 @@ def jobqueue(home: Path, *options: str, settings: Path = SETTINGS, **variables: 
     [
         (
             "slurm",
-            ["SBATCH -p compute", "SBATCH -A project42", "SBATCH --cpus-per-task=8", "SBATCH --mem=32G"]
-            + ["SBATCH -t 04:00:00"],
+            ["-p compute", "-A project42", "--cpus-per-task=8", "--mem=32G", "-t 04:00:00"],
         ),
         (
             "pbs",
-            ["PBS -q compute", "PBS -A project42", "PBS -l select=1:ncpus=8:mem=32GB", "PBS -l walltime=04:00:00"],
+            ["-q compute", "-A project42", "-l select=1:ncpus=8:mem=32GB", "-l walltime=04:00:00"],
         ),
     ],
 )
@@ -58,7 +59,7 @@ def test_the_script_of_a_job(system: str, directives: list[str], tmp_path: Path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     for directive in directives:
-        assert f"#{directive}" in lines
+        assert f"#{'SBATCH' if system == 'slurm' else 'PBS'} {directive}" in lines
     (worker,) = (line for line in lines if "dask_worker" in line)
     assert worker.startswith(f"{sys.executable} -m distributed.cli.dask_worker tls://")
     for option in (

@@ -37,7 +37,7 @@ INTERVAL_SECONDS = 30.0  # between looks at what jobs there are
 SOME_FAILED = 3  # the exit status of sobolev-batch
 
 
-class Replacing(Adaptive):
+class Replacing(Adaptive):  # type: ignore[misc]  # distributed has no types
     """Asks for a new job once the workers of one have left.
 
     Left to itself dask-jobqueue notices this of jobs with one worker only, and takes a refused job for one that waits.
