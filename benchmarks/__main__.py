@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from benchmarks.accuracy import left_to_us, stored_bytes
+from benchmarks.devices import on_a_gpu
 from benchmarks.memory import peaks
 from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
@@ -23,6 +24,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "6": all_pairs,
     "7": stored_bytes,
     "8": peaks,
+    "9": on_a_gpu,
     "growth": growth,
 }
 
@@ -39,7 +41,8 @@ def main() -> None:
     facts = [
         *machine_facts(),
         f"times are medians of {effort.repeats} turns each, taken alternately",
-        "items 1 to 4: ratios of times are other / ours; items 5 to 7: ours / other; distances: relative difference",
+        "items 1 to 4: ratios of times are other / ours; items 5 to 7 and 9: ours / other; "
+        "distances: relative difference",
     ]
     print("\n".join(["", format_table(rows), "", *facts]))
     if options.markdown:

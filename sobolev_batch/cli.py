@@ -13,7 +13,11 @@ from typing import Any, Self
 
 import click
 
-from sobolev_batch.batch.cluster import remote_client
+from sobolev_batch.batch.cluster import available_cores, remote_client
+from sobolev_batch.batch.crew import Crew
+from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.layout import lay_out_rows
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan, make_plan
 from sobolev_batch.batch.run import Progress, Summary, run
 from sobolev_batch.batch.store import Store, stored_choice
@@ -31,6 +35,8 @@ from sobolev_batch.surfaces.similarity import Similarity
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 1, 2, 3, 130
 _DEFAULT_FOLDER = Path("storage")
 _FOLLOW_SECONDS = 5.0
+# Of object storage, by the names of their loggers.
+_DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -51,14 +57,18 @@ def cli(context: click.Context, debug: bool) -> None:
         format="%(levelname)s %(name)s: %(message)s",
         stream=sys.stderr,
     )
-    if not debug:
+    if debug:
+        # Below that they log what they send, with its signature and a session's token.
+        for driver in _DRIVERS:
+            logging.getLogger(driver).setLevel(logging.INFO)
+    else:
         # The cluster's own messages at shutdown are of no use to someone who reads a table.
         logging.getLogger("distributed").setLevel(logging.ERROR)
 
 
 @cli.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+@click.option("--store", type=Location.of, metavar="PATH|URL", help="Where results go. [default: storage/NAME.zarr]")
 @click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
 @click.option("--worker-memory", metavar="SIZE", help="Of each of them, such as 4GB. [default: an equal part]")
@@ -66,7 +76,7 @@ def cli(context: click.Context, debug: bool) -> None:
 def run_command(
     context: click.Context,
     study: Path,
-    store: Path | None,
+    store: Location | None,
     scheduler: str | None,
     workers: int | None,
     worker_memory: str | None,
@@ -77,7 +87,7 @@ def run_command(
             "--workers and --worker-memory are for a cluster on this machine; one with a scheduler has its own"
         )
     parsed = Study.from_toml(study)
-    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
     with _Reporter() as reporter:
         if scheduler:
             with remote_client(scheduler) as client:
@@ -93,8 +103,8 @@ def run_command(
 @cli.command("submit")
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--scheduler", metavar="ADDRESS", required=True, help="A Dask scheduler, such as tcp://host:8786.")
-@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
-def submit_command(study: Path, scheduler: str, store: Path | None) -> None:
+@click.option("--store", type=Location.of, metavar="PATH|URL", help="Where results go. [default: storage/NAME.zarr]")
+def submit_command(study: Path, scheduler: str, store: Location | None) -> None:
     """Hand STUDY over to a cluster and return; it goes on without this process."""
     parsed = Study.from_toml(study)
     with remote_client(scheduler) as client:
@@ -105,21 +115,29 @@ def submit_command(study: Path, scheduler: str, store: Path | None) -> None:
 
 @cli.command("plan")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--store", type=click.Path(path_type=Path), help="Where results would go. [default: storage/NAME.zarr]")
-def plan_command(study: Path, store: Path | None) -> None:
+@click.option(
+    "--store", type=Location.of, metavar="PATH|URL", help="Where results would go. [default: storage/NAME.zarr]"
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Plan for its workers. [default: for processes on this machine]")
+def plan_command(study: Path, store: Location | None, scheduler: str | None) -> None:
     """Show what running STUDY would do: tasks, lattice, bytes, memory, what is already there."""
     parsed = Study.from_toml(study)
-    place = store or _DEFAULT_FOLDER / f"{parsed.name}.zarr"
+    place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
     plan = make_plan(parsed, stored_choice(place))
-    for name, value in _plan_lines(plan, place):
+    if scheduler:
+        with remote_client(scheduler) as client:
+            crew = enlist(client)
+    else:
+        crew = Crew.of_this_machine(available_cores())
+    for name, value in _plan_lines(plan, place, crew):
         click.echo(f"{name + ':':<14} {value}")
 
 
 @cli.command("status")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of, metavar="STORE")
 @click.option("--follow", is_flag=True, help="Show it again and again until the run has ended.")
 @click.pass_context
-def status_command(context: click.Context, store: Path, follow: bool) -> None:
+def status_command(context: click.Context, store: Location, follow: bool) -> None:
     """Show how far STORE is, and what failed and why."""
     status = Status.of(store)
     while follow and status.going_on:
@@ -134,20 +152,20 @@ def status_command(context: click.Context, store: Path, follow: bool) -> None:
 
 
 @cli.command("table")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of)
 @click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
 @click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
-def table_command(store: Path, style: Format, orders: tuple[float, ...]) -> None:
+def table_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
     """Print the convergence tables of STORE."""
     click.echo(format_table(open_store(store), style, orders or None))
 
 
 @cli.command("plot")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=Location.of)
 @click.option(
     "--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures."
 )
-def plot_command(store: Path, output: Path) -> None:
+def plot_command(store: Location, output: Path) -> None:
     """Draw the convergence and the transforms of STORE."""
     # Imported here: it takes as long as everything that the other commands do at their start.
     from sobolev_batch.results.plots import plot_store
@@ -259,10 +277,9 @@ class _Reporter:
             self._bar = None
 
 
-def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
+def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, str]]:
     study, lattice, transform = plan.study, plan.lattice, plan.transform
     origin = " ".join(f"{x:.9g}" for x in plan.similarity.origin)
-    tasks = len(plan.rows) * len(plan.blocks)
     yield "study", study.title
     yield "surfaces", f"{len(plan.rows)} in {len(study.families)} families, reference {plan.reference}"
     yield (
@@ -285,15 +302,35 @@ def _plan_lines(plan: Plan, place: Path) -> Iterator[tuple[str, str]]:
             "transform",
             f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
         )
-    yield "tasks", f"{tasks}, {len(plan.blocks)} per surface"
-    yield "memory", f"{_size(plan.task_memory_bytes)} per task at most, and its mesh"
+    yield "backend", study.backend
+    yield from _task_lines(plan, crew)
     yield "storage", f"{_size(plan.field_bytes)} per surface, {_size(plan.field_bytes * len(plan.rows))} in all"
     there = _stored_keys(place)
     done = sum(there.get(row.label) == row.key != "" for row in plan.rows)
     yield "store", f"{place}, {done} of {len(plan.rows)} already there"
 
 
-def _stored_keys(place: Path) -> dict[str, str]:
+def _task_lines(plan: Plan, crew: Crew) -> Iterator[tuple[str, str]]:
+    gpus = sum(member.backend == "gpu" for member in crew.members)
+    yield (
+        "workers",
+        f"{len(crew.members)} with {crew.threads} threads and {gpus} GPUs, {_size(crew.share_bytes)} or more to spare "
+        "for each thread",
+    )
+    layouts, refused = lay_out_rows(plan, plan.rows, crew.with_backend(plan.study.backend))
+    tasks = sum(layout.task_count for layout in layouts.values())
+    yield "tasks", f"{tasks} for {len(layouts)} surfaces, the lattice in {len(plan.blocks)} blocks"
+    for label, layout in layouts.items():
+        if layout.parts > 1:
+            yield "cut", f"{label} into {layout.parts} parts"
+    if layouts:
+        largest = max(layouts, key=lambda label: layouts[label].largest_bytes)
+        yield "memory", f"up to {_size(layouts[largest].largest_bytes)} in a task, of {largest}"
+    for label, reason in refused.items():
+        yield "refused", f"{label}: {reason}"
+
+
+def _stored_keys(place: Location) -> dict[str, str]:
     if not place.exists():
         return {}
     store = Store.open(place)

@@ -211,7 +211,7 @@ def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path) -> N
     assert "Traceback" not in done.stderr
     status = call("status", "storage/partly.zarr", folder=folder)
     assert status.returncode == 3
-    assert "3 of 4 complete, 1 failed\nf/bad: " in status.stdout
+    assert "3 of 4 complete, 1 failed, 0 to go\nf/bad: " in status.stdout
 
 
 def test_nothing_answers_at_the_scheduler(folder: Path) -> None:

@@ -61,6 +61,35 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
 
 
 @contextmanager
+def thread_client(workers: int | None = None) -> Iterator[Client]:
+    """A client of a new cluster of threads of this process, for a store that no other process can see.
+
+    Args:
+        workers: how many threads; default one per core that this process may use.
+    """
+    # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
+    # and the link would name one of them.
+    with (
+        dask.config.set(
+            {
+                "distributed.worker.profile.enabled": False,
+                "distributed.dashboard.link": "http://127.0.0.1:{port}/status",
+            }
+        ),
+        LocalCluster(
+            n_workers=1,
+            threads_per_worker=workers or available_cores(),
+            processes=False,
+            protocol="inproc://",
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
 def remote_client(address: str) -> Iterator[Client]:
     """A client of the scheduler at an address such as tcp://host:8786.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import psutil
+
 from sobolev_batch.batch.study import Backends
 from sobolev_batch.errors import ClusterError
 
@@ -34,11 +36,27 @@ class CrewMember:
     declares_gpu: bool = False
 
 
+# Of a worker's memory limit, what tasks may take together: Dask pauses a worker near its limit and
+# ends it at it, and an idle process with its libraries takes the constant part.
+_USABLE, _IDLE_BYTES = 0.85, 300e6
+
+
+def spare_bytes(limit: float | None) -> float:
+    """What tasks of a worker with a memory limit may take together; without one, the machine's memory is the limit."""
+    return _USABLE * (limit or psutil.virtual_memory().total) - _IDLE_BYTES
+
+
 @dataclass(frozen=True)
 class Crew:
     """All workers of a cluster at the time when a study begins."""
 
     members: tuple[CrewMember, ...]
+
+    @classmethod
+    def of_this_machine(cls, count: int) -> Crew:
+        """The workers of a cluster that a run without a scheduler would start here."""
+        spare = spare_bytes(psutil.virtual_memory().total / count)
+        return cls(tuple(CrewMember("this machine", 1, spare, "cpu", "") for _ in range(count)))
 
     @property
     def threads(self) -> int:

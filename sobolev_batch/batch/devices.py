@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Lock
 
+from sobolev_batch.errors import BackendError
+from sobolev_batch.spectral.cuda import INSTALL
+
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 # What this process has: one device at most, since CUDA settles on what it sees at its start.
 _held: set[str] = set()
@@ -35,19 +38,29 @@ class Claim:
 def visible_devices() -> tuple[str, ...]:
     """The UUIDs of the GPUs that this process may use: those of CUDA_VISIBLE_DEVICES, or all of the host.
 
-    Empty where there is no NVIDIA driver or the library that asks it is not installed. CUDA itself is
-    not started: it would settle on its devices for good.
+    CUDA itself is not started: it would settle on its devices for good.
+
+    Raises:
+        BackendError: there are none, or nobody can tell.
     """
     try:
         import pynvml
-
+    except ImportError as error:
+        raise BackendError(f"no GPU: nvidia-ml-py, which lists them, is not installed: {INSTALL}") from error
+    try:
         pynvml.nvmlInit()
-    except Exception:  # no library, no driver, or one that does not answer: there is nothing to be had
-        return ()
-    count = pynvml.nvmlDeviceGetCount()
-    uuids = [str(pynvml.nvmlDeviceGetUUID(pynvml.nvmlDeviceGetHandleByIndex(i))) for i in range(count)]
+        count = pynvml.nvmlDeviceGetCount()
+        uuids = [str(pynvml.nvmlDeviceGetUUID(pynvml.nvmlDeviceGetHandleByIndex(i))) for i in range(count)]
+    except pynvml.NVMLError_LibraryNotFound as error:
+        raise BackendError("no GPU: the NVIDIA driver is not installed on this machine") from error
+    except pynvml.NVMLError as error:
+        raise BackendError(f"no GPU: the NVIDIA driver says: {error}") from error
     wanted = os.environ.get(_VISIBLE)
-    return tuple(uuids) if wanted is None else chosen_devices(wanted, uuids)
+    found = tuple(uuids) if wanted is None else chosen_devices(wanted, uuids)
+    if not found:
+        hidden = f"CUDA_VISIBLE_DEVICES={wanted} hides all {count}" if count else "the NVIDIA driver sees none"
+        raise BackendError(f"no GPU: {hidden}")
+    return found
 
 
 def chosen_devices(wanted: str, uuids: Sequence[str]) -> tuple[str, ...]:

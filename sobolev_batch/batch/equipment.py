@@ -6,10 +6,9 @@ import asyncio
 import logging
 from typing import Any
 
-import psutil
 from distributed import Client, Worker, WorkerPlugin, get_worker
 
-from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember
+from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember, spare_bytes
 from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
@@ -17,9 +16,6 @@ from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
 _log = logging.getLogger(__name__)
 
 _NAME = "sobolev-batch"
-# Of a worker's memory limit, what tasks may take together: Dask pauses a worker near its limit and
-# ends it at it, and an idle process with its libraries takes the constant part.
-_USABLE, _IDLE_BYTES = 0.85, 300e6
 
 
 class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -47,8 +43,7 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
 
     async def setup(self, worker: Worker) -> None:
         """Find out what is there; in a thread, since loading CUDA takes seconds."""
-        limit = worker.memory_manager.memory_limit or psutil.virtual_memory().total
-        self.spare_bytes = _USABLE * limit - _IDLE_BYTES
+        self.spare_bytes = spare_bytes(worker.memory_manager.memory_limit)
         await asyncio.to_thread(self._find_backend)
         declared = [name for name in worker.state.total_resources if name.upper() == "GPU"]
         if declared and self.backend.name != "gpu":
@@ -62,14 +57,14 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
             self._claim.release()
 
     def _find_backend(self) -> None:
-        devices = visible_devices()
-        claim = claim_device(devices)
+        claim = None
         try:
-            if devices and claim is None:
-                raise BackendError(f"other workers have all of the {len(devices)} GPUs that it may use")
-            self.backend = gpu_backend()
-            self.note = self.backend.library
-            self._claim = claim
+            devices = visible_devices()
+            claim = claim_device(devices)
+            if claim is None:
+                raise BackendError(f"no GPU left: other workers have all of the {len(devices)} that it may use")
+            backend = gpu_backend()
+            self.backend, self.note, self._claim = backend, backend.description, claim
         except BackendError as error:
             self.note = str(error)
             if claim is not None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sobolev_batch.batch.crew import Crew
+from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.precision import item_bytes
@@ -47,6 +48,30 @@ class Layout:
     def largest_bytes(self) -> float:
         """What the most demanding task takes."""
         return max(self.making_bytes, self.task_bytes)
+
+    @property
+    def task_count(self) -> int:
+        """How many tasks it makes."""
+        if self.parts == 1:
+            return len(self.groups) + (len(self.groups) > 1)
+        # Parts, their sums in pairs, and the storing of each block; the cut and the record.
+        return 2 * self.parts * sum(map(len, self.groups)) + 2
+
+
+def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Crew) -> tuple[dict[str, Layout], dict[str, str]]:
+    """The layouts of rows by their labels, and for each that fits into no worker the reason.
+
+    Raises:
+        ClusterError: the lattice itself fits into no worker, whatever the mesh.
+    """
+    lay_out(plan.blocks, plan.transform, Size(), crew, len(rows))
+    layouts, refused = {}, {}
+    for row in rows:
+        try:
+            layouts[row.label] = lay_out(plan.blocks, plan.transform, row.member.expected_size(), crew, len(rows))
+        except ClusterError as error:
+            refused[row.label] = f"the mesh is too large: {error}"
+    return layouts, refused
 
 
 def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Crew, rows: int) -> Layout:

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
-from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, memory_bytes, require_inside
+from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member, sole_member
@@ -102,11 +102,6 @@ class Plan:
     def field_bytes(self) -> int:
         """Bytes of one stored field."""
         return self.lattice.half.size * self.item_bytes
-
-    @property
-    def task_memory_bytes(self) -> int:
-        """Peak memory of one task, without its mesh."""
-        return memory_bytes(self.blocks[0], self.transform)
 
 
 def make_plan(study: Study, known: Choice | None = None) -> Plan:

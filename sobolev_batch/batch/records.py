@@ -113,23 +113,21 @@ class RunRecord:
     stage: str = ""
     error: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps(asdict(self))
+    def to_table(self) -> dict[str, str]:
+        """The record as JSON takes it."""
+        return asdict(self)
 
     @classmethod
-    def from_json(cls, text: str) -> Self | None:
-        """The record that a line holds, or None where nothing was written.
+    def from_table(cls, table: dict[str, str]) -> Self:
+        """The record that a table holds.
 
         Raises:
-            StoreError: the line is not a record.
+            StoreError: it is not one.
         """
-        if not text:
-            return None
         try:
-            return cls(**json.loads(text))
-        except (ValueError, TypeError) as error:
-            raise StoreError(f"the record of the latest run is damaged ({error}): {text[:80]!r}") from error
+            return cls(**table)  # type: ignore[arg-type]
+        except TypeError as error:
+            raise StoreError(f"the record of the latest run is damaged ({error}): {table}") from error
 
 
 def utc_now() -> str:

@@ -22,6 +22,8 @@ Complexes = NDArray[np.complex128]
 _TILE_BYTES = 384 << 20
 _GROUP = 32
 _READ_AT_ONCE = 8
+# Of fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
+_FEWEST_ROWS = 4
 # The others of a tile per row of it: they only pass through, and its rows are read but once for them.
 _TILE_LENGTH = 4
 
@@ -109,10 +111,14 @@ class Reducer:
             others: of the other side; they either begin with all of the rows or have none of them.
         """
         shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
-        found = [self._block_sums(rows, others, block, shared) for block in self.blocks]
-        products, left, right = (add_sums(parts) for parts in zip(*found, strict=True))
-        sums, cancelled = differences(products, left, right)
-        for i, j in np.argwhere(np.triu(cancelled) if shared else cancelled).tolist():
+        if self._capacity < _FEWEST_ROWS:
+            sums = Sums.zeros(len(self.orders), len(rows), len(others))
+            direct_pairs = np.ones((len(rows), len(others)), dtype=bool)
+        else:
+            found = [self._block_sums(rows, others, block, shared) for block in self.blocks]
+            products, left, right = (add_sums(parts) for parts in zip(*found, strict=True))
+            sums, direct_pairs = differences(products, left, right)
+        for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
             direct = self._direct(rows[i], others[j])
             sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
         for square in (sums.squares[..., :shared], sums.outer[..., :shared]):

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,23 +16,23 @@ from distributed import Client, Future, as_completed
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.choice import Choice
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
 from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.journal import Journal
-from sobolev_batch.batch.layout import Layout, lay_out
+from sobolev_batch.batch.layout import lay_out_rows
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan, Row, make_plan
+from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job
-from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.surfaces.sources import Size
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Summary:
     """What a run did.
 
     Attributes:
-        store: the path of the store.
+        store: the path or URL of the store.
         computed: labels of the meshes whose fields were computed now.
         reused: labels of those that were already there.
         failed: the reason for each mesh that could not be computed.
@@ -84,7 +84,7 @@ class Summary:
 
 def run(
     study: Study,
-    store: str | Path,
+    store: str | Path | Location,
     client: Client | None = None,
     *,
     workers: int | None = None,
@@ -95,7 +95,7 @@ def run(
 
     Args:
         study: what to compute.
-        store: path of a new or existing store; the workers must reach it under the same path.
+        store: path or URL of a new or existing store; the workers must reach it under the same name.
         client: of the cluster to compute on. Without one, a cluster of single-threaded processes on
             this machine serves for the time of the call; a script that relies on it must guard its
             main part by ``if __name__ == "__main__"``, as all that starts processes must. Where
@@ -110,20 +110,24 @@ def run(
     Raises:
         StudyError, MeshError, LatticeError: the study cannot be carried out.
         AccuracyError: the accuracy that the study asks for is out of reach; nothing was computed.
-        StoreError: the store cannot be written or belongs to another study.
+        StoreError: the store cannot be reached or written, or belongs to another study.
         ClusterError: no worker has the GPU that the study asks for, or memory enough for its lattice.
     """
-    if client is not None and "://" not in str(store):
-        store = Path(store).absolute()  # the folder in which its workers were started may be another
-    plan = make_plan(study, stored_choice(store))
-    place = Store.prepare(store, plan)
+    location = Location.of(store)
+    if client is not None:
+        location = location.absolute()
+    known = stored_choice(location)
+    if client is not None:
+        require_reach(client, location)
+    plan = make_plan(study, known)
+    place = Store.prepare(location, plan)
     rows = rows_of(place, plan)
-    records = place.records()
+    records = list(place.records())
     notify = on_progress or (lambda progress: None)
-    missing = rows_without_field(place, rows)
+    missing = rows_without_field(records, rows)
     with Journal(place) as journal:
         if missing or not _is_reduced(place, plan, rows, records):
-            with nullcontext(client) if client is not None else local_client(workers, memory) as active:
+            with nullcontext(client) if client is not None else _own_client(location, workers, memory) as active:
                 journal.cluster = active.scheduler.address
                 notify(Progress("cluster", 0, 0, active.dashboard_link))
                 crew = enlist(active)
@@ -135,19 +139,19 @@ def run(
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                     notify(progress)
 
-                _compute_fields(active, crew, place, plan, rows, missing, note)
-                found = _reduce(active, crew, place, plan, rows, note)
+                _compute_fields(active, crew, place, plan, rows, missing, records, note)
+                found = _reduce(active, crew, place, plan, rows, records, note)
                 for _ in range(_MOST_ROUNDS - 1):
                     choice = _grown(plan, found)
                     if choice is None:
                         break
                     plan = plan.on(choice)
-                    place = Store.prepare(store, plan)
+                    place = Store.prepare(location, plan)
                     rows = rows_of(place, plan)
-                    missing = rows_without_field(place, rows)
-                    _compute_fields(active, crew, place, plan, rows, missing, note)
-                    found = _reduce(active, crew, place, plan, rows, note)
-    records = place.records()
+                    records = list(place.records())
+                    missing = rows_without_field(records, rows)
+                    _compute_fields(active, crew, place, plan, rows, missing, records, note)
+                    found = _reduce(active, crew, place, plan, rows, records, note)
     failed = {
         row.label: record.reason if record else "not computed"
         for row, record in zip(rows, records, strict=True)
@@ -162,9 +166,13 @@ def run(
     )
 
 
-def rows_without_field(store: Store, rows: Sequence[Row]) -> list[int]:
+def _own_client(location: Location, workers: int | None, memory: str | None) -> AbstractContextManager[Client]:
+    """A cluster on this machine whose workers see the store."""
+    return thread_client(workers) if location.is_of_this_process else local_client(workers, memory)
+
+
+def rows_without_field(records: Sequence[Record | None], rows: Sequence[Row]) -> list[int]:
     """The rows whose fields are to be computed."""
-    records = store.records()
     return [i for i, record in enumerate(records) if record is None or not record.completes(rows[i].key)]
 
 
@@ -190,27 +198,25 @@ def _compute_fields(
     plan: Plan,
     rows: Sequence[Row],
     missing: Sequence[int],
+    records: list[Record | None],
     notify: Notify,
 ) -> None:
+    """Compute what is missing; its records, as they are stored, take their places in the list."""
     notify(Progress("fields", 0, len(missing)))
     equipped = crew.with_backend(plan.study.backend)
-    # A lattice that fits into no worker concerns all rows; a mesh that does not, only its own.
-    lay_out(plan.blocks, plan.transform, Size(), equipped, len(missing))
-    layouts: dict[int, Layout] = {}
-    done = 0
-    for i in missing:
-        try:
-            size = rows[i].member.expected_size()
-            layouts[i] = lay_out(plan.blocks, plan.transform, size, equipped, len(missing))
-        except ClusterError as error:
-            done += 1
-            record = Record(key=rows[i].key, status="failed", reason=f"the mesh is too large: {error}")
-            store.write_record(i, record)
-            notify(Progress("fields", done, len(missing), rows[i].label, record))
+    layouts, refused = lay_out_rows(plan, [rows[i] for i in missing], equipped)
     submitter = Submitter.of(client, equipped, plan.study.backend, layouts.values())
     futures: dict[Future, int] = {}
-    for i, layout in layouts.items():
+    done = 0
+    for i in missing:
         row = rows[i]
+        if row.label in refused:
+            done += 1
+            records[i] = record = Record(key=row.key, status="failed", reason=refused[row.label])
+            store.write_record(i, record)
+            notify(Progress("fields", done, len(missing), row.label, record))
+            continue
+        layout = layouts[row.label]
         job = Job(
             store,
             i,
@@ -226,29 +232,36 @@ def _compute_fields(
             plan.study.backend,
         )
         futures[submitter.field(job, layout)] = i
-    for future in as_completed(list(futures)):
+    # Results come along: to ask for each by itself takes longer than a small mesh.
+    for future, result in as_completed(list(futures), with_results=True, raise_errors=False):
         done += 1
         i = futures.pop(future)
         row = rows[i]
-        if future.status == "error":
+        if isinstance(result, Record):
+            record = result
+        else:
             # The task itself reports bad meshes; what arrives here is a worker that died or a store
             # that cannot be written any more.
-            failure = future.exception()
+            failure = result[1] if isinstance(result, tuple) else result
             record = Record(key=row.key, status="failed", reason=f"{type(failure).__name__}: {failure}")
             _log.error("%s: %s", row.label, record.reason)
             store.write_record(i, record)
-        else:
-            record = future.result()
-        if layouts[i].parts > 1:
+        if layouts[row.label].parts > 1:
             store.discard_pieces(i)
+        records[i] = record
         notify(Progress("fields", done, len(missing), row.label, record))
 
 
 def _reduce(
-    client: Client, crew: Crew, store: Store, plan: Plan, rows: Sequence[Row], notify: Notify
+    client: Client,
+    crew: Crew,
+    store: Store,
+    plan: Plan,
+    rows: Sequence[Row],
+    records: Sequence[Record | None],
+    notify: Notify,
 ) -> Assessed | None:
     """Make the tables; the distances to the reference, or None where the tables were there."""
-    records = store.records()
     if _is_reduced(store, plan, rows, records):
         return None
     complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
@@ -335,8 +348,8 @@ def _write_tables(
 
 
 def _is_reduced(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
-    tables = store.read_table("convergence")
-    return tables is not None and tables.attrs.get("digest") == _reduction_digest(plan, rows, records)
+    attributes = store.table_attributes("convergence")
+    return attributes is not None and attributes.get("digest") == _reduction_digest(plan, rows, records)
 
 
 def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:

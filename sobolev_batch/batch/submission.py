@@ -14,7 +14,9 @@ from distributed import Client, Future, fire_and_forget, worker_client
 
 from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.journal import Journal
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.run import rows_of, rows_without_field, run
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
@@ -41,7 +43,7 @@ class Submission:
     missing: int
 
 
-def submit(study: Study, store: str | Path, client: Client) -> Submission:
+def submit(study: Study, store: str | Path | Location, client: Client) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
@@ -56,10 +58,13 @@ def submit(study: Study, store: str | Path, client: Client) -> Submission:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: see `run`; nothing was handed over.
         ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
     """
-    plan = make_plan(study, stored_choice(store))
+    location = Location.of(store).absolute()
+    known = stored_choice(location)
+    require_reach(client, location)
+    plan = make_plan(study, known)
     enlist(client).with_backend(study.backend)
-    place = Store.prepare(_everywhere(store), plan)
-    missing = rows_without_field(place, rows_of(place, plan))
+    place = Store.prepare(location, plan)
+    missing = rows_without_field(place.records(), rows_of(place, plan))
     journal = Journal(place)
     journal.cluster = client.scheduler.address
     journal.write("submitted")
@@ -107,8 +112,3 @@ def _await_acceptance(client: Client, future: Future) -> None:
                 "see its log"
             )
         time.sleep(_POLL_SECONDS)
-
-
-def _everywhere(store: str | Path) -> str | Path:
-    """A path that means the same in any folder; URLs do already."""
-    return store if "://" in str(store) else Path(store).absolute()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sobolev_batch.batch.journal import HEARTBEAT_SECONDS
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import RunRecord, age_seconds
 from sobolev_batch.batch.store import Store
 
@@ -37,16 +38,16 @@ class Status:
     silence_seconds: float
 
     @classmethod
-    def of(cls, path: str | Path) -> Status:
+    def of(cls, place: str | Path | Location) -> Status:
         """Read the status of a store.
 
         Raises:
             StoreError: no store is there.
         """
-        store = Store.open(path)
+        store = Store.open(place)
         labels, records, run = store.labels(), store.records(), store.read_run()
         return cls(
-            str(path),
+            str(place),
             sum(record is not None and record.status == "complete" for record in records),
             len(labels),
             {
@@ -55,7 +56,7 @@ class Status:
                 if record is not None and record.status == "failed"
             },
             run,
-            store.read_table("convergence") is not None,
+            store.table_attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
         )
 

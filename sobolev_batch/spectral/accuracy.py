@@ -22,7 +22,7 @@ from sobolev_batch.spectral.budget import (
     truncated,
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
-from sobolev_batch.spectral.transform import Transform, memory_bytes
+from sobolev_batch.spectral.transform import FINEST_EPS, Transform, memory_bytes
 
 Reals = NDArray[np.float64]
 
@@ -106,7 +106,8 @@ class Accuracy:
     @staticmethod
     def _bytes(intervals: int) -> float:
         half = Lattice(1.0, intervals).half
-        return memory_bytes(half, Transform()) + 2 * 16 * half.size
+        # What is asked for may lead to any eps, and the finest takes the finest grid.
+        return memory_bytes(half, Transform(FINEST_EPS["complex128"])) + 2 * 16 * half.size
 
 
 def first_lattice(widths: Reals, reach: float, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:

@@ -60,6 +60,11 @@ class Sums:
     squares: Reals
     outer: Reals
 
+    @classmethod
+    def zeros(cls, orders: int, *shape: int) -> Sums:
+        """Room for what is to be added up."""
+        return cls(np.zeros((orders, 4, *shape)), np.zeros((2, *shape)))
+
 
 @dataclass(frozen=True)
 class Assessed:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.backends import CPU, Backend
+from sobolev_batch.spectral.backends import CPU, Backend, backend_named
 from sobolev_batch.spectral.forecast import Goal, settle
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.precision import Complexes, Precision
@@ -45,7 +46,7 @@ class Field:
     quality: Quality
     settings: Transform
     points: int
-    backend: str = CPU.library
+    backend: str
 
 
 def fourier_transform(
@@ -55,6 +56,7 @@ def fourier_transform(
     *,
     dtype: Precision = "complex128",
     quadrature: str | int = "auto",
+    backend: Literal["cpu", "gpu", "auto"] = "cpu",
     threads: int | None = None,
     orders: Sequence[float] = PROBED_ORDERS,
 ) -> xr.DataArray:
@@ -67,27 +69,39 @@ def fourier_transform(
             Default 1e-9, or 1e-6 in single precision.
         dtype: "complex128" or "complex64".
         quadrature: "auto", a degree from 1 to 50, or "gauss8".
-        threads: of the NUFFT; default one per core.
+        backend: "cpu"; "gpu"; or "auto", which is the GPU if there is one that can be used. What a GPU
+            fails to do is done on the processor, with a warning in the log.
+        threads: of the NUFFT on the processor; default one per core.
         orders: the orders for which the field's own error is probed; it can be had for any other
             order too, with more uncertainty.
 
     Returns:
         The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
         xi_z in cycles per unit length. The other half is the conjugate of this one. The attribute
-        `quality` holds what the errors of norms and distances need to know of the field.
+        `quality` holds what the errors of norms and distances need to know of the field, and `backend`
+        names the library that computed it.
 
     Raises:
         LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
         InputError: settings out of range.
+        BackendError: "gpu", and there is none that can be used.
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
     """
     settings = Transform(eps, dtype, Quadrature(quadrature))
-    field = compute_field(surface, lattice, settings, check_orders(orders), threads=threads or os.cpu_count() or 1)
+    field = compute_field(
+        surface,
+        lattice,
+        settings,
+        check_orders(orders),
+        backend=backend_named(backend),
+        threads=threads or os.cpu_count() or 1,
+    )
     attributes = {
         "eps": settings.accuracy,
         "quadrature": settings.quadrature.method,
         "quality": field.quality.to_json(),
+        "backend": field.backend,
     }
     units = {"units": "cycles per unit length"}
     coordinates = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}

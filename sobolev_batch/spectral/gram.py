@@ -92,7 +92,7 @@ class Arrangement:
 
     def zeros(self, *shape: int) -> Sums:
         """Room for squares or products of so many fields."""
-        return Sums(np.zeros((len(self.by_order), 4, *shape)), np.zeros((2, *shape)))
+        return Sums.zeros(len(self.by_order), *shape)
 
     def products(self, first: Complexes, second: Complexes) -> Sums:
         """Inner products Re <a_i, b_j>_s of the parts of fields on this block.

@@ -6,11 +6,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sobolev_batch.spectral.backends import CPU, Array, Backend, Plan
+from sobolev_batch.spectral.arrays import Array, combine
+from sobolev_batch.spectral.backends import CPU, Backend, Plan
 from sobolev_batch.spectral.division import Shape, fastest_oversampling, parts
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.phases import cosine_and_sine
-from sobolev_batch.spectral.precision import Complexes, Precision
+from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature import WeightedPoints
 
 
@@ -59,13 +60,13 @@ def transform_points(
             plan = backend.plan(shape or block.shape, eps=eps, precision=precision, oversampling=sigma, threads=threads)
         angles = scale * points.coordinates
         # setpts keeps references, not copies: `angles` lives until execute has returned.
-        plan.setpts(*(np.ascontiguousarray(row, dtype=real) for row in angles))
+        plan.setpts(*(np.ascontiguousarray(row, dtype=real, like=row) for row in angles))
         for part, (x, y, z) in parts(block, shape):
             values = plan.execute(_turned(points.weights, angles, part, precision))
             if total is None and whole:
                 total = values
             elif total is None:
-                total = np.zeros(block.shape, dtype=precision)
+                total = np.zeros(block.shape, dtype=precision, like=values)
                 total[x, y, z] = values[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start]
             else:
                 total[x, y, z] += values[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start]
@@ -73,22 +74,22 @@ def transform_points(
             del values
         del points, angles
     if total is None:
-        total = np.zeros(block.shape, dtype=precision)
+        total = backend.upload(np.zeros(block.shape, dtype=precision))
     return total, count
 
 
-def _turned(weights: Array, angles: Array, block: Block, precision: Precision) -> Complexes:
+def _turned(weights: Array, angles: Array, block: Block, precision: Precision) -> Array:
     """The strengths whose modes are those of a block.
 
     FINUFFT's modes of an axis of n samples start at -(n // 2). Turning the strengths by the difference
     to the block's own start moves that window anywhere, at no cost in the FFT.
     """
     shift = np.array([start + count // 2 for start, count in zip(block.start, block.shape, strict=True)])
-    strengths = np.empty(len(weights), dtype=precision)
+    strengths = np.empty(len(weights), dtype=precision, like=weights)
     turned = np.flatnonzero(shift)
     if turned.size:
-        phase = shift[turned].astype(np.float64) @ angles[turned]
-        cosines, sines = cosine_and_sine(phase)
+        phases = combine(shift[turned].astype(np.float64), angles[turned.tolist()])
+        cosines, sines = cosine_and_sine(phases)
         np.multiply(cosines, weights, out=strengths.real, casting="same_kind")
         np.multiply(sines, -weights, out=strengths.imag, casting="same_kind")
     else:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Reals = NDArray[np.float64]
+from sobolev_batch.spectral.arrays import Array
 
 
-def cosine_and_sine(phases: Reals) -> tuple[Reals, Reals]:
+def cosine_and_sine(phases: Array) -> tuple[Array, Array]:
     """The cosine and sine of phases in radians, to two or three rounding errors of 1.
 
     From the tangent of half the phase: NumPy's tangent is vectorised for doubles where its cosine and

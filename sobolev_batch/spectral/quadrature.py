@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.arrays import Array, combine
+from sobolev_batch.spectral.backends import CPU, Backend
 from sobolev_batch.spectral.rules import (
     HIGHEST_DEGREE,
     TriangleRule,
@@ -21,9 +23,10 @@ from sobolev_batch.spectral.rules import (
     symmetric_rule,
 )
 from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
-from sobolev_batch.surfaces.mesh import Corners, Mesh
+from sobolev_batch.surfaces.mesh import Mesh
 
 Reals = NDArray[np.float64]
+_Corners = tuple[Array, Array, Array]
 
 # Triangles per slice: keeps the temporaries of a slice with a mid-sized rule near 50 MB.
 _SLICE = 1 << 17
@@ -36,10 +39,12 @@ class WeightedPoints:
     Attributes:
         coordinates: (3, n) float64, one contiguous row per axis, in units of length.
         weights: (n,) float64, in squared units of length.
+
+    Both are arrays of the backend that they were made on.
     """
 
-    coordinates: Reals
-    weights: Reals
+    coordinates: Array
+    weights: Array
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class Quadrature:
             )
 
     def batches(
-        self, mesh: Mesh, highest_frequency: float, tolerance: float, capacity: int
+        self, mesh: Mesh, highest_frequency: float, tolerance: float, capacity: int, backend: Backend = CPU
     ) -> Iterator[WeightedPoints]:
         """The points of a mesh, in batches of at most ``capacity`` points, nearly equal in size.
 
@@ -79,6 +84,7 @@ class Quadrature:
             tolerance: largest quadrature error at any such frequency, relative to the area; "auto"
                 keeps it, the others ignore it.
             capacity: bound on the points of one batch, 8 times the largest rule (3,624) or more.
+            backend: where to make the points; the rules are chosen on the processor.
         """
         groups = self._groups(mesh, highest_frequency, tolerance)
         # Nodes are merged within a piece, hence large pieces where they are shared.
@@ -88,12 +94,19 @@ class Quadrature:
         count = -(-total // (capacity - max(piece.most_points for piece in pieces)))
         # A piece goes where it starts, so a batch ends at most one piece after its share of the points.
         batch_of = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
+        faces = _Faces.of(mesh, backend)
         for _, batch in groupby(zip(batch_of, pieces, strict=True), key=itemgetter(0)):
-            yield _join(mesh, [piece for _, piece in batch])
+            yield _join([piece.points(faces, backend) for _, piece in batch])
 
     def lowest_degree(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> int:
         """The lowest degree among the rules that triangles get: the one whose error shows first."""
-        return min(group.rule.degree for group in self._groups(mesh, highest_frequency, tolerance))
+        if self.method != "auto":
+            return self._groups(mesh, highest_frequency, tolerance)[0].rule.degree
+        rules, reach = reaches(tolerance)
+        degrees = np.array([rule.degree for rule in rules])
+        # Slice by slice: of tens of millions of triangles, groups take gigabytes.
+        slices = (mesh.centroid_radii[first : first + _SLICE] for first in range(0, len(mesh.triangles), _SLICE))
+        return min(int(degrees[choose_rules(2 * np.pi * highest_frequency * part, reach)[1]].min()) for part in slices)
 
     def sizes(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> tuple[float, int]:
         """The expected number of points of a mesh, and a bound that holds before shared ones are merged."""
@@ -138,24 +151,40 @@ class _Group:
         for first in range(0, len(self.members), step):
             yield _Group(self.rule, self.splits, self.members[first : first + step], self.path)
 
-    def points(self, mesh: Mesh) -> WeightedPoints:
+    def points(self, faces: _Faces, backend: Backend) -> WeightedPoints:
+        members = backend.upload(self.members)
         whole = not (self.splits or self.path)
         if self.rule is corner_rule() and whole:
-            return WeightedPoints(*merged_corners(mesh, self.members))
+            return WeightedPoints(*merged_corners(faces, members))
         if self.rule is midpoint_rule() and whole:
-            return WeightedPoints(*merged_midpoints(mesh, self.members))
-        a, b, c = mesh.corners(self.members)
-        areas = mesh.areas[self.members] / 4 ** len(self.path)
+            return WeightedPoints(*merged_midpoints(faces, members))
+        chosen = faces.triangles[members]
+        a, b, c = (faces.vertices[chosen[:, corner]] for corner in range(3))
+        areas = faces.areas[members] / 4 ** len(self.path)
         for quarter in self.path:
             a, b, c = _quarters((a, b, c))[quarter]
         for _ in range(self.splits):
             a, b, c = (np.concatenate(parts) for parts in zip(*_quarters((a, b, c)), strict=True))
             areas = np.tile(areas / 4, 4)
         rule = self.rule
-        coordinates = np.empty((3, rule.size, len(areas)))
+        coordinates = np.empty((3, rule.size, len(areas)), like=areas)
         for axis in range(3):
-            np.matmul(rule.barycentric, np.stack([a[:, axis], b[:, axis], c[:, axis]]), out=coordinates[axis])
-        return WeightedPoints(coordinates.reshape(3, -1), np.outer(rule.weights, areas).ravel())
+            combine(rule.barycentric, np.stack([a[:, axis], b[:, axis], c[:, axis]]), out=coordinates[axis])
+        weights = np.asarray(rule.weights, like=areas)[:, None] * areas
+        return WeightedPoints(coordinates.reshape(3, -1), weights.ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class _Faces:
+    """What of a mesh its points are made from, on a backend: see `shared_nodes.Faces`."""
+
+    vertices: Array
+    triangles: Array
+    areas: Array
+
+    @classmethod
+    def of(cls, mesh: Mesh, backend: Backend) -> _Faces:
+        return cls(*map(backend.upload, (mesh.vertices, mesh.triangles, mesh.areas)))
 
 
 def _cheapest_rules(mesh: Mesh, wavenumber: float, tolerance: float) -> list[_Group]:
@@ -182,15 +211,14 @@ def choose_rules(sizes: Reals, reach: Reals) -> tuple[NDArray[np.int64], NDArray
     return splits, choice
 
 
-def _quarters(corners: Corners) -> tuple[Corners, Corners, Corners, Corners]:
+def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
     """Each triangle cut into four similar ones at its edge midpoints."""
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
 
 
-def _join(mesh: Mesh, groups: list[_Group]) -> WeightedPoints:
-    made = [group.points(mesh) for group in groups]
+def _join(made: list[WeightedPoints]) -> WeightedPoints:
     if len(made) == 1:
         return made[0]
     return WeightedPoints(

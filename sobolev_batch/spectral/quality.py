@@ -16,6 +16,9 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
 
+# Vertices at a time: their products with all directions stay in cache.
+_SLICE = 1 << 14
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -40,8 +43,12 @@ class Quality:
             along = DIRECTIONS @ np.asarray(surface.center)
             low, high = along - surface.radius, along + surface.radius
         else:
-            along = DIRECTIONS @ surface.used_coordinates
-            low, high = along.min(axis=1), along.max(axis=1)
+            coordinates = surface.used_coordinates
+            low, high = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
+            for first in range(0, coordinates.shape[1], _SLICE):
+                along = DIRECTIONS @ coordinates[:, first : first + _SLICE]
+                np.minimum(low, along.min(axis=1), out=low)
+                np.maximum(high, along.max(axis=1), out=high)
         return cls(surface.area, tuple(low.tolist()), tuple(high.tolist()), probe)
 
     def to_json(self) -> str:

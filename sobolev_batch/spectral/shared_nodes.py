@@ -2,31 +2,45 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
-from numpy.typing import NDArray
 
-from sobolev_batch.surfaces.mesh import Mesh
-
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from sobolev_batch.spectral.arrays import Array, sums_of_runs
 
 # An edge and its triangle are sorted as one integer: twice the bits of a vertex and those of a triangle.
 _BITS = 63
 
 
-def merged_corners(mesh: Mesh, members: Indices) -> tuple[Reals, Reals]:
+class Faces(Protocol):
+    """What of a mesh its points are made from, as arrays of any backend."""
+
+    @property
+    def vertices(self) -> Array:
+        """float64 (n, 3), in units of length."""
+
+    @property
+    def triangles(self) -> Array:
+        """int64 (m, 3)."""
+
+    @property
+    def areas(self) -> Array:
+        """float64 (m,), in squared units of length."""
+
+
+def merged_corners(mesh: Faces, members: Array) -> tuple[Array, Array]:
     """The corners of some triangles, each with a third of the areas that meet there.
 
     Returns:
         coordinates (3, n), in units of length; weights (n,), in squared units of length.
     """
     thirds = np.repeat(mesh.areas[members] / 3, 3)
-    weights: Reals = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
+    weights = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
     there = np.flatnonzero(weights)
-    return np.ascontiguousarray(mesh.vertices[there].T), weights[there]
+    return np.ascontiguousarray(mesh.vertices[there].T, like=weights), weights[there]
 
 
-def merged_midpoints(mesh: Mesh, members: Indices) -> tuple[Reals, Reals]:
+def merged_midpoints(mesh: Faces, members: Array) -> tuple[Array, Array]:
     """The edge midpoints of some triangles, each with a third of the areas that meet there.
 
     Returns:
@@ -38,8 +52,8 @@ def merged_midpoints(mesh: Mesh, members: Indices) -> tuple[Reals, Reals]:
         used, triangles = np.unique(triangles, return_inverse=True)
         vertices, triangles = vertices[used], triangles.reshape(-1, 3)
     bits = len(vertices).bit_length()
-    numbers = np.arange(len(triangles))
-    edges = np.empty((3, len(triangles)), dtype=np.int64)
+    numbers = np.arange(len(triangles), like=triangles)
+    edges = np.empty((3, len(triangles)), dtype=np.int64, like=triangles)
     for row, (i, j) in zip(edges, ((0, 1), (1, 2), (2, 0)), strict=True):
         first, second = triangles[:, i], triangles[:, j]
         np.left_shift(np.minimum(first, second), bits, out=row)
@@ -50,12 +64,15 @@ def merged_midpoints(mesh: Mesh, members: Indices) -> tuple[Reals, Reals]:
     ordered.sort()
     thirds = (mesh.areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
     ordered >>= triangle_bits
-    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    weights = np.add.reduceat(thirds, starts)
+    differs = np.empty(len(ordered), dtype=bool, like=ordered)
+    differs[:1] = True
+    np.not_equal(ordered[1:], ordered[:-1], out=differs[1:])
+    starts = np.flatnonzero(differs)
+    weights = sums_of_runs(thirds, starts)
     ends = ordered[starts]
-    coordinates = np.empty((3, len(starts)))
+    coordinates = np.empty((3, len(starts)), like=thirds)
     low, high = ends >> bits, ends & ((1 << bits) - 1)
     for axis in range(3):
-        column = np.ascontiguousarray(vertices[:, axis])
+        column = np.ascontiguousarray(vertices[:, axis], like=vertices)
         np.multiply(column[low] + column[high], 0.5, out=coordinates[axis])
     return coordinates, weights

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import numpy as np
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.backends import CPU, Backend
-from sobolev_batch.spectral.division import Division, Load, divide, transform_bytes
+from sobolev_batch.spectral.backends import CPU, Backend, Gpu
+from sobolev_batch.spectral.division import Costs, Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
@@ -33,6 +34,11 @@ FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
 # Samples of a closed form at a time.
 _SLAB = 1 << 18
+# Of a GPU's free memory, what a transform plans with; and how often it is tried, each time with half as much.
+_DEVICE_SHARE, _ATTEMPTS = 0.9, 4
+_OUT_OF_MEMORY = "out of memory"
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,12 +97,13 @@ class Transformed:
     Attributes:
         values: complex (block.shape).
         points: of the quadrature; 0 for a closed form.
-        backend: the library that computed it; also which one failed before, and why.
+        backend: the library that computed it; also which one failed before, and why. "closed form"
+            where none was needed.
     """
 
     values: Complexes
     points: int
-    backend: str = CPU.library
+    backend: str
 
 
 def transform_block(
@@ -117,37 +124,92 @@ def transform_block(
         lattice: where.
         block: which part of it.
         settings: how.
-        backend: where to compute.
+        backend: where to compute. What a GPU fails to do is done on the processor.
         threads: of FINUFFT.
         batch: the largest number of points of one NUFFT.
         memory: what this may take besides the mesh and the result, in bytes. What does not fit is
             computed in smaller batches, in parts of the block and with less oversampling, whichever is
             predicted to be the fastest; that changes the values by a small multiple of eps. Without
-            it, a transform takes what `memory_bytes` says, however many points there are.
+            it, a transform takes what `memory_bytes` says, however many points there are. On a GPU what
+            is free there is the bound, and this one holds for the processor that may have to step in.
 
     Raises:
         LatticeError: a mesh reaches beyond the lattice's half period.
         InputError: the memory is too little for any way of computing it.
     """
     if isinstance(surface, Sphere):
-        return Transformed(_closed_form(surface, lattice, block, settings.precision), 0)
+        return Transformed(_closed_form(surface, lattice, block, settings.precision), 0, "closed form")
     require_inside(surface, lattice)
     division = Division(batch)
     if memory is not None:
-        load = _load(surface, lattice, settings)
-        eps, precision = settings.accuracy, settings.precision
-        division = divide(block.shape, eps, precision, load, CPU.costs, memory=memory, batch=batch)
+        division, _ = _division(surface, lattice, block, settings, CPU.costs, memory=memory, batch=batch)
+    failure = ""
+    if isinstance(backend, Gpu):
+        made = _on_gpu(surface, lattice, block, settings, batch, backend)
+        if isinstance(made, Transformed):
+            return made
+        _log.warning("%s: %s; the processor computes it instead", backend.library, made)
+        failure = f" after {backend.library}: {made}"
+    values, points = _computed(surface, lattice, block, settings, division, CPU, threads)
+    return Transformed(values, points, CPU.library + failure)
+
+
+def _on_gpu(
+    mesh: Mesh, lattice: Lattice, block: Block, settings: Transform, batch: int, backend: Gpu
+) -> Transformed | str:
+    """The transform of a mesh by a GPU, or why it failed.
+
+    Where memory is too little after all, it is tried again in smaller batches and parts.
+    """
+    try:
+        with backend.work():
+            room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.precision)
+            for _ in range(_ATTEMPTS):
+                division, taken = _division(mesh, lattice, block, settings, backend.costs, memory=room, batch=batch)
+                backend.make_room(taken)
+                try:
+                    values, points = _computed(mesh, lattice, block, settings, division, backend, 1)
+                    return Transformed(values, points, backend.library)
+                except Exception as error:
+                    # cuFINUFFT says of a failure only where it happened; cuFFT's want of memory is not even known.
+                    suspect = type(error) is RuntimeError and taken > room / 2
+                    if not (backend.libraries.is_out_of_memory(error) or suspect):
+                        raise
+                room = min(room, taken) / 2
+                _log.warning("%s: %s; trying again with %.3g MB", backend.library, _OUT_OF_MEMORY, room / 1e6)
+                backend.make_room(math.inf)
+    except InputError:  # no division is small enough
+        return _OUT_OF_MEMORY
+    except Exception as error:
+        return (" ".join(str(error).split()) or type(error).__name__)[:200]
+    return _OUT_OF_MEMORY
+
+
+def _computed(
+    mesh: Mesh,
+    lattice: Lattice,
+    block: Block,
+    settings: Transform,
+    division: Division,
+    backend: Backend,
+    threads: int,
+) -> tuple[Complexes, int]:
+    """The transform of a mesh on one backend, divided in one way, and the number of points."""
+    batches = settings.quadrature.batches(
+        mesh, lattice.highest_frequency, settings.rule_tolerance, division.batch, backend
+    )
     values, points = transform_points(
-        settings.quadrature.batches(surface, lattice.highest_frequency, settings.rule_tolerance, division.batch),
+        batches,
         lattice,
         block,
         eps=settings.accuracy,
         precision=settings.precision,
         threads=threads,
+        backend=backend,
         shape=division.shape,
         oversampling=division.oversampling,
     )
-    return Transformed(values, points)
+    return backend.download(values), points
 
 
 def memory_bytes(
@@ -179,11 +241,24 @@ def memory_bytes(
     return block.size * item_bytes(settings.precision) + math.ceil(needed)
 
 
-def _load(mesh: Mesh, lattice: Lattice, settings: Transform) -> Load:
-    """What transforming a mesh has to deal with."""
-    points, most = settings.quadrature.sizes(mesh, lattice.highest_frequency, settings.rule_tolerance)
+def _division(
+    mesh: Mesh, lattice: Lattice, block: Block, settings: Transform, costs: Costs, *, memory: float, batch: int
+) -> tuple[Division, int]:
+    """How the transform of a mesh is divided to fit into memory, and what it then takes, in bytes.
+
+    Raises:
+        InputError: the memory is too little.
+    """
+    shape, eps, precision = block.shape, settings.accuracy, settings.precision
     low, high = mesh.bounds
-    return Load(points, most, len(mesh.triangles), float(np.prod((high - low) / (2 * lattice.half_period))))
+    fill = float(np.prod((high - low) / (2 * lattice.half_period)))
+    load = Load(math.inf, triangles=len(mesh.triangles), fill=fill)
+    if transform_bytes(shape, eps, precision, load, Division(batch), costs) > memory:
+        # Only now do the points need counting.
+        points, most = settings.quadrature.sizes(mesh, lattice.highest_frequency, settings.rule_tolerance)
+        load = replace(load, points=points, most_points=most)
+    division = divide(shape, eps, precision, load, costs, memory=memory, batch=batch)
+    return division, transform_bytes(shape, eps, precision, load, division, costs)
 
 
 def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, precision: Precision) -> Complexes:

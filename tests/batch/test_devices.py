@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-from sobolev_batch.batch.devices import chosen_devices, claim_device
+from sobolev_batch import BackendError
+from sobolev_batch.batch.devices import chosen_devices, claim_device, visible_devices
 
 HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 
@@ -32,6 +34,54 @@ HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 )
 def test_visible_devices_are_read_as_cuda_does(wanted: str, expected: tuple[str, ...]) -> None:
     assert chosen_devices(wanted, HOST) == expected
+
+
+class _LibraryNotFoundError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("uuids", "visible", "expected"),
+    [
+        (None, None, "no GPU: the NVIDIA driver is not installed on this machine"),
+        ([], None, "no GPU: the NVIDIA driver sees none"),
+        (HOST, "", "no GPU: CUDA_VISIBLE_DEVICES= hides all 3"),
+        (HOST, "7", "no GPU: CUDA_VISIBLE_DEVICES=7 hides all 3"),
+        (HOST, None, HOST),
+        (HOST, "1", HOST[1:2]),
+    ],
+)
+def test_what_the_driver_lists(
+    monkeypatch: pytest.MonkeyPatch, uuids: tuple[str, ...] | None, visible: str | None, expected: object
+) -> None:
+    def start() -> None:
+        if uuids is None:
+            raise _LibraryNotFoundError
+
+    library = SimpleNamespace(
+        NVMLError=Exception,
+        NVMLError_LibraryNotFound=_LibraryNotFoundError,
+        nvmlInit=start,
+        nvmlDeviceGetCount=lambda: len(uuids or ()),
+        nvmlDeviceGetHandleByIndex=lambda index: index,
+        nvmlDeviceGetUUID=lambda index: (uuids or ())[index],
+    )
+    monkeypatch.setitem(sys.modules, "pynvml", library)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    if isinstance(expected, str):
+        with pytest.raises(BackendError) as caught:
+            visible_devices()
+        assert str(caught.value) == expected
+    else:
+        assert visible_devices() == expected
+
+
+def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", None)
+    with pytest.raises(BackendError, match=r"nvidia-ml-py.* is not installed: pip install 'sobolev-batch\[gpu\]'"):
+        visible_devices()
 
 
 WORKER = """

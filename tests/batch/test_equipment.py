@@ -41,7 +41,7 @@ def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
     assert len(summary.computed) == 5
     assert not summary.failed
     meshes = open_store(store_path)["meshes"].to_dataset()
-    assert set(meshes["backend"].values.tolist()) == {"finufft"}
+    assert set(meshes["backend"].values.tolist()) == {"closed form", "finufft"}
     assert len(set(meshes["worker"].values.tolist())) == 2
 
 
@@ -81,4 +81,4 @@ def test_a_memory_that_is_no_number() -> None:
 
 def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:
     run(study_on("cpu"), store_path, client)
-    assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"finufft"}
+    assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"closed form", "finufft"}

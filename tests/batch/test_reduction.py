@@ -88,6 +88,15 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
         assert found[:, i] == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-10)
 
 
+def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, others = [0, 2, CENTER], [0, 2, CENTER, 7, 9]
+    by_products = reducer.tile(rows, others)
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 3 * 16 * reducer.blocks[0].size)
+    monkeypatch.setattr(Reducer, "_block_sums", None)
+    for found, expected in zip(reducer.tile(rows, others), by_products, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     norms, to_center = reducer.norms([1, 3, CENTER])
     weights = shell_weights(reducer.lattice, reducer.orders)

@@ -174,9 +174,9 @@ def show(progress: Progress) -> None:
 @click.option("--system", type=click.Choice(list(CLUSTERS)), required=True)
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Jobs at a time.")
 @click.option("--adaptive", is_flag=True, help="Fewer jobs while there is little to do.")
-@click.option("--store", type=click.Path(path_type=Path), help="Where results go. [default: storage/NAME.zarr]")
+@click.option("--store", help="Where results go: a path or a URL. [default: storage/NAME.zarr]")
 @click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
-def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None, print_script: bool) -> None:
+def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None, print_script: bool) -> None:
     """Run STUDY on jobs of a batch system and print its table."""
     check_settings(system, print_script)
     if print_script:
@@ -184,7 +184,7 @@ def main(study: Path, system: str, jobs: int, adaptive: bool, store: Path | None
         return
     try:
         parsed = Study.from_toml(study)
-        place = store or Path("storage") / f"{parsed.name}.zarr"
+        place = store or f"storage/{parsed.name}.zarr"
         with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
             click.echo("jobs are submitted; the study begins with the first that runs", err=True)
             client.wait_for_workers(1)

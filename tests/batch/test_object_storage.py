@@ -1,0 +1,406 @@
+"""Stores in object storage, against a server that speaks S3, and in memory."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import psutil
+import pytest
+import xarray as xr
+from distributed import Client
+
+from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch.batch import location as location_module
+from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.run import Progress
+from sobolev_batch.batch.store import Store
+from tests.batch.conftest import small_table, variable
+from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, serving
+from tests.batch.test_store import READER
+from tests.test_cli import STUDY
+
+pytest.importorskip("s3fs")
+
+COMMAND = [sys.executable, "-m", "sobolev_batch"]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """A server that this process, and all that it starts, takes for S3."""
+    with serving() as server, pytest.MonkeyPatch.context() as patch:
+        for name, value in server.environment().items():
+            patch.setenv(name, value)
+        yield server
+        forget_drivers()
+
+
+@pytest.fixture(scope="module")
+def s3_client(server: Server) -> Iterator[Client]:
+    """Two worker processes that know the server."""
+    with local_client(2) as client:
+        yield client
+
+
+@pytest.fixture
+def url(request: pytest.FixtureRequest) -> str:
+    """A place that no other test uses."""
+    return f"s3://{BUCKET}/{re.sub(r'[^a-z0-9]+', '-', request.node.name.lower())}/results.zarr"
+
+
+@pytest.fixture(scope="module")
+def stored(server: Server, s3_client: Client) -> str:
+    """The small study's store after a run; not to be changed."""
+    url = f"s3://{BUCKET}/finished/results.zarr"
+    assert len(run(Study.from_table(small_table()), url, s3_client).computed) == 5
+    return url
+
+
+def forget_drivers() -> None:
+    """Have the drivers read their environment again."""
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
+
+
+def call(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        timeout=120,
+        check=False,
+        env={**os.environ, **environment},
+    )
+
+
+def assert_same(ours: xr.DataTree, theirs: xr.DataTree) -> None:
+    """All but who computed it, and how long that took, is equal to the bit."""
+    assert set(ours.children) == set(theirs.children)
+    for group in ("fourier", "norms", "distances", "convergence", "meshes"):
+        one, other = (
+            tree[group].to_dataset().drop_vars(["seconds", "worker"], errors="ignore") for tree in (ours, theirs)
+        )
+        if group == "fourier":
+            # Its coordinate says how far the field is from exact; the field itself is compared.
+            assert np.array_equal(one["quality"].values, other["quality"].values)
+        xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
+
+
+def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, stored: str, finished_store: Path) -> None:
+    tree = open_store(stored)
+    assert_same(tree, open_store(finished_store))
+    assert len(set(variable(tree, "meshes", "worker").values.tolist())) == 2
+    # What is written is what a folder holds, key for key.
+    assert {key.split("results.zarr/")[1] for key in server.keys("finished/")} == {
+        str(path.relative_to(finished_store)) for path in finished_store.rglob("*") if path.is_file()
+    }
+
+
+def test_a_second_run_reuses_and_writes_no_field(server: Server, s3_client: Client, url: str) -> None:
+    study = Study.from_table(small_table())
+    first = run(study, url, s3_client)
+    server.requests()
+    steps: list[Progress] = []
+    second = run(study, url, s3_client, on_progress=steps.append)
+    assert (second.computed, second.reused) == ((), first.computed)
+    assert steps == []
+    made = server.requests()
+    root = url.replace("s3:/", "")
+    written = {path for method, path in made if method not in ("GET", "HEAD")}
+    assert written == {f"{root}/zarr.json", f"{root}/records/zarr.json"}
+    assert len(made) < 25
+
+
+def test_requests_grow_by_five_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
+    counts = []
+    for meshes in (4, 14):
+        family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(meshes)]
+        study = Study.from_table(small_table(family=family))
+        server.requests()
+        run(study, url.replace("results", str(meshes)), s3_client)
+        counts.append(len(server.requests()))
+    # The field and its record written; a look for an older record; the field read for norms and for pairs.
+    assert counts[1] - counts[0] <= 5 * 10 + 4
+    assert counts[0] < 160
+
+
+def test_an_interrupted_run_goes_on_from_what_is_stored(
+    server: Server, s3_client: Client, url: str, stored: str
+) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 2:
+            raise KeyboardInterrupt
+
+    study = Study.from_table(small_table())
+    with pytest.raises(KeyboardInterrupt):
+        run(study, url, s3_client, on_progress=interrupt)
+    again = run(study, url, s3_client)
+    assert len(again.reused) >= 2
+    assert len(again.computed) + len(again.reused) == 5
+    assert_same(open_store(url), open_store(stored))
+
+
+def test_meshes_added_to_a_study_join_its_store(s3_client: Client, url: str) -> None:
+    table = small_table(lattice={"xi_max": 3.0, "M": 40})
+    run(Study.from_table(table), url, s3_client)
+    more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
+    assert run(Study.from_table({**table, "family": more}), url, s3_client).computed == ("late/sphere",)
+    assert variable(open_store(url), "convergence", "distance").sizes["mesh"] == 6
+    assert np.isfinite(variable(open_store(url), "norms", "norm").values).all()
+
+
+def test_another_lattice_leaves_nothing_of_the_first(server: Server, s3_client: Client, url: str) -> None:
+    table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
+    del table["lattice"]
+    run(Study.from_table(table), url, s3_client)
+    keys = len(server.keys(url.removeprefix(f"s3://{BUCKET}/")))
+    finer = Study.from_table({**table, "accuracy": {"rtol": 0.03}})
+    assert len(run(finer, url, s3_client).computed) == 5
+    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == keys
+    assert np.isfinite(variable(open_store(url), "fourier", "fourier").values).all()
+
+
+def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", READER, stored], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert 0.003 < float(done.stdout) < 0.006
+
+
+def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    assert f"{url}, 0 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    done = call("run", "study.toml", "--store", url, "--workers", "2", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
+    assert "botocore" not in done.stderr
+    assert f"{url}, 3 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    assert call("status", url, folder=tmp_path).stdout == f"{url}: 3 of 3 complete, 0 failed\n"
+    table = call("table", url, "--format", "csv", folder=tmp_path)
+    assert table.stdout.count("\n") == 5
+    assert call("plot", url, folder=tmp_path).stdout.split() == ["convergence.png", "transform.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.png", "study.toml", "transform.png"]
+
+
+def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    done = call("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
+    assert done.returncode == 0, done.stderr
+    assert "DEBUG" in done.stderr
+    keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
+    stored = b"".join(server.client().get_object(Bucket=BUCKET, Key=key)["Body"].read() for key in keys)
+    for hidden in (SECRET, TOKEN, "Signature=", "tester", server.url):
+        assert hidden not in done.stdout
+        assert hidden == server.url or hidden not in done.stderr
+        assert hidden.encode() not in stored
+
+
+def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table()))
+    store = Store.prepare(url, plan)
+    place = plan.lattice.place(plan.blocks[0])
+    for row, value in ((1, 0), (3, 1)):
+        store.write_field(row, place, np.full(plan.lattice.shape, value, dtype=complex))
+    prefix = url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c"
+    assert server.keys(prefix) == [f"{prefix}/{row}/0/0/0" for row in (1, 3)]
+    fields = Store.open(url).read_fields([0, 1, 3], place)
+    assert np.isnan(fields[0]).all()
+    assert (fields[1] == 0).all()
+    s3 = server.client()
+    data = bytearray(s3.get_object(Bucket=BUCKET, Key=f"{prefix}/3/0/0/0")["Body"].read())
+    data[1000] ^= 4
+    s3.put_object(Bucket=BUCKET, Key=f"{prefix}/3/0/0/0", Body=bytes(data))
+    with pytest.raises(StoreError, match="the field of ico/3 is damaged"):
+        store.read_fields([1, 3], place)
+
+
+def test_large_chunks_are_written_and_read_in_parts(server: Server, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(location_module, "_PART_BYTES", 1 << 20)
+    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 192})))
+    store = Store.prepare(url, plan)
+    place = plan.lattice.place(plan.blocks[0])
+    values = (
+        np.random.default_rng(0).standard_normal((*store.read_fields([], place).shape[1:], 2)).view(complex)[..., 0]
+    )
+    assert values.nbytes > 50 << 20
+    store.write_field(0, place, values)
+    server.requests()
+    assert np.array_equal(store.read_fields([0], place)[0], values)
+    assert len(server.requests()) > 2
+
+
+def test_places_that_hold_something_else(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table()))
+    server.client().put_object(Bucket=BUCKET, Key=url.removeprefix(f"s3://{BUCKET}/") + "/precious.txt", Body=b"text")
+    with pytest.raises(StoreError, match="not empty and holds no store"):
+        Store.prepare(url, plan)
+    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == 1
+    Store.prepare(url + "/below", plan)
+    with pytest.raises(StoreError, match="a store of another study is there, with the study 'small', not 'other'"):
+        Store.prepare(url + "/below", make_plan(Study.from_table(small_table(study={"name": "other"}))))
+
+
+@pytest.fixture
+def deaf() -> Iterator[str]:
+    """An endpoint that takes connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+
+def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path: Path, deaf: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    there, nowhere = f"s3://{BUCKET}/nothing.zarr", "s3://no-such-bucket/results.zarr"
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    unknown = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
+    cases: list[tuple[tuple[str, ...], dict[str, str], str]] = [
+        (("status", there), {}, "no store of a study is there"),
+        (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
+        (("run", "study.toml", "--store", there), {"AWS_ENDPOINT_URL": deaf}, "nothing answers there within 20 s"),
+        (("table", there), unknown, "no credentials (Unable to locate credentials); set those of s3://"),
+    ]
+    for arguments, environment, message in cases:
+        started = time.monotonic()
+        done = call(*arguments, folder=tmp_path, **environment)
+        assert done.returncode == 2, done.stderr
+        assert message in done.stderr, done.stderr
+        assert done.stderr.startswith("error: ")
+        assert done.stderr.count("\n") == 1
+        assert SECRET not in done.stderr
+        assert done.stdout == ""
+        assert time.monotonic() - started < 40
+    assert server.keys("nothing.zarr") == []
+
+
+def test_a_missing_driver_is_named(tmp_path: Path) -> None:
+    script = "import sys; sys.modules['s3fs'] = None; sys.argv[1:] = ['status', 's3://b/x.zarr']\n"
+    script += "from sobolev_batch.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "pip install 'sobolev-batch[s3]'" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    read = '{"Effect": "Allow", "Action": ["s3:Get*", "s3:List*", "s3:Head*"], "Resource": "*"}'
+    with serving() as server:
+        iam = server.client("iam")
+        iam.create_user(UserName="reader")
+        iam.put_user_policy(
+            UserName="reader", PolicyName="p", PolicyDocument=f'{{"Version": "2012-10-17", "Statement": [{read}]}}'
+        )
+        made = iam.create_access_key(UserName="reader")["AccessKey"]
+        reader = server.environment(made["AccessKeyId"], made["SecretAccessKey"])
+        # Another may write, and has done so.
+        assert (
+            call(
+                "run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **server.environment()
+            ).returncode
+            == 0
+        )
+        before = server.keys("")
+        server.enforce(True)
+        assert call("status", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **reader).returncode == 0
+        for arguments, environment, message in [
+            (("run", "study.toml", "--store", f"s3://{BUCKET}/b.zarr"), reader, "cannot be written: access is denied"),
+            (("run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr"), reader, "cannot be written: access is denied"),
+            (("status", f"s3://{BUCKET}/a.zarr"), server.environment("AKIANOBODY"), "cannot be read: access is denied"),
+            (
+                ("status", f"s3://{BUCKET}/a.zarr"),
+                {**reader, "AWS_SECRET_ACCESS_KEY": SECRET},
+                "cannot be read: access is denied",
+            ),
+        ]:
+            done = call(*arguments, folder=tmp_path, **environment)
+            assert done.returncode == 2, done.stderr
+            assert message in done.stderr, done.stderr
+            assert done.stderr.startswith("error: ")
+            assert done.stderr.count("\n") == 1
+            assert SECRET not in done.stderr
+            assert made["SecretAccessKey"] not in done.stderr
+        server.enforce(False)
+        assert server.keys("") == before
+
+
+def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    def kill(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 1:
+            brief.process.kill()
+
+    with serving() as brief:
+        for name, value in brief.environment().items():
+            monkeypatch.setenv(name, value)
+        forget_drivers()
+        try:
+            with pytest.raises(
+                StoreError, match=rf"s3://{BUCKET}/x.zarr: the store cannot be (read|written): .*connect"
+            ):
+                run(study, f"s3://{BUCKET}/x.zarr", workers=1, on_progress=kill)
+        finally:
+            forget_drivers()
+
+
+def test_workers_that_do_not_reach_the_store_are_found_at_once(server: Server, url: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
+        with local_client(1) as client:
+            patch.undo()
+            with pytest.raises(
+                StoreError, match=r"the worker tcp://\S+ cannot use the store: s3://.*Could not connect"
+            ):
+                run(Study.from_table(small_table()), url, client)
+    assert server.keys(url.removeprefix(f"s3://{BUCKET}/")) == []
+
+
+def test_a_store_in_memory_is_computed_by_threads(study: Study, finished_store: Path) -> None:
+    place = "memory://a/results.zarr"
+    steps: list[Progress] = []
+    summary = run(study, place, workers=2, on_progress=steps.append)
+    assert (summary.store, len(summary.computed), summary.failed) == (place, 5, {})
+    assert steps[0].label.startswith("http://127.0.0.1:")
+    assert len(run(study, place).reused) == 5
+    assert_same(open_store(place), open_store(finished_store))
+    assert_same(xr.open_datatree(place, engine="zarr"), open_store(finished_store))
+    with thread_client(2) as client:
+        assert len(run(study, "memory://b/results.zarr", client).computed) == 5
+    with pytest.raises(StoreError, match="no store of a study is there"):
+        open_store("memory://c/results.zarr")
+
+
+def test_a_store_in_memory_is_refused_where_workers_are_other_processes(client: Client, study: Study) -> None:
+    steps: list[Progress] = []
+    with pytest.raises(
+        StoreError, match=r"stays in the memory of one process, and the worker tcp://\S+ is another one"
+    ):
+        run(study, "memory://d/results.zarr", client, on_progress=steps.append)
+    assert steps == []
+    assert not fsspec.filesystem("memory").exists("/d")
+
+
+def test_a_cluster_of_threads_listens_on_loopback_only() -> None:
+    before = listening()
+    with thread_client(1) as client:
+        opened = listening() - before
+        assert client.dashboard_link in {f"http://{ip}:{port}/status" for ip, port in opened}
+        assert {ip for ip, _ in opened} == {"127.0.0.1"}
+
+
+def listening() -> set[tuple[str, int]]:
+    """The addresses at which this process takes connections."""
+    found = psutil.Process().net_connections(kind="inet")
+    return {(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN}
