@@ -31,7 +31,7 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
             INTERFACE=next(name for name, found in psutil.net_if_addrs().items() if found[0].address == "127.0.0.1"),
             RECIPES=str(FOLDER),
             SLURM_SUBMIT_DIR=str(tmp_path),
-            SLURM_NTASKS="2",
+            SLURM_NTASKS="1",
             SLURM_MEM_PER_CPU="2048",
         ),
         cwd=tmp_path,
@@ -43,9 +43,9 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert re.search(TABLE, done.stdout)
     log = (tmp_path / "workers.log").read_text()
-    assert len(re.findall(r"Start worker at: +tls://127\.0\.0\.1", log)) == 2
-    assert log.count("Memory:                   2.00 GiB") == 2
-    assert len(re.findall("End worker", log)) == 2
+    assert len(re.findall(r"Start worker at: +tls://127\.0\.0\.1", log)) == 1
+    assert log.count("Memory:                   2.00 GiB") == 1
+    assert len(re.findall("End worker", log)) == 1
     assert not list(tmp_path.glob(".sobolev-batch.*"))
 
 
