@@ -10,6 +10,7 @@ import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
+from sobolev_batch.batch.connection import check_connection
 from sobolev_batch.errors import ClusterError
 
 _CONNECT_SECONDS = 15
@@ -93,8 +94,9 @@ def remote_client(address: str) -> Iterator[Client]:
     """A client of the scheduler at an address such as tcp://host:8786.
 
     Raises:
-        ClusterError: nothing answers there.
+        ClusterError: nothing answers there, or it is not to be reached with Dask's configuration.
     """
+    check_connection(address, _CONNECT_SECONDS)
     try:
         client = Client(address, timeout=_CONNECT_SECONDS)
     except (OSError, ValueError) as error:

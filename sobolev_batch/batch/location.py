@@ -79,6 +79,10 @@ class Location:
         found = _URL.match(self.name)
         return found[1] if found else ""
 
+    def absolute(self) -> Location:
+        """The same location for processes that were started in another folder."""
+        return self if self.scheme else Location(str(Path(self.name).absolute()))
+
     @property
     def is_of_this_process(self) -> bool:
         """Whether no other process can see what is written here."""

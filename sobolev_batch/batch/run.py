@@ -118,6 +118,8 @@ def run(
         ClusterError: no worker has the GPU that the study asks for, or memory enough for its lattice.
     """
     location = Location.of(store)
+    if client is not None:
+        location = location.absolute()
     known = stored_choice(location)
     if client is not None:
         require_reach(client, location)

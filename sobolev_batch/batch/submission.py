@@ -58,7 +58,7 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: see `run`; nothing was handed over.
         ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
     """
-    location = _everywhere(store)
+    location = Location.of(store).absolute()
     known = stored_choice(location)
     require_reach(client, location)
     plan = make_plan(study, known)
@@ -112,9 +112,3 @@ def _await_acceptance(client: Client, future: Future) -> None:
                 "see its log"
             )
         time.sleep(_POLL_SECONDS)
-
-
-def _everywhere(store: str | Path | Location) -> Location:
-    """A location that means the same in any folder, as URLs do."""
-    location = Location.of(store)
-    return location if location.scheme else Location.of(Path(location.name).absolute())

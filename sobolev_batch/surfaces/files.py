@@ -37,7 +37,8 @@ class Files(Source):
         else:
             found = {match for path in self.paths for match in _matches(folder, path)}
         paths = sorted(found)
-        return tuple(FileMember(name, -1, path) for name, path in zip(_names(paths), paths, strict=True))
+        # Absolute, since a worker may have been started in another folder.
+        return tuple(FileMember(name, -1, path.absolute()) for name, path in zip(_names(paths), paths, strict=True))
 
     @staticmethod
     def _recorded(name: str, path: str) -> Path:

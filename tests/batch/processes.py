@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from distributed import Client
 
 SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+# A worker's own HTTP server listens on every interface unless told otherwise, --no-dashboard or not.
+WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
 
 
 def dask(*arguments: str) -> subprocess.Popen[str]:

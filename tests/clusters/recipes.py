@@ -1,0 +1,63 @@
+"""The recipes of workflows/clusters/, and the commands of docs/clusters.md as they stand there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "workflows" / "clusters"
+CERTIFICATES = FOLDER / "make-certificates"
+
+# One of its meshes is a file beside it, and workers are started elsewhere.
+STUDY = """
+[study]
+name = "small"
+[lattice]
+xi_max = 3.0
+M = 16
+[norm]
+orders = [-3.0]
+[reference]
+source = "sphere"
+[[family]]
+name = "ico"
+source = "icosphere"
+levels = [0, 1, 2, 3]
+[[family]]
+name = "file"
+source = "files"
+paths = ["tetrahedron.off"]
+"""
+TETRAHEDRON = "OFF\n4 4 0\n1 1 1\n1 -1 -1\n-1 1 -1\n-1 -1 1\n3 0 1 2\n3 0 3 1\n3 0 2 3\n3 1 3 2\n"
+TABLE = r"(?s)ico/3 +1,280 .*file/tetrahedron +4 "  # of its table
+
+
+def write_study(folder: Path) -> None:
+    """Put the study into a folder as study.toml."""
+    (folder / "study.toml").write_text(STUDY)
+    (folder / "tetrahedron.off").write_text(TETRAHEDRON)
+
+
+def documented(beginning: str = "") -> list[list[str]]:
+    """The commands of docs/clusters.md that begin so, as lists of words."""
+    text = (ROOT / "docs" / "clusters.md").read_text(encoding="utf-8")
+    lines = "".join(re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)).splitlines()
+    return [shlex.split(line, comments=True) for line in lines if line.startswith(beginning)]
+
+
+def environment(home: Path, **variables: str) -> dict[str, str]:
+    """What a process is to see: this checkout, the commands beside this interpreter, a home of its own."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("DASK_", "SLURM_"))}
+    path = os.pathsep.join([str(home / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
+    return {**kept, "PYTHONPATH": str(ROOT), "HOME": str(home), "PATH": path, "TMPDIR": str(home), **variables}
+
+
+def add_command(home: Path, name: str, script: str) -> None:
+    """Put a command into the PATH of `environment`."""
+    (home / "bin").mkdir(exist_ok=True)
+    (home / "bin" / name).write_text(f"#!/bin/bash\n{script}")
+    (home / "bin" / name).chmod(0o755)

@@ -1,0 +1,237 @@
+"""Several machines by hand: certificates, scheduler, workers and study by the documented commands."""
+
+from __future__ import annotations
+
+import re
+import socket
+import ssl
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import dask
+import psutil
+import pytest
+import yaml
+from distributed import Client
+
+from sobolev_batch import ClusterError, open_store
+from sobolev_batch.batch.cluster import remote_client
+from sobolev_batch.batch.connection import check_connection
+from tests.batch.processes import stop
+from tests.clusters.recipes import CERTIFICATES, TABLE, documented, environment, write_study
+
+
+def make_certificates(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("home")
+
+
+@pytest.fixture(scope="module")
+def certificates(home: Path) -> Path:
+    made = make_certificates(home / "dask-tls")
+    assert made.returncode == 0, made.stderr
+    assert f"export DASK_CONFIG={home}/dask-tls/tls.yaml" in made.stdout
+    return home / "dask-tls"
+
+
+@pytest.fixture(scope="module")
+def others(home: Path) -> Path:
+    """Certificates of somebody else."""
+    assert make_certificates(home / "others", "2").returncode == 0
+    return home / "others"
+
+
+def configured(folder: Path | None) -> Any:
+    """Dask's configuration as with DASK_CONFIG naming the tls.yaml of a folder."""
+    settings = yaml.safe_load((folder / "tls.yaml").read_text()) if folder else {}
+    return dask.config.set(dask.config.merge(dask.config.config, settings))
+
+
+class Cluster:
+    def __init__(self, address: str, processes: list[subprocess.Popen[str]]) -> None:
+        self.address, self.processes = address, processes
+
+
+@pytest.fixture(scope="module")
+def cluster(home: Path, certificates: Path) -> Iterator[Cluster]:
+    """A scheduler and two workers, started as documented but on loopback and at free ports."""
+    (export,) = {tuple(words) for words in documented("export DASK_CONFIG=~/dask-tls")}
+    variable, value = export[1].replace("~", str(home)).split("=")
+    (scheduler,), (worker, *_) = documented("dask scheduler"), documented("dask worker")
+    log = (home / "worker.log").open("w")
+    processes: list[subprocess.Popen[str]] = []
+    changes = {"8786": "0", "127.0.0.1:8787": "127.0.0.1:0", "--interface": "--host", "eth0": "127.0.0.1", "-1": "2"}
+
+    def start(words: list[str], stderr: Any, **replaced: str) -> subprocess.Popen[str]:
+        arguments = [{**changes, **replaced}.get(word, word) for word in words[1:]]
+        command = [sys.executable, "-m", words[0], *arguments]
+        processes.append(
+            subprocess.Popen(command, env=environment(home, **{variable: value}), stderr=stderr, text=True)
+        )
+        return processes[-1]
+
+    try:
+        lines = start(scheduler, subprocess.PIPE).stderr
+        assert lines is not None
+        address = next(found[0] for line in lines if (found := re.search(r"tls://127\.0\.0\.1:\d+", line)))
+        start(worker, log, **{"tls://HOST:8786": address})
+        with configured(certificates), Client(address) as client:
+            client.wait_for_workers(2, timeout=60)
+        yield Cluster(address, processes)
+    finally:
+        for process in reversed(processes):
+            stop(process)
+        log.close()
+
+
+def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Path) -> None:
+    files = sorted(certificates.iterdir())
+    assert [file.name for file in files] == ["ca.pem", "certificate.pem", "key.pem", "tls.yaml"]
+    assert stat.S_IMODE(certificates.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
+    verify = ["openssl", "verify", "-x509_strict", "-CAfile", *map(str, files[:2])]
+    assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
+    before = {file: file.read_bytes() for file in files}
+    again = make_certificates(certificates)
+    assert again.returncode == 2
+    assert f"{certificates} is there already" in again.stderr
+    assert before == {file: file.read_bytes() for file in files}
+    assert not list(home.glob(".make-certificates*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "call it as: make-certificates FOLDER"),
+        (["new", "soon"], "DAYS is soon"),
+        (["nowhere/new"], "there is no folder nowhere"),
+        (['n"ew'], 'has one of " '),
+    ],
+)
+def test_certificates_are_not_made(arguments: list[str], message: str, tmp_path: Path) -> None:
+    done = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_path: Path) -> None:
+    write_study(tmp_path)
+    (run,) = documented("sobolev-batch run")
+    words = [cluster.address if word == "tls://HOST:8786" else word for word in run[1:]]
+    done = subprocess.run(
+        [sys.executable, "-m", "sobolev_batch", *words],
+        env=environment(home, DASK_CONFIG=str(certificates / "tls.yaml")),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(TABLE, done.stdout)
+    meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
+    assert all(worker.startswith("tls://") for worker in meshes["worker"].values.tolist())
+
+
+def test_nothing_listens_beyond_loopback(cluster: Cluster) -> None:
+    everyone = [psutil.Process(process.pid) for process in cluster.processes]
+    everyone += [child for process in everyone for child in process.children(recursive=True)]
+    listening = {
+        connection.laddr.ip
+        for process in everyone
+        for connection in process.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+    assert listening == {"127.0.0.1"}
+
+
+def test_a_client_without_certificate_is_refused(cluster: Cluster, certificates: Path) -> None:
+    context = ssl.create_default_context(cafile=certificates / "ca.pem")
+    context.check_hostname = False
+    host, port = cluster.address.removeprefix("tls://").split(":")
+    with (
+        socket.create_connection((host, int(port)), timeout=20) as plain,
+        context.wrap_socket(plain) as encrypted,
+        pytest.raises(ssl.SSLError, match="certificate required"),
+    ):
+        encrypted.recv(1)
+
+
+def test_each_way_to_miss_an_encrypted_scheduler_has_its_words(
+    cluster: Cluster, certificates: Path, others: Path, tmp_path: Path
+) -> None:
+    def refusal(folder: Path | None, address: str) -> str:
+        with configured(folder), pytest.raises(ClusterError) as caught, remote_client(address):
+            pass
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    plain = cluster.address.replace("tls", "tcp")
+    assert "names none; export DASK_CONFIG=FOLDER/tls.yaml" in refusal(None, cluster.address)
+    assert f"use {cluster.address} and export DASK_CONFIG" in refusal(None, plain)
+    assert f"demands encryption; use {cluster.address}" in refusal(certificates, plain)
+    assert f"is not good for {others}/ca.pem" in refusal(others, cluster.address)
+    # The right authority, and a certificate that it did not sign.
+    for name in ("certificate.pem", "key.pem"):
+        (tmp_path / name).write_bytes((others / name).read_bytes())
+    (tmp_path / "ca.pem").write_bytes((certificates / "ca.pem").read_bytes())
+    settings = (others / "tls.yaml").read_text().replace(str(others), str(tmp_path))
+    (tmp_path / "tls.yaml").write_text(settings)
+    assert f"refuses the certificate {tmp_path}/certificate.pem" in refusal(tmp_path, cluster.address)
+    (tmp_path / "key.pem").unlink()
+    assert "cannot be read" in refusal(tmp_path, cluster.address)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "says", "message"),
+    [
+        ("tcp", b"", "within 0.5 s"),
+        ("tls", b"", "within 0.5 s"),
+        ("tcp", b"SSH-2.0-OpenSSH_9.2\r\n", "no Dask scheduler answers"),
+        ("tls", b"SSH-2.0-OpenSSH_9.2\r\n", "is not encrypted; start the scheduler with --protocol tls"),
+    ],
+)
+def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says: bytes, message: str) -> None:
+    """Dask's own client waits for ever for the first and runs out of memory at the third."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        connections = []
+
+        def answer() -> None:
+            connections.append(server.accept()[0])
+            connections[0].recv(1)
+            connections[0].sendall(says)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        address = f"{scheme}://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            configured(certificates if scheme == "tls" else None),
+            pytest.raises(ClusterError, match=message),
+        ):
+            check_connection(address, 0.5)
+        thread.join()
+        for connection in connections:
+            connection.close()
+
+
+def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
+    """As when DASK_CONFIG names a file that is not there."""
+    done = subprocess.run(
+        [sys.executable, "-m", "dask", "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0"],
+        env=environment(home, DASK_CONFIG=str(home / "nothing.yaml")),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert "TLS expects a `ssl_context`" in done.stderr

@@ -1,0 +1,153 @@
+"""What docs/clusters.md and kubernetes.yaml tell people to run exists, and fits together."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+import yaml
+from dask.utils import parse_bytes
+from distributed.cli import dask_scheduler, dask_worker
+
+from sobolev_batch import Study
+from sobolev_batch.cli import cli
+from tests.clusters.recipes import FOLDER, ROOT, documented
+
+COMMANDS: dict[tuple[str, ...], click.Command] = {
+    ("dask", "scheduler"): dask_scheduler.main,
+    ("dask", "worker"): dask_worker.main,
+    **{("sobolev-batch", name): command for name, command in cli.commands.items()},
+}
+# One binary and one decimal unit, as Kubernetes writes them.
+UNITS = {"Gi": "GiB", "Mi": "MiB"}
+
+
+def check_options(words: list[str]) -> None:
+    """Every option of a command is one of its own, and followed by a value where it wants one."""
+    command = COMMANDS[words[0], words[1]]
+    takes_value = {
+        name: not option.is_flag
+        for option in command.params
+        if isinstance(option, click.Option)
+        for name in (*option.opts, *option.secondary_opts)
+    }
+    for word, following in zip(words, [*words[1:], "--end"], strict=True):
+        if word.startswith("--"):
+            assert word in takes_value, f"{words[:2]} has no {word}"
+            assert takes_value[word] != (following.startswith("--")), f"{word} {following}"
+
+
+def documents() -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()))
+
+
+def pods() -> Mapping[str, dict[str, Any]]:
+    """The pod of each kind of container."""
+    cluster, gpu = (document["spec"] for document in documents()[:2])
+    return {
+        "worker": cluster["worker"]["spec"],
+        "scheduler": cluster["scheduler"]["spec"],
+        "gpu": gpu["worker"]["spec"],
+        "submit": documents()[-1]["spec"]["template"]["spec"],
+    }
+
+
+def test_documented_options_exist() -> None:
+    commands = [words for words in documented() if tuple(words[:2]) in COMMANDS]
+    assert len(commands) == 4
+    for words in commands:
+        check_options(words)
+    for words in documented("python "):
+        assert (ROOT / words[1]).is_file()
+    # Lazily, since it changes what Ctrl-C does.
+    assert importlib.util.find_spec("dask_jobqueue") is not None
+
+
+def test_kinds() -> None:
+    kinds = [(document["apiVersion"], document["kind"]) for document in documents()]
+    assert kinds == [
+        ("kubernetes.dask.org/v1", "DaskCluster"),
+        ("kubernetes.dask.org/v1", "DaskWorkerGroup"),
+        *[("networking.k8s.io/v1", "NetworkPolicy")] * 2,
+        ("v1", "ConfigMap"),
+        ("batch/v1", "Job"),
+    ]
+
+
+@pytest.mark.parametrize("name", ["worker", "scheduler", "gpu", "submit"])
+def test_pods(name: str) -> None:
+    pod = pods()[name]
+    (container,) = pod["containers"]
+    check_options(container["args"])
+    assert pod["automountServiceAccountToken"] is False
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert container["securityContext"] == {
+        "allowPrivilegeEscalation": False,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"]},
+    }
+    volumes = {volume["name"] for volume in pod["volumes"]}
+    assert {mount["name"] for mount in container["volumeMounts"]} == volumes
+    resources = container["resources"]
+    assert resources["requests"] == resources["limits"]
+    if "--memory-limit" in container["args"]:
+        limit = container["args"][container["args"].index("--memory-limit") + 1]
+        allowed = resources["limits"]["memory"]
+        # The nanny beside the worker needs some too.
+        assert parse_bytes(limit) <= 0.85 * parse_bytes(allowed[:-2] + UNITS[allowed[-2:]])
+    if name != "scheduler":
+        assert container["envFrom"] == [{"secretRef": {"name": "object-store"}}]
+
+
+def test_the_parts_of_the_manifest_name_each_other() -> None:
+    cluster, gpu, to_scheduler, to_workers, study, job = documents()
+    name = cluster["metadata"]["name"]
+    assert gpu["spec"]["cluster"] == name
+    selector = {"dask.org/cluster-name": name, "dask.org/component": "scheduler"}
+    assert cluster["spec"]["scheduler"]["service"]["selector"] == selector
+    assert to_scheduler["spec"]["podSelector"]["matchLabels"] == selector
+    assert to_scheduler["spec"]["ingress"] == [
+        {
+            "from": [{"podSelector": {}}],  # of this namespace
+            "ports": [{"protocol": "TCP", "port": port} for port in (8786, 8787)],
+        }
+    ]
+    assert to_workers["spec"]["podSelector"]["matchLabels"] == {**selector, "dask.org/component": "worker"}
+    assert to_workers["spec"]["ingress"] == [
+        {"from": [{"podSelector": {"matchLabels": {"dask.org/cluster-name": name}}}]}
+    ]
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    assert f"tcp://{name}-scheduler:8786" in container["args"]
+    (secret,) = (words for words in documented("kubectl") if "secret" in words)
+    assert container["envFrom"][0]["secretRef"]["name"] == secret[secret.index("generic") + 1]
+    assert study["metadata"]["name"] in str(job)
+
+
+def test_the_study_of_the_manifest_is_valid(tmp_path: Path) -> None:
+    ((name, text),) = documents()[-2]["data"].items()
+    (tmp_path / name).write_text(text)
+    assert Study.from_toml(tmp_path / name).name == "icosphere"
+    assert f"/study/{name}" in pods()["submit"]["containers"][0]["args"]
+
+
+def test_the_image() -> None:
+    lines = (FOLDER / "Dockerfile").read_text().splitlines()
+    (build,) = documented("docker build")
+    assert build[build.index("--tag") + 1] == pods()["worker"]["containers"][0]["image"]
+    sources = [
+        word for line in lines if line.startswith("COPY ") and "--from" not in line for word in line.split()[1:-1]
+    ]
+    assert {"pyproject.toml", "sobolev_batch"} <= set(sources)
+    assert all((ROOT / source).exists() for source in sources)
+    user = str(pods()["worker"]["securityContext"]["runAsUser"])
+    assert f"USER {user}:{user}" in lines
+
+
+@pytest.mark.parametrize(("shell", "name"), [("sh", "make-certificates"), ("bash", "slurm.sbatch")])
+def test_scripts_parse(shell: str, name: str) -> None:
+    assert subprocess.run([shell, "-n", FOLDER / name], capture_output=True, check=False).returncode == 0

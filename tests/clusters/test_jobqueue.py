@@ -1,0 +1,160 @@
+"""SLURM and PBS: what would be submitted, and studies on jobs that are processes of this machine."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.clusters.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
+
+SETTINGS = FOLDER / "jobqueue.yaml"
+
+# SLURM's commands, for which every job runs at once and here.
+SBATCH = """
+if [ -n "$REFUSE" ]; then echo "sbatch: error: Invalid account" >&2; exit 1; fi
+cp "$1" "$HOME/job-$$"
+setsid bash "$HOME/job-$$" > "$HOME/log-$$" 2>&1 < /dev/null &
+echo "Submitted batch job $!"
+"""
+SCANCEL = 'kill -- "-$1"'
+
+
+def jobqueue(
+    home: Path, *options: str, settings: Path = SETTINGS, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """The documented command, with further options."""
+    command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
+    script, study = FOLDER / Path(command[0]).name, command[1]
+    return subprocess.run(
+        [sys.executable, script, study, *options],
+        env=environment(home, DASK_CONFIG=str(settings), **variables),
+        cwd=home,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("system", "directives"),
+    [
+        (
+            "slurm",
+            ["-p compute", "-A project42", "--cpus-per-task=8", "--mem=32G", "-t 04:00:00"],
+        ),
+        (
+            "pbs",
+            ["-q compute", "-A project42", "-l select=1:ncpus=8:mem=32GB", "-l walltime=04:00:00"],
+        ),
+    ],
+)
+def test_the_script_of_a_job(system: str, directives: list[str], tmp_path: Path) -> None:
+    done = jobqueue(tmp_path, "--system", system, "--print-script")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    for directive in directives:
+        assert f"#{'SBATCH' if system == 'slurm' else 'PBS'} {directive}" in lines
+    (worker,) = (line for line in lines if "dask_worker" in line)
+    assert worker.startswith(f"{sys.executable} -m distributed.cli.dask_worker tls://")
+    for option in (
+        *("--nthreads 1", "--nworkers 8", "--memory-limit 4.00GiB", "--nanny", "--interface ib0", "--tls-key "),
+        *("--lifetime 225m", "--lifetime-stagger 10m", "--dashboard-address 127.0.0.1:0"),
+    ):
+        assert f" {option}" in worker
+    assert "--lifetime-restart" not in worker
+
+
+@pytest.mark.parametrize("system", ["slurm", "pbs"])
+def test_lifetimes_end_before_the_walltime(system: str) -> None:
+    settings = yaml.safe_load(SETTINGS.read_text())["jobqueue"][system]
+    options = dict(zip(settings["worker-extra-args"][::2], settings["worker-extra-args"][1::2], strict=True))
+    longest = sum(int(options[name].removesuffix("m")) for name in ("--lifetime", "--lifetime-stagger"))
+    hours, minutes, _ = map(int, settings["walltime"].split(":"))
+    assert longest + 3 < 60 * hours + minutes
+    assert settings["cores"] == settings["processes"]
+
+
+def test_a_study_on_local_jobs(tmp_path: Path) -> None:
+    write_study(tmp_path)
+    done = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")
+    assert done.returncode == 0, done.stderr
+    assert re.search(TABLE, done.stdout)
+    assert done.stderr.count(": complete") == 6
+    assert (tmp_path / "results.zarr" / "zarr.json").exists()
+    assert not list(tmp_path.glob(".sobolev-batch*"))
+
+
+@pytest.fixture
+def slurm(tmp_path: Path) -> Path:
+    """A home with SLURM's commands and settings for them: two workers a job."""
+    add_command(tmp_path, "sbatch", SBATCH)
+    add_command(tmp_path, "scancel", SCANCEL)
+    settings = yaml.safe_load(SETTINGS.read_text())
+    change = {"cores": 2, "processes": 2, "memory": "2GiB", "local-directory": str(tmp_path), "interface": None}
+    settings["jobqueue"]["slurm"].update(change)
+    settings["jobqueue"]["slurm"]["scheduler-options"]["host"] = "127.0.0.1"
+    settings["jobqueue"]["slurm"]["worker-extra-args"] += ["--host", "127.0.0.1"]
+    (tmp_path / "jobqueue.yaml").write_text(yaml.safe_dump(settings))
+    return tmp_path
+
+
+REPLACED = """
+import time
+import jobqueue
+from distributed import Client
+
+if __name__ == "__main__":
+    jobqueue.INTERVAL_SECONDS = 0.2
+    with jobqueue.jobs_of("slurm", 1) as cluster, Client(cluster) as client:
+        client.wait_for_workers(2)
+        first = set(client.scheduler_info(n_workers=-1)["workers"])
+        assert all(worker.startswith("tls://127.0.0.1") for worker in first)
+        while not all(getattr(job, "had_workers", False) for job in cluster.workers.values()):
+            time.sleep(0.05)  # until it was looked at
+        client.retire_workers(list(first))
+        client.wait_for_workers(2)
+        assert not first & set(client.scheduler_info(n_workers=-1)["workers"])
+"""
+
+
+def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
+    paths = environment(slurm)["PYTHONPATH"]
+    done = subprocess.run(
+        [sys.executable, "-c", REPLACED],
+        env=environment(slurm, DASK_CONFIG=str(slurm / "jobqueue.yaml"), PYTHONPATH=f"{paths}:{FOLDER}"),
+        cwd=slurm,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(list(slurm.glob("job-*"))) == 2
+    assert not list(slurm.glob(".sobolev-batch*"))
+
+
+def test_a_job_that_is_refused(slurm: Path) -> None:
+    write_study(slurm)
+    done = jobqueue(slurm, "--system", "slurm", settings=slurm / "jobqueue.yaml", REFUSE="yes")
+    assert done.returncode == 1
+    assert "sbatch: error: Invalid account" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(slurm.glob(".sobolev-batch*"))
+
+
+def test_settings_that_cannot_serve(tmp_path: Path) -> None:
+    done = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")
+    assert done.returncode == 1
+    assert "jobqueue.slurm.cores is not set: copy jobqueue.yaml" in done.stderr
+    done = jobqueue(tmp_path, "--system", "slurm", PATH=str(tmp_path))
+    assert "there is no sbatch here" in done.stderr
+    everywhere = tmp_path / "everywhere.yaml"
+    everywhere.write_text(SETTINGS.read_text().replace("    interface: ib0", "    interface: null"))
+    done = jobqueue(tmp_path, "--system", "pbs", "--print-script", settings=everywhere)
+    assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all" in done.stderr

@@ -1,0 +1,203 @@
+"""Runs a study on workers that are jobs of SLURM or PBS.
+
+    export DASK_CONFIG=$HOME/jobqueue.yaml
+    python jobqueue.py STUDY --system slurm --jobs 4
+
+The scheduler is part of this process, on the node where it is started. docs/clusters.md tells the rest.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import click
+import dask
+from dask_jobqueue import JobQueueCluster, PBSCluster, SLURMCluster
+from dask_jobqueue.local import LocalCluster
+from distributed import Adaptive, Client, Security
+from distributed.core import Status
+
+from sobolev_batch import SobolevBatchError, Study, open_store, run
+from sobolev_batch.batch.run import Progress
+from sobolev_batch.results.tables import format_table
+
+# dask_jobqueue ends the process on Ctrl-C as if all had gone well.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+CLUSTERS: dict[str, type[JobQueueCluster]] = {"slurm": SLURMCluster, "pbs": PBSCluster, "local": LocalCluster}
+INTERVAL_SECONDS = 30.0  # between looks at what jobs there are
+SOME_FAILED = 3  # the exit status of sobolev-batch
+
+
+class Replacing(Adaptive):  # type: ignore[misc]  # distributed has no types
+    """Asks for a new job once the workers of one have left.
+
+    Left to itself dask-jobqueue notices this of jobs with one worker only, and takes a refused job for one that waits.
+    """
+
+    said = ""
+
+    async def target(self) -> int:
+        """The number of workers that there should be, after jobs without workers are forgotten."""
+        cluster = self.cluster
+        forget_refused(cluster)
+        for name, job in list(cluster.workers.items()):
+            names = {f"{name}{suffix}" for suffix in cluster.worker_spec.get(name, {}).get("group", [""])}
+            if names & cluster.observed:
+                job.had_workers = True
+            elif getattr(job, "had_workers", False):
+                del cluster.workers[name]
+                await job.close()
+        wanted: int = await super().target()
+        return wanted
+
+    async def adapt(self) -> None:
+        """Have as many jobs as there should be; what the batch system refuses is said once."""
+        try:
+            await super().adapt()
+        except RuntimeError as error:
+            if str(error) != self.said:
+                click.echo(f"no new job: {str(error).strip()}", err=True)
+            self.said = str(error)
+
+
+def forget_refused(cluster: JobQueueCluster) -> None:
+    """Drop the jobs that the batch system did not take: they are in the cluster's books all the same."""
+    for name, job in list(cluster.workers.items()):
+        if job.job_id is None:
+            job.status = Status.failed
+            del cluster.workers[name]
+
+
+def setting(system: str, name: str) -> Any:
+    """A setting of Dask's configuration for a batch system."""
+    return dask.config.get(f"jobqueue.{system}.{name}", None)
+
+
+def check_settings(system: str, printing: bool) -> None:
+    """Refuse a configuration with which jobs cannot be asked for, or whose scheduler everybody could reach."""
+    for name in ("cores", "memory", "processes"):
+        if setting(system, name) is None:
+            raise click.ClickException(
+                f"jobqueue.{system}.{name} is not set: copy jobqueue.yaml, fill it in, and export DASK_CONFIG=its path"
+            )
+    command = CLUSTERS[system].job_cls.submit_command
+    if command is not None and not printing and shutil.which(command) is None:
+        raise click.ClickException(f"there is no {command} here: call this on a node from which jobs are submitted")
+    if setting(system, "interface") is None and not {"host", "interface"} & set(setting(system, "scheduler-options")):
+        raise click.ClickException(
+            f"jobqueue.{system}.interface is not set, and the scheduler would listen on all: "
+            "name the network that the nodes share, such as ib0"
+        )
+
+
+def security_of(folder: Path) -> Security:
+    """Encryption with what make-certificates puts into a folder."""
+    files = {
+        f"tls_{role}_{part}": f"{folder}/{name}.pem"
+        for role in ("scheduler", "worker", "client")
+        for part, name in (("cert", "certificate"), ("key", "key"))
+    }
+    return Security(require_encryption=True, tls_ca_file=f"{folder}/ca.pem", **files)
+
+
+def job_script(system: str) -> str:
+    """The script of one job, with names in place of what is known only when it is submitted."""
+    security = security_of(Path("CERTIFICATES"))
+    job = CLUSTERS[system].job_cls("tls://SCHEDULER:PORT", name="WORKER", protocol="tls://", security=security)
+    return str(job.job_script())
+
+
+@contextmanager
+def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueueCluster]:
+    """A cluster whose workers are jobs, cancelled at the end; encrypted, since other users share its network.
+
+    Args:
+        system: one of CLUSTERS.
+        jobs: how many there should be; jobs that end are replaced.
+        adaptive: have fewer jobs while there is little to do.
+    """
+    options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
+    # Certificates for this time alone, in a folder that all nodes see and nobody else can read: of the one in which
+    # this was started, unless the configuration names another.
+    parent = setting(system, "shared-temp-directory") or Path.cwd()
+    with TemporaryDirectory(prefix=".sobolev-batch-", dir=parent) as work:
+        folder = Path(work, "certificates")
+        subprocess.run([Path(__file__).with_name("make-certificates"), folder], check=True, stdout=subprocess.DEVNULL)
+        cluster = CLUSTERS[system](
+            # Said here too: dask-jobqueue does not know the workers of its jobs by name from the configuration alone.
+            processes=setting(system, "processes"),
+            security=security_of(folder),
+            scheduler_options=options,
+        )
+
+        async def submit() -> None:
+            try:
+                await cluster
+            finally:
+                forget_refused(cluster)
+
+        least = 1 if adaptive else jobs
+        with closing(cluster):
+            for _ in range(least):
+                # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
+                cluster.worker_spec.update(cluster.new_worker_spec())
+                cluster.sync(submit)
+            cluster.adapt(
+                Adaptive=Replacing,
+                minimum_jobs=least,
+                maximum_jobs=jobs,
+                interval=INTERVAL_SECONDS,
+                wait_count=4,  # so often in a row must a job have had nothing to do before it goes
+            )
+            yield cluster
+
+
+def show(progress: Progress) -> None:
+    """A line for each mesh, on standard error."""
+    if progress.record is not None:
+        outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
+        line = f"[{progress.done}/{progress.total}] {progress.label}: {progress.record.status}, {outcome}"
+        click.echo(line, err=True)
+
+
+@click.command()
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--system", type=click.Choice(list(CLUSTERS)), required=True)
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Jobs at a time.")
+@click.option("--adaptive", is_flag=True, help="Fewer jobs while there is little to do.")
+@click.option("--store", help="Where results go: a path or a URL. [default: storage/NAME.zarr]")
+@click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
+def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None, print_script: bool) -> None:
+    """Run STUDY on jobs of a batch system and print its table."""
+    check_settings(system, print_script)
+    if print_script:
+        click.echo(job_script(system))
+        return
+    try:
+        parsed = Study.from_toml(study)
+        place = store or f"storage/{parsed.name}.zarr"
+        with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
+            click.echo("jobs are submitted; the study begins with the first that runs", err=True)
+            client.wait_for_workers(1)
+            summary = run(parsed, place, client, on_progress=show)
+        click.echo(format_table(open_store(place)))
+    except (SobolevBatchError, RuntimeError) as error:  # the latter: what the batch system or Dask refuses
+        raise click.ClickException(str(error).strip()) from error
+    for label, reason in summary.failed.items():
+        click.echo(f"{label}: {reason}", err=True)
+    sys.exit(SOME_FAILED if summary.failed else 0)
+
+
+if __name__ == "__main__":
+    for ending in (signal.SIGTERM, signal.SIGHUP):  # jobs are cancelled then too
+        signal.signal(ending, lambda number, frame: sys.exit(128 + number))
+    main()
