@@ -319,7 +319,7 @@ def _task_lines(plan: Plan, crew: Crew) -> Iterator[tuple[str, str]]:
     )
     layouts, refused = lay_out_rows(plan, plan.rows, crew.with_backend(plan.study.backend))
     tasks = sum(layout.task_count for layout in layouts.values())
-    yield "tasks", f"{tasks} for {len(layouts)} surfaces, the lattice in {len(plan.blocks)} blocks"
+    yield "tasks", f"{tasks} for {len(layouts)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     for label, layout in layouts.items():
         if layout.parts > 1:
             yield "cut", f"{label} into {layout.parts} parts"

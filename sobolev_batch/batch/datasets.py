@@ -40,7 +40,7 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
         values = [getattr(record.facts, item.name) for record in known]
         columns[item.name] = _strings(values) if isinstance(item.default, str) else np.array(values)
     columns["seconds"] = np.array([record.seconds for record in known])
-    for name in ("worker", "backend", "key"):
+    for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in known])
     return xr.Dataset(
         {name: ("mesh", values, {"units": _UNITS[name]} if name in _UNITS else {}) for name, values in columns.items()},

@@ -15,24 +15,9 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table
 from tests.batch.processes import tcp_cluster
+from tests.clusters.recipes import write_study
 
 _POLL_SECONDS = 0.02
-
-STUDY = """
-[study]
-name = "handed-over"
-[lattice]
-xi_max = 3.0
-M = 16
-[norm]
-orders = [-3.0]
-[reference]
-source = "sphere"
-[[family]]
-name = "ico"
-source = "icosphere"
-levels = [0, 1, 2, 3]
-"""
 
 # Dies without any farewell as soon as the study is handed over.
 CLIENT = """
@@ -48,9 +33,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.fixture
 def study_path(tmp_path: Path) -> Path:
-    path = tmp_path / "study.toml"
-    path.write_text(STUDY)
-    return path
+    write_study(tmp_path)
+    return tmp_path / "study.toml"
 
 
 def cli(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -70,7 +54,7 @@ def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: 
         assert client.returncode == -9, client.stderr
         followed = cli("status", store_path, "--follow")
     assert followed.returncode == 0, followed.stdout + followed.stderr
-    assert f"{store_path}: 5 of 5 complete, 0 failed, 0 to go" in followed.stdout
+    assert f"{store_path}: 6 of 6 complete, 0 failed, 0 to go" in followed.stdout
     assert "\ndone; by process" in followed.stdout
     table = cli("table", store_path)
     assert "ico/3" in table.stdout
@@ -83,12 +67,12 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
         submitted = cli("submit", study_path, "--scheduler", address, "--store", store)
         assert submitted.returncode == 0, submitted.stderr
         assert submitted.stdout.splitlines() == [
-            f"5 of 5 surfaces to be computed by the cluster at {address}",
+            f"6 of 6 surfaces to be computed by the cluster at {address}",
             f"follow it by: sobolev-batch status '{store}'",
         ]
         assert cli("status", store, "--follow").returncode == 0
         again = cli("submit", study_path, "--scheduler", address, "--store", store)
-        assert again.stdout.startswith("0 of 5 surfaces to be computed")
+        assert again.stdout.startswith("0 of 6 surfaces to be computed")
         assert cli("status", store, "--follow").returncode == 0
 
 
@@ -117,7 +101,7 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
                 break  # it was quicker than the signal
             time.sleep(_POLL_SECONDS)
     status = Status.of(store_path)
-    assert (status.complete, status.total, status.failed) == (5, 5, {})
+    assert (status.complete, status.total, status.failed) == (6, 6, {})
 
 
 def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, store_path: Path) -> None:
