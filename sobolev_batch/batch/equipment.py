@@ -84,6 +84,16 @@ def enlist(client: Client) -> Crew:
     return Crew(tuple(CrewMember(address, *parts) for address, parts in sorted(found.items())))
 
 
+def worry_about(client: Client, backend: str) -> str:
+    """What a study is waiting for that its cluster does not have any more; empty while it has."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    if not workers:
+        return "no worker is left; waiting for one to start"
+    if backend == "gpu" and not any(worker["resources"].get(GPU) for worker in workers):
+        return "no worker with a GPU is left, and the study asks for one; waiting for one to start"
+    return ""
+
+
 def _describe(dask_worker: Worker) -> tuple[int, float, str, str, bool]:
     equipment = dask_worker.plugins[_NAME]
     declares = any(name.upper() == "GPU" for name in dask_worker.state.total_resources)

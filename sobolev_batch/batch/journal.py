@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+from collections.abc import Callable
 from threading import Event, Thread
 from types import TracebackType
 from typing import Self
@@ -24,12 +25,14 @@ class Journal:
     Attributes:
         cluster: the address of the scheduler, once there is one.
         stage: what is being done.
+        worry: asked at each beat, for what keeps the run from going on; empty while nothing does.
     """
 
     def __init__(self, store: Store) -> None:
         """Name the store."""
         self.cluster = ""
         self.stage = ""
+        self.worry: Callable[[], str] = str
         self._store = store
         self._started = utc_now()
         self._ended = Event()
@@ -62,6 +65,9 @@ class Journal:
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):
             try:
-                self.write("running")
+                worry = self.worry()
+                if worry:
+                    _log.warning("%s: %s", self._store.path, worry)
+                self.write("running", worry)
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)

@@ -103,7 +103,7 @@ class RunRecord:
         started: when, in UTC.
         seen: the latest sign of life of its driver, in UTC.
         stage: what it is doing.
-        error: why it failed; empty otherwise.
+        error: why it failed, or what keeps it from going on; empty otherwise.
     """
 
     state: RunState

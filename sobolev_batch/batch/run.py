@@ -20,7 +20,7 @@ from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.equipment import enlist, worry_about
 from sobolev_batch.batch.journal import Journal
 from sobolev_batch.batch.layout import lay_out_rows
 from sobolev_batch.batch.location import Location
@@ -137,6 +137,7 @@ def run(
                 crew = enlist(active)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
+                journal.worry = lambda: worry_about(active, study.backend)
                 place.scratch.discard()
 
                 def note(progress: Progress) -> None:

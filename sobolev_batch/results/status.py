@@ -88,6 +88,8 @@ class Status:
             yield f"submitted {_span(self.silence_seconds)} ago, waiting for a worker; {where}"
         elif run.state == "running":
             yield f"running: {run.stage or 'planning'}; {where}, last sign of life {_span(self.silence_seconds)} ago"
+            if run.error:
+                yield run.error
             if self.lost:
                 yield "the process that drove it is probably gone; run or submit the study again, it goes on from here"
         elif run.state == "failed":

@@ -43,8 +43,9 @@ def tcp_cluster(*workers: list[str]) -> Iterator[tuple[str, list[subprocess.Pope
     try:
         address = scheduler_address(scheduler)
         processes += [dask("worker", address, *WORKER, *options) for options in workers]
-        with Client(address) as client:
-            client.wait_for_workers(len(workers), timeout=60)
+        if workers:
+            with Client(address) as client:
+                client.wait_for_workers(len(workers), timeout=60)
         yield address, processes
     finally:
         for process in reversed([scheduler, *processes]):

@@ -11,7 +11,7 @@ from distributed import Client
 from sobolev_batch import ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, remote_client
 from sobolev_batch.batch.crew import GPU, MEMORY
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.equipment import enlist, worry_about
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import tcp_cluster
 
@@ -82,3 +82,10 @@ def test_a_memory_that_is_no_number() -> None:
 def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:
     run(study_on("cpu"), store_path, client)
     assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"closed form", "finufft"}
+
+
+def test_what_a_study_waits_for_is_told(client: Client) -> None:
+    assert worry_about(client, "auto") == ""
+    assert worry_about(client, "gpu").startswith("no worker with a GPU is left")
+    with tcp_cluster() as (address, _), Client(address) as lonely:
+        assert worry_about(lonely, "auto") == "no worker is left; waiting for one to start"
