@@ -10,6 +10,7 @@ from pathlib import Path
 from benchmarks.accuracy import left_to_us, stored_bytes
 from benchmarks.devices import on_a_gpu
 from benchmarks.memory import peaks
+from benchmarks.scale import tiny_meshes
 from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
 from benchmarks.timing import Effort, machine_facts
@@ -26,6 +27,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "8": peaks,
     "9": on_a_gpu,
     "growth": growth,
+    "scale": tiny_meshes,
 }
 
 

@@ -87,7 +87,7 @@ def cut_mesh(job: Job, count: int) -> Cut:
         size = math.ceil(len(mesh.triangles) / count)
         there = set()
         for number, piece in mesh.parts(size):
-            job.store.write_piece(job.row, number, piece)
+            job.store.scratch.write(job.row, number, piece)
             there.add(number)
     except Exception as error:
         return Cut(seconds=time.perf_counter() - started, error=reason_of(job, error))
@@ -100,7 +100,7 @@ def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
         return Partial()
     started = time.perf_counter()
     try:
-        piece = job.store.read_piece(job.row, number)
+        piece = job.store.scratch.read(job.row, number)
         backend = backend_of(job.backend)
         made = transform_block(piece, job.lattice, block, cut.settings, backend=backend, memory=job.memory)
         exact = exact_transform(piece, cut.draws.within(block).frequencies)

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -61,6 +62,9 @@ class Progress:
 # A study whose distances fall short of the accuracy asked for is computed again on a larger lattice,
 # this often in all.
 _MOST_ROUNDS = 3
+
+# Rows that the scheduler knows of at a time: enough to deal out well, while each costs it memory.
+_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
 
 Notify = Callable[[Progress], None]
 
@@ -133,7 +137,7 @@ def run(
                 crew = enlist(active)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
-                place.discard_pieces()
+                place.scratch.discard()
 
                 def note(progress: Progress) -> None:
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
@@ -206,34 +210,28 @@ def _compute_fields(
     equipped = crew.with_backend(plan.study.backend)
     layouts, refused = lay_out_rows(plan, [rows[i] for i in missing], equipped)
     submitter = Submitter.of(client, equipped, plan.study.backend, layouts.values())
-    futures: dict[Future, int] = {}
     done = 0
     for i in missing:
-        row = rows[i]
-        if row.label in refused:
+        if rows[i].label in refused:
             done += 1
-            records[i] = record = Record(key=row.key, status="failed", reason=refused[row.label])
+            records[i] = record = Record(key=rows[i].key, status="failed", reason=refused[rows[i].label])
             store.write_record(i, record)
-            notify(Progress("fields", done, len(missing), row.label, record))
-            continue
-        layout = layouts[row.label]
-        job = Job(
-            store,
-            i,
-            row.label,
-            row.key,
-            row.member,
-            plan.similarity,
-            plan.lattice,
-            plan.transform,
-            plan.study.orders,
-            plan.aim(row),
-            layout.transform_bytes,
-            plan.study.backend,
-        )
-        futures[submitter.field(job, layout)] = i
+            notify(Progress("fields", done, len(missing), rows[i].label, record))
+    futures: dict[Future, int] = {}
+    remaining = iter([i for i in missing if rows[i].label in layouts])
     # Results come along: to ask for each by itself takes longer than a small mesh.
-    for future, result in as_completed(list(futures), with_results=True, raise_errors=False):
+    completed = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+
+    def hand_over(count: int) -> None:
+        for i in islice(remaining, count):
+            layout = layouts[rows[i].label]
+            future = submitter.field(_job(store, plan, i, rows[i], layout.transform_bytes), layout)
+            futures[future] = i
+            completed.add(future)
+
+    hand_over(max(_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * crew.threads))
+    for future, result in completed:
+        hand_over(1)
         done += 1
         i = futures.pop(future)
         row = rows[i]
@@ -247,9 +245,28 @@ def _compute_fields(
             _log.error("%s: %s", row.label, record.reason)
             store.write_record(i, record)
         if layouts[row.label].parts > 1:
-            store.discard_pieces(i)
+            store.scratch.discard(i)
         records[i] = record
         notify(Progress("fields", done, len(missing), row.label, record))
+    if any(layout.parts > 1 for layout in layouts.values()):
+        store.scratch.discard()
+
+
+def _job(store: Store, plan: Plan, number: int, row: Row, memory: float) -> Job:
+    return Job(
+        store,
+        number,
+        row.label,
+        row.key,
+        row.member,
+        plan.similarity,
+        plan.lattice,
+        plan.transform,
+        plan.study.orders,
+        plan.aim(row),
+        memory,
+        plan.study.backend,
+    )
 
 
 def _reduce(

@@ -33,9 +33,9 @@ from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.records import Record, RunRecord
+from sobolev_batch.batch.scratch import Scratch
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
-from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity
 
 SCHEMA_VERSION = 2
@@ -49,8 +49,6 @@ _LABELS = "fourier/mesh"
 _QUALITY = "fourier/quality"
 _RECORD = "records/record"
 _RECORDS, _RUN = "records", "run"
-_SCRATCH = "scratch"
-_PIECE_ARRAYS = ("vertices", "triangles")
 _REQUESTS_AT_ONCE = 64
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
@@ -160,14 +158,15 @@ class Store:
 
     def write_record(self, row: int, record: Record) -> None:
         """Write the completion record of a row: one chunk, replaced as a whole."""
+        array = self._array(_RECORD)
         with self.location.access("written"):
-            self._array(_RECORD)[row] = record.to_json()
+            array[row] = record.to_json()
 
     def write_field(self, row: int, place: Place, values: NDArray[Any]) -> None:
         """Write one block of a row's field, which must be whole chunks."""
-        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        array = self._array(_FIELD)
         with self.location.access("written"):
-            self._array(_FIELD).with_config({"write_empty_chunks": True})[(row, *place)] = values
+            array[(row, *place)] = values
 
     def read_fields(self, rows: Sequence[int], place: Place) -> NDArray[Any]:
         """One block of several rows' fields, complex (len(rows), ...).
@@ -200,43 +199,10 @@ class Store:
                 read(i)
         return values
 
-    def write_piece(self, row: int, number: int, mesh: Mesh) -> None:
-        """Keep a piece of a row's mesh in the scratch space, until `discard_pieces`."""
-        with self.location.access("written"):
-            for name in _PIECE_ARRAYS:
-                values = getattr(mesh, name)
-                zarr.create_array(
-                    self.location.keys(values.nbytes),
-                    name=_piece(row, number, name),
-                    data=values,
-                    chunks=values.shape,
-                    compressors=(Crc32cCodec(),),
-                    overwrite=True,
-                )
-
-    def read_piece(self, row: int, number: int) -> Mesh:
-        """A piece that was written.
-
-        Raises:
-            StoreError: it is not there, damaged, or cannot be reached.
-        """
-        keys = self.location.keys()
-        with self.location.access("read"):
-            try:
-                vertices, triangles = (
-                    np.asarray(zarr.open_array(keys, path=_piece(row, number, name), mode="r")[:])
-                    for name in _PIECE_ARRAYS
-                )
-            except (FileNotFoundError, ValueError) as error:
-                raise StoreError(
-                    f"{self.path}: piece {number} of the mesh of {self.labels()[row]} cannot be read ({error}); "
-                    "run the study again"
-                ) from error
-        return Mesh.of_checked(vertices, triangles)
-
-    def discard_pieces(self, row: int | None = None) -> None:
-        """Remove the pieces of a row, or of all."""
-        self.location.remove(_SCRATCH if row is None else f"{_SCRATCH}/{row}")
+    @property
+    def scratch(self) -> Scratch:
+        """Room for pieces of meshes, which no reader needs."""
+        return Scratch(self.location)
 
     def read_run(self) -> RunRecord | None:
         """The record of the latest run, or None where none was ever begun."""
@@ -253,8 +219,9 @@ class Store:
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
         """Set the coordinate `quality` of all fields."""
+        array = self._array(_QUALITY)
         with self.location.access("written"):
-            self._array(_QUALITY)[:] = np.array(qualities, dtype=object)
+            array[:] = np.array(qualities, dtype=object)
 
     def write_table(self, group: str, dataset: xr.Dataset) -> None:
         """Replace a group of small arrays, each in one chunk; `consolidate` makes it known to readers."""
@@ -312,7 +279,10 @@ class Store:
             ) from error
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        return zarr.Array.from_dict(StorePath(self.keys(name), name), self._document(name))
+        place = StorePath(self.keys(name), name)
+        known = zarr.AsyncArray.from_dict(place, self._document(name))
+        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": True}))
 
     def _read_texts(self, name: str) -> tuple[str, ...]:
         array = self._array(name)
@@ -446,10 +416,6 @@ def stored_choice(place: str | Path | Location) -> Choice | None:
         return None
     table = store.attributes()["study"].get("choice")
     return Choice.from_table(table) if table else None
-
-
-def _piece(row: int, number: int, name: str) -> str:
-    return f"{_SCRATCH}/{row}/{number}/{name}"
 
 
 def _attributes(plan: Plan) -> dict[str, Any]:

@@ -14,5 +14,5 @@ from tests.spectral.fake_device import Device
 _DEVICE = Device(capacity=float(os.environ.get("PRETEND_GPU_BYTES", "1e12")))
 _NAME = os.environ["PRETEND_GPU"]
 
-equipment.visible_devices = lambda: (_NAME,)
-equipment.gpu_backend = _DEVICE.backend  # type: ignore[assignment]
+vars(equipment)["visible_devices"] = lambda: (_NAME,)
+vars(equipment)["gpu_backend"] = _DEVICE.backend

@@ -75,3 +75,24 @@ def test_documents_of_a_folder_and_of_a_url(tmp_path: Path) -> None:
         location.remove("nothing")
         assert location.read("b/c") is None
         assert location.read("d") == b"3"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (OSError("Could not connect to http://me:hidden@host/x"), "Could not connect to http://host/x"),
+        (PermissionError("Access\nDenied"), r"access is denied \(Access Denied\); check the credentials"),
+        (TimeoutError(), "nothing answers there within"),
+        (FileNotFoundError("b"), r"there is no bucket 'bucket' \(b\)"),
+        (ZeroDivisionError("of a driver"), "of a driver"),
+    ],
+)
+def test_reasons_in_one_line(error: Exception, reason: str) -> None:
+    message = rf"^s3://bucket/a: the store cannot be read: {reason}"
+    with pytest.raises(StoreError, match=message) as caught, Location.of("s3://bucket/a").access("read"):
+        raise error
+    assert "\n" not in str(caught.value)
+    # Of a folder, what is no failure of the disk is a defect of ours.
+    if not isinstance(error, OSError):
+        with pytest.raises(ZeroDivisionError), Location.of("folder").access("read"):
+            raise error

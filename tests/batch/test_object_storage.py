@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
@@ -17,11 +18,13 @@ import psutil
 import pytest
 import xarray as xr
 from distributed import Client
+from zarr.storage import FsspecStore
 
-from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch import location as location_module
+from sobolev_batch import Lattice, StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
@@ -158,15 +161,25 @@ def test_meshes_added_to_a_study_join_its_store(s3_client: Client, url: str) -> 
     assert np.isfinite(variable(open_store(url), "norms", "norm").values).all()
 
 
-def test_another_lattice_leaves_nothing_of_the_first(server: Server, s3_client: Client, url: str) -> None:
+def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
     table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
     del table["lattice"]
-    run(Study.from_table(table), url, s3_client)
-    keys = len(server.keys(url.removeprefix(f"s3://{BUCKET}/")))
-    finer = Study.from_table({**table, "accuracy": {"rtol": 0.03}})
-    assert len(run(finer, url, s3_client).computed) == 5
-    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == keys
-    assert np.isfinite(variable(open_store(url), "fourier", "fourier").values).all()
+    plan = make_plan(Study.from_table(table))
+    store = Store.prepare(url, plan)
+    prefix = url.removeprefix(f"s3://{BUCKET}/")
+    empty = server.keys(prefix)
+    store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
+    store.write_record(1, Record("key", "complete"))
+    store.write_table("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
+    store.consolidate()
+    assert len(server.keys(prefix)) == len(empty) + 5
+    finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
+    again = Store.prepare(url, finer)
+    assert server.keys(prefix) == empty
+    assert again.records() == (None,) * 5
+    assert again.table_attributes("norms") is None
+    assert np.isnan(again.read_fields([1], finer.lattice.place(finer.blocks[0]))).all()
+    assert Store.open(url).labels() == store.labels()
 
 
 def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Path) -> None:
@@ -224,19 +237,19 @@ def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -
         store.read_fields([1, 3], place)
 
 
-def test_large_chunks_are_written_and_read_in_parts(server: Server, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(location_module, "_PART_BYTES", 1 << 20)
-    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 192})))
+def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 240})))
     store = Store.prepare(url, plan)
     place = plan.lattice.place(plan.blocks[0])
-    values = (
-        np.random.default_rng(0).standard_normal((*store.read_fields([], place).shape[1:], 2)).view(complex)[..., 0]
-    )
-    assert values.nbytes > 50 << 20
-    store.write_field(0, place, values)
+    values = np.arange(plan.lattice.half.size, dtype=complex).reshape(plan.lattice.shape)
+    assert values.nbytes > 100 << 20
     server.requests()
+    store.write_field(0, place, values)
+    assert sum("partNumber=" in path for _, path in server.requests()) > 1
     assert np.array_equal(store.read_fields([0], place)[0], values)
-    assert len(server.requests()) > 2
+    # Small keys are read without a look at their size, large ones in parts at once.
+    readers = [store.location.keys(size) for size in (1 << 20, 100 << 20)]
+    assert [reader.fs.max_concurrency > 1 for reader in readers if isinstance(reader, FsspecStore)] == [False, True]
 
 
 def test_places_that_hold_something_else(server: Server, url: str) -> None:
@@ -404,3 +417,15 @@ def listening() -> set[tuple[str, int]]:
     """The addresses at which this process takes connections."""
     found = psutil.Process().net_connections(kind="inet")
     return {(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
+    location, key = Location.of(url), url.removeprefix(f"s3://{BUCKET}/") + "/a/b"
+    assert not location.exists()
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"1")
+    assert location.exists()
+    assert location.read("a/b") == b"1"
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"2")
+    assert location.read("a/b") == b"2"
+    server.client().delete_object(Bucket=BUCKET, Key=key)
+    assert not location.exists()

@@ -104,10 +104,10 @@ def test_a_piece_that_is_gone_fails_with_its_number(plan: Plan, store_path: Path
     job = job_of(plan, store_path, Ball("ball", 0))
     cut = cut_mesh(job, 3)
     assert cut.there == {0, 1, 2}
-    job.store.discard_pieces(0)
+    job.store.scratch.discard(0)
     partial = transform_piece(job, cut, 1, plan.blocks[0])
     assert partial.values is None
-    assert "piece 1 of the mesh of ico/0 cannot be read" in partial.error
+    assert "piece 1 of the mesh of row 0 cannot be read" in partial.error
 
 
 def test_errors_survive_the_sum() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table
 from tests.batch.processes import tcp_cluster
+
+_POLL_SECONDS = 0.02
 
 STUDY = """
 [study]
@@ -105,13 +108,14 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
         assert cli("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
         store = Store.open(store_path)
         while (record := store.read_run()) is None or record.state == "submitted":
-            pass
+            time.sleep(_POLL_SECONDS)
         driver = next(worker for worker in workers if f"process {worker.pid} " in record.driver)
         driver.kill()
         while (record := store.read_run()) is None or record.state != "done" or f" {driver.pid} " in record.driver:
             assert record is None or record.state != "failed", record
             if record is not None and record.state == "done":
                 break  # it was quicker than the signal
+            time.sleep(_POLL_SECONDS)
     status = Status.of(store_path)
     assert (status.complete, status.total, status.failed) == (5, 5, {})
 
@@ -134,7 +138,7 @@ def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, st
 
 def _remove(path: str) -> None:
     # The study must have been planned by the client: its store says so.
-    store = Path(path).parent / "results.zarr" / "records" / "run"
+    store = Path(path).parent / "results.zarr" / "records" / "zarr.json"
     while not store.exists():
-        pass
+        time.sleep(_POLL_SECONDS)
     Path(path).unlink()
