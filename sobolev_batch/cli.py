@@ -110,7 +110,7 @@ def submit_command(study: Path, scheduler: str, store: Location | None) -> None:
     with remote_client(scheduler) as client:
         submission = submit(parsed, store or _DEFAULT_FOLDER / f"{parsed.name}.zarr", client)
     click.echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
-    click.echo(f"follow it by: sobolev-batch status {shlex.quote(submission.store)}")
+    click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
 
 
 @cli.command("plan")
@@ -314,8 +314,8 @@ def _task_lines(plan: Plan, crew: Crew) -> Iterator[tuple[str, str]]:
     gpus = sum(member.backend == "gpu" for member in crew.members)
     yield (
         "workers",
-        f"{len(crew.members)} with {crew.threads} threads and {gpus} GPUs, {_size(crew.share_bytes)} or more to spare "
-        "for each thread",
+        f"{len(crew.members)}, with {crew.threads} threads and {gpus} GPUs together; for tasks, "
+        f"{_size(crew.share_bytes)} or more of memory a thread",
     )
     layouts, refused = lay_out_rows(plan, plan.rows, crew.with_backend(plan.study.backend))
     tasks = sum(layout.task_count for layout in layouts.values())

@@ -11,9 +11,11 @@ from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
 from sobolev_batch.batch.connection import check_connection
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.errors import ClusterError, InputError
 
 _CONNECT_SECONDS = 15
+# In less, a worker with all its libraries has no room for any transform.
+_LEAST_BYTES = 700_000_000
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
 # for each took a third of a reduction's time. What glibc may keep is bounded.
 _KEPT_BYTES = 64 << 20
@@ -29,12 +31,9 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
         memory: of each, such as "4GB"; default an equal part of the machine's.
 
     Raises:
-        ClusterError: the memory is not a number of bytes.
+        InputError: the memory is not a size that a worker can live in.
     """
-    try:
-        limit = "auto" if memory is None else parse_bytes(memory)
-    except ValueError as error:
-        raise ClusterError(f"memory must be a number of bytes such as 4GB or 512MiB, found {memory!r}") from error
+    limit = "auto" if memory is None else _memory_limit(memory)
     count = workers or available_cores()
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
@@ -108,6 +107,16 @@ def remote_client(address: str) -> Iterator[Client]:
         if not client.scheduler_info()["workers"]:
             raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
         yield client
+
+
+def _memory_limit(memory: str) -> int:
+    try:
+        limit = int(parse_bytes(memory))
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"a worker's memory must be a size such as 4GB or 800MiB, found {memory!r}") from error
+    if limit < _LEAST_BYTES:
+        raise InputError(f"a worker's memory must be at least {_LEAST_BYTES / 1e6:g} MB, found {memory!r}")
+    return limit
 
 
 def available_cores() -> int:

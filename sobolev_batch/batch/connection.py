@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import ssl
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from distributed import Security
@@ -32,7 +33,9 @@ def check_connection(address: str, seconds: float) -> None:
             f"the certificates of Dask's configuration ({_configuration()}) cannot be read ({error}): {files}"
         ) from error
     try:
-        asyncio.run(_shake_hands(address, seconds, arguments))
+        # In a thread: a notebook has a loop of its own running in this one.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(asyncio.run, _shake_hands(address, seconds, arguments)).result()
     except (OSError, RuntimeError, TypeError, ValueError, MemoryError) as error:
         raise ClusterError(_explanation(address, seconds, security, error)) from error
 

@@ -7,6 +7,7 @@ import logging
 from typing import Any
 
 from distributed import Client, Worker, WorkerPlugin, get_worker
+from distributed.core import Status
 
 from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember, spare_bytes
 from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
@@ -16,6 +17,7 @@ from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
 _log = logging.getLogger(__name__)
 
 _NAME = "sobolev-batch"
+_SETUP_SECONDS = 0.05
 
 
 class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -36,6 +38,7 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
         self.note = ""
         self.spare_bytes = 0.0
         self._claim: Claim | None = None
+        self._ready: asyncio.Event | None = None
 
     def __reduce__(self) -> tuple[type[Equipment], tuple[()]]:
         # It travels to workers before it has found anything.
@@ -43,6 +46,7 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
 
     async def setup(self, worker: Worker) -> None:
         """Find out what is there; in a thread, since loading CUDA takes seconds."""
+        self._ready = asyncio.Event()
         self.spare_bytes = spare_bytes(worker.memory_manager.memory_limit)
         await asyncio.to_thread(self._find_backend)
         declared = [name for name in worker.state.total_resources if name.upper() == "GPU"]
@@ -50,6 +54,18 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
             _log.warning("%s declares a GPU but computes on its CPU: %s", worker.address, self.note)
         resources = {MEMORY: self.spare_bytes} | ({GPU: 1} if self.backend.name == "gpu" else {})
         await worker.set_resources(**resources)
+        if worker.status == Status.running:
+            # The scheduler looks for tasks that wait for resources only when a worker begins to run.
+            worker.status = Status.paused
+            worker.status = Status.running
+        self._ready.set()
+
+    async def found(self) -> tuple[float, str, str]:
+        """Spare memory, backend and note, once they are known."""
+        while self._ready is None:
+            await asyncio.sleep(_SETUP_SECONDS)
+        await self._ready.wait()
+        return self.spare_bytes, self.backend.name, self.note
 
     def teardown(self, worker: Worker) -> None:
         """Let go of the GPU."""
@@ -78,7 +94,9 @@ def enlist(client: Client) -> Crew:
         ClusterError: there are no workers.
     """
     client.register_plugin(Equipment(), name=_NAME)
-    found = client.run(_describe)
+    answers = client.run(_describe, on_error="return")
+    # One that is just leaving, or joining, counts as not there.
+    found = {address: parts for address, parts in answers.items() if isinstance(parts, tuple)}
     if not found:
         raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
     return Crew(tuple(CrewMember(address, *parts) for address, parts in sorted(found.items())))
@@ -94,16 +112,12 @@ def worry_about(client: Client, backend: str) -> str:
     return ""
 
 
-def _describe(dask_worker: Worker) -> tuple[int, float, str, str, bool]:
-    equipment = dask_worker.plugins[_NAME]
+async def _describe(dask_worker: Worker) -> tuple[int, float, str, str, bool] | None:
+    equipment = dask_worker.plugins.get(_NAME)
+    if equipment is None:
+        return None
     declares = any(name.upper() == "GPU" for name in dask_worker.state.total_resources)
-    return (
-        dask_worker.state.nthreads,
-        equipment.spare_bytes,
-        equipment.backend.name,
-        equipment.note,
-        declares,
-    )
+    return dask_worker.state.nthreads, *await equipment.found(), declares
 
 
 def backend_of(wanted: str) -> Backend:

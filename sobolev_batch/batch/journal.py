@@ -50,17 +50,22 @@ class Journal:
         self._thread.join()
         if error is None:
             self.write("done")
-        elif isinstance(error, KeyboardInterrupt):
-            self.write("failed", "interrupted")
-        else:
-            self.write("failed", str(error) or type(error).__name__)
+        elif not self._is_replaced():
+            self.write("failed", "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error))
+
+    def _is_replaced(self) -> bool:
+        """Whether another driver has taken over, as when this one's worker was retired: how that ends counts."""
+        there = self._store.read_run()
+        return there is not None and there.state == "running" and there.driver != self._driver
 
     def write(self, state: RunState, error: str = "") -> None:
         """Replace the store's record."""
+        self._store.write_run(RunRecord(state, self._driver, self._started, utc_now(), self.stage, error))
+
+    @property
+    def _driver(self) -> str:
         driver = f"process {os.getpid()} on {socket.gethostname()}"
-        if self.cluster:
-            driver += f", cluster {self.cluster}"
-        self._store.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
+        return f"{driver}, cluster {self.cluster}" if self.cluster else driver
 
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):

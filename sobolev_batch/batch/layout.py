@@ -24,6 +24,8 @@ _FEWEST_TRIANGLES = 1 << 16
 _MESH_BYTES = 100.0
 # Less makes a transform's batches and parts of a block so small that it becomes slow.
 _LEAST_ROOM_BYTES = 256e6
+# Of the choice of rules, for each triangle.
+_CHOICE_BYTES = 100.0
 
 
 @dataclass(frozen=True)
@@ -92,29 +94,35 @@ def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Cre
     """
     block = blocks[0]
     block_bytes = float(block.size * item_bytes(transform.precision))
-    wanted = memory_bytes(block, transform, triangles=min(size.triangles, _PART_TRIANGLES)) - block_bytes
-    least = min(wanted, _LEAST_ROOM_BYTES)
+
+    def least(triangles: float) -> float:
+        return _LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles
 
     def fixed(triangles: float) -> float:
         # The block and what it is added to or compared with.
         return _MESH_BYTES * triangles + 2 * block_bytes
 
-    whole = size.triangles <= 1.5 * _PART_TRIANGLES and fixed(size.triangles) + least <= crew.largest_bytes
+    whole = size.triangles <= 1.5 * _PART_TRIANGLES and (
+        fixed(size.triangles) + least(size.triangles) <= crew.largest_bytes
+    )
     part = size.triangles if whole else _PART_TRIANGLES
-    while not whole and fixed(part) + least > crew.share_bytes and part > _FEWEST_TRIANGLES:
+    while not whole and fixed(part) + least(part) > crew.share_bytes and part > _FEWEST_TRIANGLES:
         part //= 2
     making = max(size.making_bytes, _MESH_BYTES * size.triangles)
-    needed = max(making, fixed(part) + least)
+    needed = max(making, fixed(part) + least(part))
     if needed > crew.largest_bytes:
         raise ClusterError(
             f"it takes about {needed / 1e9:.2g} GB in one task, and no worker has more than "
-            f"{crew.largest_bytes / 1e9:.2g} GB to spare; start workers with more memory"
+            f"{crew.largest_bytes / 1e9:.2g} GB to spare (of its limit it keeps 15 % and 0.3 GB for itself); "
+            "start workers with more memory"
         )
-    spent = min(max(least, crew.share_bytes - fixed(part)), wanted)
-    task = fixed(part) + spent
+    room = max(least(part), crew.share_bytes - fixed(part))
+    # Not all of the room is taken, but a mesh may turn out larger than its file suggested.
+    wanted = memory_bytes(block, transform, triangles=part) - block_bytes
+    task = fixed(part) + min(room, max(wanted, least(part)))
     parts = 1 if whole else max(1, math.ceil(size.triangles / part))
     # A task computes as many blocks as leaves two for every thread: each makes the mesh anew.
     count = len(blocks) if parts > 1 else min(len(blocks), max(1, math.ceil(2 * crew.threads / max(rows, 1))))
     ends = [len(blocks) * k // count for k in range(count + 1)]
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
-    return Layout(parts, groups, spent, max(making, task) if parts == 1 else making, task)
+    return Layout(parts, groups, room, max(making, task) if parts == 1 else making, task)

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from fsspec import AbstractFileSystem, available_protocols
 from fsspec.core import url_to_fs
@@ -56,10 +57,16 @@ class Location:
             return place
         found = _URL.match(str(place))
         if found is None:
-            first = place.parts[0] if isinstance(place, Path) and place.parts else ""
+            if not str(place):
+                raise StoreError("the path of the store is empty; name a folder or a URL")
+            first = Path(place).parts[0] if Path(place).parts else ""
             if first.endswith(":") and first[:-1] in available_protocols():
-                raise StoreError(f"a Path cannot hold a URL, and this one began with {first}//: give it as a string")
-            return cls(str(Path(place)))
+                # Not repeated: there may be a password in it.
+                raise StoreError(
+                    f"this begins with {first}/ and a URL with {first}//; a Path cannot hold a URL, give it as a string"
+                )
+            # Once, here: libraries underneath would expand it in some places and not in others.
+            return cls(str(Path(place).expanduser()))
         scheme, separator, rest = found.groups()
         if separator == "::" or "::" in rest:
             raise StoreError(f"{scheme}::...: a chain of URLs cannot hold a store; name the last of them alone")
@@ -135,7 +142,7 @@ class Location:
                 path = Path(self.name) / key
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # A reader finds the old document or the new one, never a part of it.
-                partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+                partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
                 partial.write_bytes(document)
                 partial.replace(path)
 

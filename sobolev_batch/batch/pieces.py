@@ -10,6 +10,7 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class Cut:
     """A mesh that was cut: everything about it but its triangles.
 
     Attributes:
+        token: tells its pieces from those of any other cut.
         there: the numbers of the pieces that have triangles with an area.
         settings: of the transform of every piece.
         draws: the frequencies at which the field is probed.
@@ -43,6 +45,7 @@ class Cut:
         error: why it failed; empty otherwise.
     """
 
+    token: str = ""
     there: frozenset[int] = frozenset()
     settings: Transform | None = None
     draws: Draws | None = None
@@ -72,6 +75,10 @@ class Partial:
     seconds: float = 0.0
     error: str = ""
 
+    def __sizeof__(self) -> int:
+        # Dask asks, to know what its workers hold.
+        return 0 if self.values is None else self.values.nbytes
+
 
 def cut_mesh(job: Job, count: int) -> Cut:
     """Make a mesh, describe it, and store it as at most ``count`` pieces of equally many triangles."""
@@ -85,13 +92,13 @@ def cut_mesh(job: Job, count: int) -> Cut:
         draws = draws_for([mesh], job.lattice, job.orders, settings.lowest_degree(mesh, job.lattice))
         facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe())
         size = math.ceil(len(mesh.triangles) / count)
-        there = set()
+        token, there = uuid4().hex, set()
         for number, piece in mesh.parts(size):
-            job.store.scratch.write(job.row, number, piece)
+            job.store.scratch.write(job.row, token, number, piece)
             there.add(number)
     except Exception as error:
         return Cut(seconds=time.perf_counter() - started, error=reason_of(job, error))
-    return Cut(frozenset(there), settings, draws, facts, quality, time.perf_counter() - started)
+    return Cut(token, frozenset(there), settings, draws, facts, quality, time.perf_counter() - started)
 
 
 def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
@@ -100,7 +107,7 @@ def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
         return Partial()
     started = time.perf_counter()
     try:
-        piece = job.store.scratch.read(job.row, number)
+        piece = job.store.scratch.read(job.row, cut.token, number)
         backend = backend_of(job.backend)
         made = transform_block(piece, job.lattice, block, cut.settings, backend=backend, memory=job.memory)
         exact = exact_transform(piece, cut.draws.within(block).frequencies)
@@ -129,18 +136,20 @@ def add_partials(first: Partial, second: Partial) -> Partial:
 def store_block(job: Job, cut: Cut, total: Partial, block: Block) -> Part:
     """Store a block that all pieces were added to, and probe it."""
     error = cut.error or total.error
+    # The cut counts once, with the first block.
+    seconds = total.seconds + (cut.seconds if block.start == job.lattice.half.start else 0.0)
     if error or cut.draws is None or cut.quality is None or total.values is None:
-        return Part(Facts(), cut.seconds + total.seconds, error or "no part of the mesh has an area")
+        return Part(Facts(), seconds, error or "no part of the mesh has an area")
     started = time.perf_counter()
     try:
         job.store.write_field(job.row, job.lattice.place(block), total.values)
     except Exception as failure:
-        return Part(Facts(), total.seconds, reason_of(job, failure))
+        return Part(Facts(), seconds, reason_of(job, failure))
     draws = cut.draws.within(block)
     probe = measure(draws, total.values[draws.places(block)], np.asarray(total.exact))
     return Part(
         replace(cut.facts, points=total.points),
-        total.seconds + time.perf_counter() - started,
+        seconds + time.perf_counter() - started,
         quality=replace(cut.quality, probe=probe),
         backends=total.backends,
     )

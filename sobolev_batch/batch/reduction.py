@@ -69,6 +69,12 @@ class Reducer:
         return [rows[part] for part in _parts(len(rows), min(fitting, shared))]
 
     @property
+    def task_bytes(self) -> float:
+        """What one task of the reduction takes at most, measured: the fields it holds, the others as temporaries."""
+        block_bytes = 16.0 * self.blocks[0].size
+        return max(5 * block_bytes, _TILE_BYTES + 4 * block_bytes)
+
+    @property
     def _capacity(self) -> int:
         return _TILE_BYTES // (self.blocks[0].size * 16)
 
@@ -121,8 +127,9 @@ class Reducer:
         for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
             direct = self._direct(rows[i], others[j])
             sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
-        for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
-            square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
+        if shared:
+            for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
+                square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = (self.areas[list(rows)][:, None] + self.areas[list(others)]) * unequal
         errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal

@@ -10,15 +10,16 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from distributed import Client, Future, as_completed
+from distributed import CancelledError, Client, Future, as_completed
+from distributed.comm import CommClosedError
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.cluster import local_client, thread_client
-from sobolev_batch.batch.crew import Crew
+from sobolev_batch.batch.crew import MEMORY, Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
 from sobolev_batch.batch.equipment import enlist, worry_about
 from sobolev_batch.batch.journal import Journal
@@ -32,6 +33,7 @@ from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job
+from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.quality import Quality
 
@@ -152,6 +154,8 @@ def run(
                         break
                     plan = plan.on(choice)
                     place = Store.prepare(location, plan)
+                    # It has laid out the records anew, that of the run with them.
+                    journal.write("running")
                     rows = rows_of(place, plan)
                     records = list(place.records())
                     missing = rows_without_field(records, rows)
@@ -210,7 +214,7 @@ def _compute_fields(
     notify(Progress("fields", 0, len(missing)))
     equipped = crew.with_backend(plan.study.backend)
     layouts, refused = lay_out_rows(plan, [rows[i] for i in missing], equipped)
-    submitter = Submitter.of(client, equipped, plan.study.backend, layouts.values())
+    submitter = Submitter.of(client, crew, plan.study.backend, layouts.values(), len(plan.blocks))
     done = 0
     for i in missing:
         if rows[i].label in refused:
@@ -218,39 +222,57 @@ def _compute_fields(
             records[i] = record = Record(key=rows[i].key, status="failed", reason=refused[rows[i].label])
             store.write_record(i, record)
             notify(Progress("fields", done, len(missing), rows[i].label, record))
+    # A mesh in pieces occupies all workers by itself, and its pieces the scratch space.
+    cut = any(layout.parts > 1 for layout in layouts.values())
+    in_flight = crew.threads + 1 if cut else max(_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * crew.threads)
     futures: dict[Future, int] = {}
-    remaining = iter([i for i in missing if rows[i].label in layouts])
-    # Results come along: to ask for each by itself takes longer than a small mesh.
-    completed = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+    remaining = enumerate(i for i in missing if rows[i].label in layouts)
+    completed = as_completed(loop=client.loop)
 
     def hand_over(count: int) -> None:
-        for i in islice(remaining, count):
+        for rank, i in islice(remaining, count):
             layout = layouts[rows[i].label]
-            future = submitter.field(_job(store, plan, i, rows[i], layout.transform_bytes), layout)
+            future = submitter.field(_job(store, plan, i, rows[i], layout.transform_bytes), layout, rank)
             futures[future] = i
             completed.add(future)
 
-    hand_over(max(_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * crew.threads))
-    for future, result in completed:
-        hand_over(1)
-        done += 1
-        i = futures.pop(future)
-        row = rows[i]
-        if isinstance(result, Record):
-            record = result
-        else:
-            # The task itself reports bad meshes; what arrives here is a worker that died or a store
-            # that cannot be written any more.
-            failure = result[1] if isinstance(result, tuple) else result
-            record = Record(key=row.key, status="failed", reason=f"{type(failure).__name__}: {failure}")
-            _log.error("%s: %s", row.label, record.reason)
-            store.write_record(i, record)
-        if layouts[row.label].parts > 1:
-            store.scratch.discard(i)
-        records[i] = record
-        notify(Progress("fields", done, len(missing), row.label, record))
-    if any(layout.parts > 1 for layout in layouts.values()):
+    hand_over(in_flight)
+    for batch in completed.batches():
+        hand_over(len(batch))
+        for future, outcome in zip(batch, _outcomes(client, batch), strict=True):
+            done += 1
+            i = futures.pop(future)
+            row = rows[i]
+            if isinstance(outcome, Record):
+                record = outcome
+            else:
+                # The task itself reports bad meshes; what arrives here is a worker that died or a store
+                # that cannot be written any more.
+                record = Record(key=row.key, status="failed", reason=f"{type(outcome).__name__}: {outcome}")
+                _log.error("%s: %s", row.label, record.reason)
+                store.write_record(i, record)
+            if layouts[row.label].parts > 1:
+                store.scratch.discard(i)
+            records[i] = record
+            notify(Progress("fields", done, len(missing), row.label, record))
+    if cut:
         store.scratch.discard()
+
+
+def _outcomes(client: Client, futures: Sequence[Future]) -> list[Any]:
+    """The results of futures that have ended, or what they raised, all fetched at once.
+
+    Raises:
+        ClusterError: the scheduler is gone, and what became of its tasks is not known.
+    """
+    lost = f"the scheduler at {client.scheduler.address} was lost; the same command goes on from what is stored"
+    if client.status != "running" or any(future.cancelled() for future in futures):
+        raise ClusterError(lost)
+    try:
+        found = iter(client.gather([future for future in futures if future.status == "finished"]))
+        return [next(found) if future.status == "finished" else future.exception() for future in futures]
+    except (CommClosedError, CancelledError) as error:
+        raise ClusterError(lost) from error
 
 
 def _job(store: Store, plan: Plan, number: int, row: Row, memory: float) -> Job:
@@ -292,12 +314,18 @@ def _reduce(
     others = range(len(rows)) if every_pair else [reference]
     distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
 
+    claims = reducer.task_bytes > crew.share_bytes
+    resources = {MEMORY: min(reducer.task_bytes, crew.largest_bytes)} if claims else None
+
+    def submitted(task: Callable[..., Any], *arguments: Sequence[int]) -> Future:
+        return client.submit(task, *arguments, pure=False, resources=resources)
+
     jobs: dict[Future, tuple[Sequence[int], Sequence[int] | None]] = {
-        client.submit(reducer.norms, tile, pure=False): (tile, None) for tile in reducer.strips(complete, crew.threads)
+        submitted(reducer.norms, tile): (tile, None) for tile in reducer.strips(complete, crew.threads)
     }
     if every_pair:
         for tile, others_of_tile in reducer.tiles(complete, crew.threads):
-            jobs[client.submit(reducer.tile, tile, others_of_tile, pure=False)] = (tile, others_of_tile)
+            jobs[submitted(reducer.tile, tile, others_of_tile)] = (tile, others_of_tile)
     notify(Progress("reduction", 0, len(jobs)))
     for done, future in enumerate(as_completed(list(jobs)), 1):
         tile, other = jobs.pop(future)

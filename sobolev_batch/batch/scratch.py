@@ -2,67 +2,63 @@
 
 from __future__ import annotations
 
+import io
+import logging
+import zipfile
 from dataclasses import dataclass
 
 import numpy as np
-import zarr
-from zarr.codecs import Crc32cCodec
 
 from sobolev_batch.batch.location import Location
 from sobolev_batch.errors import StoreError
 from sobolev_batch.surfaces.mesh import Mesh
 
+_log = logging.getLogger(__name__)
+
 _FOLDER = "scratch"
-_ARRAYS = ("vertices", "triangles")
 
 
 @dataclass(frozen=True)
 class Scratch:
-    """Pieces of meshes, by the rows that they belong to."""
+    """Pieces of meshes, by the rows and the cuts that they belong to: each one key, with a checksum."""
 
     location: Location
 
-    def write(self, row: int, number: int, mesh: Mesh) -> None:
-        """Keep a piece of a row's mesh until it is discarded.
+    def write(self, row: int, token: str, number: int, mesh: Mesh) -> None:
+        """Keep a piece of a cut of a row's mesh until the row's pieces are discarded.
 
         Raises:
             StoreError: it cannot be written.
         """
-        with self.location.access("written"):
-            for name in _ARRAYS:
-                values = getattr(mesh, name)
-                zarr.create_array(
-                    self.location.keys(values.nbytes),
-                    name=_key(row, number, name),
-                    data=values,
-                    chunks=values.shape,
-                    compressors=(Crc32cCodec(),),
-                    overwrite=True,
-                )
+        archive = io.BytesIO()
+        np.savez(archive, vertices=mesh.vertices, triangles=mesh.triangles)
+        self.location.write({_key(row, token, number): archive.getvalue()})
 
-    def read(self, row: int, number: int) -> Mesh:
+    def read(self, row: int, token: str, number: int) -> Mesh:
         """A piece that was written.
 
         Raises:
             StoreError: it is not there, damaged, or cannot be reached.
         """
-        keys = self.location.keys()
-        with self.location.access("read"):
-            try:
-                vertices, triangles = (
-                    np.asarray(zarr.open_array(keys, path=_key(row, number, name), mode="r")[:]) for name in _ARRAYS
-                )
-            except (FileNotFoundError, ValueError) as error:
-                raise StoreError(
-                    f"{self.location}: piece {number} of the mesh of row {row} cannot be read ({error}); "
-                    "run the study again"
-                ) from error
-        return Mesh.of_checked(vertices, triangles)
+        archive = self.location.read(_key(row, token, number))
+        try:
+            if archive is None:
+                raise ValueError("it is not there")
+            with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
+                return Mesh.of_checked(arrays["vertices"], arrays["triangles"])
+        except (ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise StoreError(
+                f"{self.location}: piece {number} of the mesh of row {row} cannot be read ({error}); "
+                "run the study again"
+            ) from error
 
     def discard(self, row: int | None = None) -> None:
-        """Remove the pieces of a row, or of all."""
-        self.location.remove(_FOLDER if row is None else f"{_FOLDER}/{row}")
+        """Remove the pieces of a row, or of all; what cannot be removed is in nobody's way."""
+        try:
+            self.location.remove(_FOLDER if row is None else f"{_FOLDER}/{row}")
+        except StoreError as error:
+            _log.warning("scratch space is left behind: %s", error)
 
 
-def _key(row: int, number: int, name: str) -> str:
-    return f"{_FOLDER}/{row}/{number}/{name}"
+def _key(row: int, token: str, number: int) -> str:
+    return f"{_FOLDER}/{row}/{token}/{number}.npz"

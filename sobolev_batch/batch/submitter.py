@@ -24,23 +24,31 @@ class Submitter:
         claims_memory: whether tasks have to claim their memory; where each fits beside as many as a worker
             has threads, none needs to, and the scheduler is free to deal them out as it likes.
         claims_gpu: whether transforms have to run where a GPU is.
+        blocks: of the lattice.
     """
 
     client: Client
     claims_memory: bool
     claims_gpu: bool
+    blocks: int
 
     @classmethod
-    def of(cls, client: Client, crew: Crew, backend: Backends, layouts: Iterable[Layout]) -> Submitter:
+    def of(cls, client: Client, crew: Crew, backend: Backends, layouts: Iterable[Layout], blocks: int) -> Submitter:
         """The submitter for fields with these layouts."""
         largest = max((layout.largest_bytes for layout in layouts), default=0.0)
-        return cls(client, largest > crew.share_bytes, backend == "gpu")
+        return cls(client, largest > crew.share_bytes, backend == "gpu", blocks)
 
-    def field(self, job: Job, layout: Layout) -> Future:
-        """Compute and store a field; the result is its completion record."""
+    def field(self, job: Job, layout: Layout, rank: int) -> Future:
+        """Compute and store a field; the result is its completion record.
+
+        Args:
+            job: what to compute.
+            layout: as which tasks.
+            rank: fields of lower rank come first.
+        """
         groups = layout.groups
         if layout.parts > 1:
-            return self._field_of_pieces(job, layout)
+            return self._field_of_pieces(job, layout, rank)
         if len(groups) == 1:
             return self._submit(compute_mesh, job, groups[0], claim=layout.making_bytes, transforms=True)
         parts = [
@@ -48,19 +56,22 @@ class Submitter:
         ]
         return self._submit(finish_mesh, job, parts)
 
-    def _field_of_pieces(self, job: Job, layout: Layout) -> Future:
-        cut = self._submit(cut_mesh, job, layout.parts, claim=layout.making_bytes)
+    def _field_of_pieces(self, job: Job, layout: Layout, rank: int) -> Future:
+        # Mesh after mesh and block after block, and sums before further pieces: what waits to be added
+        # up waits in memory.
+        first = -2 * rank * (self.blocks + 1)
+        cut = self._submit(cut_mesh, job, layout.parts, claim=layout.making_bytes, priority=first)
         claim = layout.task_bytes
         parts = []
-        # Block after block, so that what is added up need not wait in memory for the other blocks.
-        for rank, block in enumerate(block for group in layout.groups for block in group):
+        for number, block in enumerate(block for group in layout.groups for block in group):
+            later = first - 2 * (number + 1)
             pieces = [
-                self._submit(transform_piece, job, cut, number, block, claim=claim, transforms=True, priority=-rank)
-                for number in range(layout.parts)
+                self._submit(transform_piece, job, cut, part, block, claim=claim, transforms=True, priority=later)
+                for part in range(layout.parts)
             ]
-            total = self._sum(pieces, claim, -rank)
-            parts.append(self._submit(store_block, job, cut, total, block, claim=claim, priority=-rank))
-        return self._submit(finish_mesh, job, parts)
+            total = self._sum(pieces, claim, later + 1)
+            parts.append(self._submit(store_block, job, cut, total, block, claim=claim, priority=later + 1))
+        return self._submit(finish_mesh, job, parts, priority=first)
 
     def _sum(self, partials: Sequence[Future], claim: float, priority: int) -> Future:
         """Add in pairs, pairs of pairs and so on: no task waits for more than two others."""

@@ -13,6 +13,7 @@ from sobolev_batch.batch.store import Store
 
 # A driver that missed this many beats is taken for lost.
 _MISSED_BEATS = 6
+_PATIENCE_SECONDS = 600.0
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,11 @@ class Status:
     @property
     def lost(self) -> bool:
         """Whether a run began that does not give signs of life any more."""
-        running = self.run is not None and self.run.state == "running"
-        return running and self.silence_seconds > _MISSED_BEATS * HEARTBEAT_SECONDS
+        if self.run is None or self.run.state not in ("submitted", "running"):
+            return False
+        # What was submitted may wait for a busy cluster, and nobody beats for it.
+        patience = _MISSED_BEATS * HEARTBEAT_SECONDS if self.run.state == "running" else _PATIENCE_SECONDS
+        return self.silence_seconds > patience
 
     def lines(self) -> Iterator[str]:
         """For people."""
@@ -85,7 +89,9 @@ class Status:
     def _run_lines(self, run: RunRecord) -> Iterator[str]:
         where = f"by {run.driver}, begun {run.started}"
         if run.state == "submitted":
-            yield f"submitted {_span(self.silence_seconds)} ago, waiting for a worker; {where}"
+            yield f"submitted {_span(self.silence_seconds)} ago, no worker has taken it up yet; {where}"
+            if self.lost:
+                yield "if that cluster is gone, submit the study again"
         elif run.state == "running":
             yield f"running: {run.stage or 'planning'}; {where}, last sign of life {_span(self.silence_seconds)} ago"
             if run.error:

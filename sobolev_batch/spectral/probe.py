@@ -138,8 +138,11 @@ def _shell_chances(lattice: Lattice, orders: tuple[float, ...], degree: int) -> 
     # Relative to the highest frequency, so that high powers neither over- nor underflow.
     growth = (np.arange(lattice.shell_count) / lattice.shell_count) ** (degree + 1)
     weights = shell_weights(lattice, orders)
-    parts = [part / (masses @ part) for weight in weights for part in (weight, weight * growth)]
-    return np.asarray(np.mean(parts, axis=0))
+    chances = np.zeros(lattice.shell_count)
+    for weight in weights:
+        for part in (weight, weight * growth):
+            chances += part / (masses @ part)
+    return chances / (2 * len(orders))
 
 
 def _point_of(lattice: Lattice, shell: int, rng: np.random.Generator) -> NDArray[np.int64]:

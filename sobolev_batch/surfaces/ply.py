@@ -39,7 +39,7 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     # Every element takes at least a byte: a count beyond that would only reserve memory.
     if sum(counts.values()) > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
-    text = re.search(rb"^format\s+ascii", header, re.M) is not None
+    text = _is_text(header)
     lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if text else sum(counts.values())
     if lines != sum(counts.values()):
         raise MeshError(f"the PLY header announces {sum(counts.values())} entries, found {lines}")
@@ -60,13 +60,18 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     return vertices, _triangles(ply["face"])
 
 
-def announced_faces(header: bytes) -> int:
-    """How many faces the beginning of a file announces; 0 where it does not."""
-    return _announced(header).get("face", 0)
+def announced_sizes(header: bytes) -> tuple[int, int, bool]:
+    """How many vertices and faces the beginning of a file announces, 0 where it does not, and whether it is a text."""
+    counts = _announced(header.partition(_END)[0])
+    return counts.get("vertex", 0), counts.get("face", 0), _is_text(header)
 
 
 def _announced(header: bytes) -> dict[str, int]:
     return {name.decode(): int(count) for name, count in re.findall(rb"^element\s+(\w+)\s+(\d+)", header, re.M)}
+
+
+def _is_text(header: bytes) -> bool:
+    return re.search(rb"^format\s+ascii", header, re.M) is not None
 
 
 def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:

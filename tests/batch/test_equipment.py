@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-from sobolev_batch import ClusterError, Study, open_store, run
+from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, remote_client
 from sobolev_batch.batch.crew import GPU, MEMORY
 from sobolev_batch.batch.equipment import enlist, worry_about
@@ -74,9 +74,10 @@ def test_the_memory_of_local_workers_can_be_given() -> None:
     assert member.spare_bytes == pytest.approx(0.85 * 3e9 - 300e6)
 
 
-def test_a_memory_that_is_no_number() -> None:
-    with pytest.raises(ClusterError, match="memory must be a number of bytes such as 4GB or 512MiB, found 'much'"):
-        local_client(1, "much").__enter__()
+@pytest.mark.parametrize("memory", ["much", "-1", "0", "0.5", "1e3", "10MB", "inf", "nan", "50%", ""])
+def test_a_memory_that_no_worker_can_live_in(memory: str) -> None:
+    with pytest.raises(InputError, match=r"a worker's memory must be .* found "):
+        local_client(1, memory).__enter__()
 
 
 def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:

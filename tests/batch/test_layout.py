@@ -7,6 +7,9 @@ import pytest
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.crew import Crew, CrewMember
 from sobolev_batch.batch.layout import lay_out
+from sobolev_batch.spectral.backends import CPU_COSTS
+from sobolev_batch.spectral.division import Load, divide
+from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform import Transform, memory_bytes
 from sobolev_batch.surfaces.sources import Size
 
@@ -27,9 +30,9 @@ def crew(*spare_gigabytes: float, threads: int = 1) -> Crew:
 def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
     layout = lay_out(ONE_CHUNK, TRANSFORM, Size(20_000, 1e7), crew(8, 8), rows=100)
     assert (layout.parts, layout.groups) == (1, (ONE_CHUNK,))
-    block_bytes = ONE_CHUNK[0].size * 16
-    assert layout.transform_bytes == memory_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) - block_bytes
-    assert layout.largest_bytes <= 8e9
+    # It claims what it is going to use, and may use what there is.
+    assert layout.transform_bytes == pytest.approx(8e9, rel=0.01)
+    assert memory_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < layout.largest_bytes < 0.4e9
 
 
 @pytest.mark.parametrize("workers", [crew(4), crew(4, 4), crew(64, 64, 64, threads=8)])
@@ -39,7 +42,7 @@ def test_a_huge_mesh_is_cut_into_the_same_parts_on_any_cluster(workers: Crew) ->
 
 def test_where_memory_is_short_parts_are_smaller() -> None:
     layout = lay_out(ONE_CHUNK, TRANSFORM, Size(20_000_000, 0.9e9), crew(2.1, threads=5), rows=1)
-    assert layout.parts == 20
+    assert layout.parts == 39
     assert layout.task_bytes <= 2.1e9 / 5
     assert layout.making_bytes <= 2.1e9
 
@@ -50,8 +53,19 @@ def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() 
     assert tight.largest_bytes == pytest.approx(1.5e9)
     # Four at once would leave nothing to each: such tasks run beside fewer others.
     crowded = lay_out(LARGE, TRANSFORM, Size(1000, 0), crew(2.25, threads=4), rows=10)
-    assert crowded.transform_bytes == pytest.approx(256e6)
+    assert crowded.transform_bytes == pytest.approx(256e6, rel=1e-2)
     assert 2.25e9 / 4 < crowded.largest_bytes <= 2.25e9
+
+
+@pytest.mark.parametrize("triangles", [2_500_000, 3_000_000, 20_000_000])
+@pytest.mark.parametrize("blocks", [ONE_CHUNK, LARGE])
+@pytest.mark.parametrize("threads", [4, 8])
+def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
+    layout = lay_out(blocks, TRANSFORM, Size(triangles, 0), crew(4, threads=threads), rows=1)
+    part = triangles / layout.parts
+    load = Load(part * 3, part * 12, int(part))
+    divide(blocks[0].shape, 1e-9, "complex128", load, CPU_COSTS, memory=layout.transform_bytes, batch=1 << 21)
+    assert layout.largest_bytes <= 4e9
 
 
 @pytest.mark.parametrize(("rows", "groups"), [(1, 4), (2, 2), (4, 1), (1000, 1)])

@@ -19,6 +19,8 @@ from sobolev_batch.batch.store import Store
         (Path("/tmp/a.zarr"), "/tmp/a.zarr", ""),
         ("s3/a.zarr", "s3/a.zarr", ""),
         (Path("s3/a.zarr"), "s3/a.zarr", ""),
+        ("~/a.zarr", str(Path.home() / "a.zarr"), ""),
+        (Path("~/a.zarr"), str(Path.home() / "a.zarr"), ""),
         ("odd:name/a.zarr", "odd:name/a.zarr", ""),
         ("file:///tmp/a.zarr", "/tmp/a.zarr", ""),
         ("s3://bucket/a b/c.zarr/", "s3://bucket/a b/c.zarr", "s3"),
@@ -45,7 +47,9 @@ def test_folders_and_urls(place: str | Path, name: str, scheme: str) -> None:
         ("simplecache::s3://bucket/hidden.zarr", "a chain of URLs cannot hold a store"),
         ("s3://bucket", "names no place in a bucket"),
         ("s3:///a.zarr", "names no place in a bucket"),
-        (Path("s3://bucket/hidden.zarr"), "a Path cannot hold a URL, and this one began with s3://"),
+        (Path("s3://bucket/hidden.zarr"), "this begins with s3:/ and a URL with s3://; a Path cannot hold a URL"),
+        ("s3:/bucket/hidden.zarr", "this begins with s3:/ and a URL with s3://"),
+        ("", "the path of the store is empty"),
     ],
 )
 def test_urls_that_are_refused_and_not_repeated(place: str | Path, message: str) -> None:

@@ -59,7 +59,7 @@ def job_of(plan: Plan, store_path: Path, member: Member, row: int = 0) -> Job:
 
 def computed(client: Client, job: Job, parts: int, blocks: tuple[Block, ...]) -> Record:
     layout = Layout(parts, tuple((block,) for block in blocks), 1e9, 1e9, 1e9)
-    record: Record = Submitter(client, False, False).field(job, layout).result()
+    record: Record = Submitter(client, False, False, len(blocks)).field(job, layout, 0).result()
     return record
 
 

@@ -97,6 +97,25 @@ def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, mon
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize(("rows", "others"), [([0, 1], [3, 4, 9]), ([2], [9]), ([5], [6, 7, 8])])
+@pytest.mark.parametrize("fitting", [5, 3])
+def test_tiles_whose_others_are_all_other_rows(
+    reducer: Reducer,
+    fields: NDArray[np.complex128],
+    monkeypatch: pytest.MonkeyPatch,
+    rows: list[int],
+    others: list[int],
+    fitting: int,
+) -> None:
+    monkeypatch.setattr(reduction, "_TILE_BYTES", fitting * 16 * reducer.blocks[0].size)
+    found = reducer.tile(rows, others).values
+    lattice = reducer.lattice
+    differences = (fields[rows][:, None] - fields[others]).reshape(-1, *lattice.shape)
+    sums = shell_sums(differences, None, lattice, lattice.half)
+    expected = np.sqrt(shell_weights(lattice, reducer.orders) @ sums.T).reshape(found.shape)
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     norms, to_center = reducer.norms([1, 3, CENTER])
     weights = shell_weights(reducer.lattice, reducer.orders)

@@ -68,7 +68,7 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
         assert submitted.returncode == 0, submitted.stderr
         assert submitted.stdout.splitlines() == [
             f"6 of 6 surfaces to be computed by the cluster at {address}",
-            f"follow it by: sobolev-batch status '{store}'",
+            f"follow it by: sobolev-batch status --follow '{store}'",
         ]
         assert cli("status", store, "--follow").returncode == 0
         again = cli("submit", study_path, "--scheduler", address, "--store", store)
