@@ -6,6 +6,7 @@ process, so a location can be stored, logged and sent to a worker.
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ from typing import Any
 from uuid import uuid4
 
 from fsspec import AbstractFileSystem, available_protocols
+from fsspec.asyn import sync
 from fsspec.core import url_to_fs
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import FsspecStore, LocalStore
@@ -136,7 +138,11 @@ class Location:
         with self.access("written"):
             if self.scheme:
                 files, root = self._filesystem()
-                files.pipe({f"{root}/{key}": document for key, document in documents.items()})
+                named = {f"{root}/{key}": document for key, document in documents.items()}
+                if files.async_impl:
+                    sync(files.loop, _put_all, files, named)
+                else:
+                    files.pipe(named)
                 return
             for key, document in documents.items():
                 path = Path(self.name) / key
@@ -251,6 +257,14 @@ def _require_no_credentials(scheme: str, rest: str) -> None:
     before, at, _ = rest.partition("@")
     if at and (":" in before or (scheme in _BUCKET_SCHEMES and "/" not in before)):
         raise StoreError(f"a {scheme}:// URL of a store with credentials in it; {advice}")
+
+
+async def _put_all(files: AbstractFileSystem, documents: Mapping[str, bytes]) -> None:
+    # All are waited for, since asyncio logs the failures that nobody asked for.
+    puts = (files._pipe_file(path, document) for path, document in documents.items())
+    for outcome in await asyncio.gather(*puts, return_exceptions=True):
+        if isinstance(outcome, BaseException):
+            raise outcome
 
 
 def _lacks_bucket(error: Exception) -> bool:

@@ -293,7 +293,7 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
         assert done.stderr.count("\n") == 1
         assert SECRET not in done.stderr
         assert done.stdout == ""
-        assert time.monotonic() - started < 40
+        assert time.monotonic() - started < 90
     assert server.keys("nothing.zarr") == []
 
 
