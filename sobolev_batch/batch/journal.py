@@ -56,7 +56,7 @@ class Journal:
     def _is_replaced(self) -> bool:
         """Whether another driver has taken over, as when this one's worker was retired: how that ends counts."""
         there = self._store.read_run()
-        return there is not None and there.state == "running" and there.driver != self._driver
+        return there is not None and there.state == "running" and not there.driver.startswith(_process())
 
     def write(self, state: RunState, error: str = "") -> None:
         """Replace the store's record."""
@@ -64,8 +64,7 @@ class Journal:
 
     @property
     def _driver(self) -> str:
-        driver = f"process {os.getpid()} on {socket.gethostname()}"
-        return f"{driver}, cluster {self.cluster}" if self.cluster else driver
+        return f"{_process()}, cluster {self.cluster}" if self.cluster else _process()
 
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):
@@ -76,3 +75,7 @@ class Journal:
                 self.write("running", worry)
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)
+
+
+def _process() -> str:
+    return f"process {os.getpid()} on {socket.gethostname()}"

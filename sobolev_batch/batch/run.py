@@ -135,6 +135,7 @@ def run(
         if missing or not _is_reduced(place, plan, rows, records):
             with nullcontext(client) if client is not None else _own_client(location, workers, memory) as active:
                 journal.cluster = active.scheduler.address
+                journal.write("running")
                 notify(Progress("cluster", 0, 0, active.dashboard_link))
                 crew = enlist(active)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
