@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,3 +91,25 @@ def test_what_a_study_waits_for_is_told(client: Client) -> None:
     assert worry_about(client, "gpu").startswith("no worker with a GPU is left")
     with tcp_cluster() as (address, _), Client(address) as lonely:
         assert worry_about(lonely, "auto") == "no worker is left; waiting for one to start"
+
+
+def _die_once(marker: Path) -> str:
+    if not marker.exists():
+        marker.touch()
+        os._exit(1)
+    return "alive"
+
+
+def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tmp_path: Path) -> None:
+    with local_client(1, "1GB") as client:
+        enlist(client)
+        task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
+        assert task.result(timeout=120) == "alive"
+
+
+def test_a_cluster_is_enlisted_as_it_is_after_the_setup_of_its_workers() -> None:
+    """A second client registers nothing and waits for nothing of its own accord."""
+    with local_client(1) as client, Client(client.scheduler.address, set_as_default=False) as second:
+        first = enlist(client)
+        assert enlist(second) == first
+        assert all(member.spare_bytes > 0 and member.note for member in first.members)
