@@ -147,10 +147,10 @@ def run(
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                     notify(progress)
 
-                _compute_fields(active, crew, place, plan, rows, missing, records, note)
-                found = _reduce(active, crew, place, plan, rows, records, note)
-                for _ in range(_MOST_ROUNDS - 1):
-                    choice = _grown(plan, found)
+                for rounds_left in reversed(range(_MOST_ROUNDS)):
+                    _compute_fields(active, crew, place, plan, rows, missing, records, note)
+                    found = _reduce(active, crew, place, plan, rows, records, note)
+                    choice = _grown(plan, found) if rounds_left else None
                     if choice is None:
                         break
                     plan = plan.on(choice)
@@ -160,8 +160,6 @@ def run(
                     rows = rows_of(place, plan)
                     records = list(place.records())
                     missing = rows_without_field(records, rows)
-                    _compute_fields(active, crew, place, plan, rows, missing, records, note)
-                    found = _reduce(active, crew, place, plan, rows, records, note)
     failed = {
         row.label: record.reason if record else "not computed"
         for row, record in zip(rows, records, strict=True)
