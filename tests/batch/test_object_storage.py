@@ -32,7 +32,7 @@ from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, serving
 from tests.batch.test_store import READER
 from tests.test_cli import STUDY
 
-pytest.importorskip("s3fs")
+pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
 
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
