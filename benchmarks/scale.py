@@ -15,7 +15,7 @@ import sobolev_batch as sb
 from benchmarks.table import Row
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.run import Progress
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
 from sobolev_batch.results.status import Status
 

@@ -11,35 +11,45 @@ task; a reduction over what the tasks stored makes the tables. Data flows one wa
 `surfaces` knows none of the others, `spectral` knows neither dask nor zarr. See docs/design.md.
 """
 
-from sobolev_batch.batch.run import Summary, run
-from sobolev_batch.batch.study import Study
-from sobolev_batch.batch.submission import Submission, submit
-from sobolev_batch.errors import (
-    AccuracyError,
-    BackendError,
-    ClusterError,
-    InputError,
-    LatticeError,
-    MeshError,
-    OrderError,
-    SobolevBatchError,
-    StoreError,
-    StudyError,
-)
-from sobolev_batch.results.opening import open_store
-from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.norms import distance, inner_product, norm
-from sobolev_batch.surfaces.icosphere import icosphere
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.readers import read_mesh
-from sobolev_batch.surfaces.similarity import Similarity
-from sobolev_batch.surfaces.sphere import Sphere
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sobolev_batch.batch.release import release
+    from sobolev_batch.batch.run import Summary, run
+    from sobolev_batch.batch.study import Study
+    from sobolev_batch.batch.submission import Submission, submit
+    from sobolev_batch.batch.verification import Verification, verify
+    from sobolev_batch.errors import (
+        AccuracyError,
+        BackendError,
+        ClaimError,
+        ClusterError,
+        DamageError,
+        InputError,
+        LatticeError,
+        MeshError,
+        OrderError,
+        SobolevBatchError,
+        StoreError,
+        StudyError,
+    )
+    from sobolev_batch.results.opening import open_store
+    from sobolev_batch.spectral.fields import fourier_transform
+    from sobolev_batch.spectral.lattice import Lattice
+    from sobolev_batch.spectral.norms import distance, inner_product, norm
+    from sobolev_batch.surfaces.icosphere import icosphere
+    from sobolev_batch.surfaces.mesh import Mesh
+    from sobolev_batch.surfaces.readers import read_mesh
+    from sobolev_batch.surfaces.similarity import Similarity
+    from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
     "AccuracyError",
     "BackendError",
+    "ClaimError",
     "ClusterError",
+    "DamageError",
     "InputError",
     "Lattice",
     "LatticeError",
@@ -54,6 +64,7 @@ __all__ = [
     "StudyError",
     "Submission",
     "Summary",
+    "Verification",
     "distance",
     "fourier_transform",
     "icosphere",
@@ -61,6 +72,57 @@ __all__ = [
     "norm",
     "open_store",
     "read_mesh",
+    "release",
     "run",
     "submit",
+    "verify",
 ]
+
+
+# Modules are imported when something of them is asked for: it takes seconds for all of them, in which
+# the command line could not answer.
+_MODULES = {
+    "AccuracyError": "errors",
+    "BackendError": "errors",
+    "ClaimError": "errors",
+    "ClusterError": "errors",
+    "DamageError": "errors",
+    "InputError": "errors",
+    "Lattice": "spectral.lattice",
+    "LatticeError": "errors",
+    "Mesh": "surfaces.mesh",
+    "MeshError": "errors",
+    "OrderError": "errors",
+    "Similarity": "surfaces.similarity",
+    "SobolevBatchError": "errors",
+    "Sphere": "surfaces.sphere",
+    "StoreError": "errors",
+    "Study": "batch.study",
+    "StudyError": "errors",
+    "Submission": "batch.submission",
+    "Summary": "batch.run",
+    "Verification": "batch.verification",
+    "distance": "spectral.norms",
+    "fourier_transform": "spectral.fields",
+    "icosphere": "surfaces.icosphere",
+    "inner_product": "spectral.norms",
+    "norm": "spectral.norms",
+    "open_store": "results.opening",
+    "read_mesh": "surfaces.readers",
+    "release": "batch.release",
+    "run": "batch.run",
+    "submit": "batch.submission",
+    "verify": "batch.verification",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Self
 
 import click
@@ -19,10 +20,13 @@ from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.layout import lay_out_rows
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan, make_plan
-from sobolev_batch.batch.run import Progress, Summary, run
+from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.release import release
+from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submission import submit
+from sobolev_batch.batch.verification import verify
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.opening import open_store
 from sobolev_batch.results.status import Status
@@ -32,7 +36,7 @@ from sobolev_batch.spectral.norms import distance
 from sobolev_batch.surfaces.readers import read_mesh
 from sobolev_batch.surfaces.similarity import Similarity
 
-EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 1, 2, 3, 130
+EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 3, 130, 143
 _DEFAULT_FOLDER = Path("storage")
 _FOLLOW_SECONDS = 5.0
 # Of object storage, by the names of their loggers.
@@ -87,7 +91,7 @@ def run_command(
             "--workers and --worker-memory are for a cluster on this machine; one with a scheduler has its own"
         )
     parsed = Study.from_toml(study)
-    place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
+    place = store or _default_place(parsed)
     with _Reporter() as reporter:
         if scheduler:
             with remote_client(scheduler) as client:
@@ -108,7 +112,7 @@ def submit_command(study: Path, scheduler: str, store: Location | None) -> None:
     """Hand STUDY over to a cluster and return; it goes on without this process."""
     parsed = Study.from_toml(study)
     with remote_client(scheduler) as client:
-        submission = submit(parsed, store or _DEFAULT_FOLDER / f"{parsed.name}.zarr", client)
+        submission = submit(parsed, store or _default_place(parsed), client)
     click.echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
     click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
 
@@ -149,6 +153,45 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
         context.exit(EXIT_SOME_FAILED)
     if status.lost or (status.run is not None and status.run.state == "failed"):
         context.exit(EXIT_OTHER)
+
+
+@cli.command("verify")
+@click.argument("store", type=Location.of, metavar="STORE")
+@click.pass_context
+def verify_command(context: click.Context, store: Location) -> None:
+    """Read everything in STORE back, against its checksums and completion records.
+
+    What is damaged is named, and withdrawn where STORE can be written: `run` then computes it again.
+    Exit status 1 if anything is damaged.
+    """
+    with click.progressbar(label="fields", file=sys.stderr, show_pos=True, length=0) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.length = total
+            bar.update(1)
+
+        found = verify(store, show)
+    click.echo(f"{store}: {found.complete} of {found.total} surfaces complete, their fields read back")
+    for name, what in [*found.fields.items(), *((f"table {name}", what) for name, what in found.tables.items())]:
+        click.echo(f"{name}: {what}")
+    if found.is_sound:
+        click.echo("nothing is damaged")
+        return
+    remedy = "run the study again to repair it" if found.withdrawn else "it cannot be written here, and stays as it is"
+    click.echo(f"{len(found.fields)} surfaces and {len(found.tables)} arrays of tables are damaged; {remedy}")
+    context.exit(EXIT_OTHER)
+
+
+@cli.command("release")
+@click.argument("store", type=Location.of, metavar="STORE")
+@click.option("--force", is_flag=True, help="Even if its run gave a sign of life a moment ago.")
+def release_command(store: Location, force: bool) -> None:
+    """Release STORE from the claim of a run that was killed together with its machine."""
+    claim = release(store, force=force)
+    if claim is None:
+        click.echo(f"{store}: no run has claimed it")
+    else:
+        click.echo(f"{store}: released from {claim.driver}, which had claimed it since {claim.since}")
 
 
 @cli.command("table")
@@ -215,6 +258,8 @@ def compare_command(
 def main() -> None:
     """Run the command line; the process ends with its exit status."""
     debug = "--debug" in sys.argv
+    # What ends a job at its time limit: it leaves the time to give up the claim on a store.
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         status = cli.main(standalone_mode=False)
     except click.ClickException as error:
@@ -223,6 +268,9 @@ def main() -> None:
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted; the same command goes on from what is stored", err=True)
         sys.exit(EXIT_INTERRUPTED)
+    except _Terminated:
+        click.echo("terminated; the same command goes on from what is stored", err=True)
+        sys.exit(EXIT_TERMINATED)
     except Exception as error:
         if debug:
             raise
@@ -231,6 +279,14 @@ def main() -> None:
         click.echo(f"error: {what}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
     sys.exit(status or 0)
+
+
+class _Terminated(SystemExit):
+    """Somebody has asked the process to end."""
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise _Terminated
 
 
 class _Reporter:
@@ -275,6 +331,14 @@ class _Reporter:
         if self._bar is not None:
             self._bar.__exit__(None, None, None)
             self._bar = None
+
+
+def _default_place(study: Study) -> Location:
+    """Where the results of a study go unless somebody says otherwise; the folder is made here, others are not."""
+    location = Location.of(_DEFAULT_FOLDER / f"{study.name}.zarr")
+    with location.access("written"):
+        _DEFAULT_FOLDER.mkdir(exist_ok=True)
+    return location
 
 
 def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, str]]:
@@ -331,9 +395,10 @@ def _task_lines(plan: Plan, crew: Crew) -> Iterator[tuple[str, str]]:
 
 
 def _stored_keys(place: Location) -> dict[str, str]:
-    if not place.exists():
+    store = Store(place)
+    if not store.is_there() or store.is_unfinished:
         return {}
-    store = Store.open(place)
+    store.attributes()
     return {
         label: record.key
         for label, record in zip(store.labels(), store.records(), strict=True)

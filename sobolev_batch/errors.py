@@ -50,6 +50,27 @@ class StoreError(InputError):
     """A store cannot be read or written, or belongs to another study."""
 
 
+class ClaimError(StoreError):
+    """Another run has a store to itself."""
+
+
+class DamageError(StoreError):
+    """What is stored is not what was stored.
+
+    Attributes:
+        what: is wrong, without saying with what.
+        row: of the field, where it is one.
+    """
+
+    def __init__(self, message: str, what: str, row: int | None = None) -> None:
+        super().__init__(message, what, row)
+        self.what = what
+        self.row = row
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class BackendError(SobolevBatchError):
     """A GPU was asked for and cannot be used: a library, the driver or the device is missing or fails."""
 

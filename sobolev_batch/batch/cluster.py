@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 
 import dask
 from dask.utils import parse_bytes
@@ -37,8 +40,11 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
     count = workers or available_cores()
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
+        _shielded_from_interrupts() as unshield,
         dask.config.set(
             {
+                # A task whose worker died twice is set aside, and tried with nothing beside it.
+                "distributed.scheduler.allowed-failures": 1,
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
@@ -51,12 +57,39 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
             threads_per_worker=1,
             memory_limit=limit,
             processes=True,
+            # Of what workers say when they are ended in the middle of a task, nothing helps.
+            silence_logs=logging.ERROR,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
         ) as cluster,
         Client(cluster) as client,
     ):
+        unshield()
         yield client
+
+
+@contextmanager
+def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
+    """Keep Ctrl-C from processes that are started from now on, or by threads that are.
+
+    A terminal sends it to all processes at once. It is the driver that ends, and its cluster with it;
+    workers that are interrupted themselves only print where they were. What the signal mask of a thread
+    blocks is blocked in everything that it starts; the caller's own is restored by what is yielded.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield lambda: None
+        return
+    # It starts with the first process otherwise, and unblocks the signal in the thread that does that.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+    def restore() -> None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    try:
+        yield restore
+    finally:
+        restore()
 
 
 @contextmanager

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import logging
-import os
-import socket
 from collections.abc import Callable
 from threading import Event, Thread
 from types import TracebackType
 from typing import Self
 
+from sobolev_batch.batch.claim import Claim, this_process
 from sobolev_batch.batch.records import RunRecord, RunState, utc_now
 from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import ClaimError
 
 _log = logging.getLogger(__name__)
 
 # Who reads the record knows from its age whether the driver still lives.
 HEARTBEAT_SECONDS = 10.0
+# A driver that was silent for so long is taken for lost.
+PATIENCE_SECONDS = 6 * HEARTBEAT_SECONDS
 
 
 class Journal:
@@ -28,12 +30,14 @@ class Journal:
         worry: asked at each beat, for what keeps the run from going on; empty while nothing does.
     """
 
-    def __init__(self, store: Store) -> None:
-        """Name the store."""
+    def __init__(self, store: Store, claim: Claim) -> None:
+        """Name the store, and the claim that it is held by."""
         self.cluster = ""
         self.stage = ""
         self.worry: Callable[[], str] = str
         self._store = store
+        self._claim = claim
+        self._is_lost = False
         self._started = utc_now()
         self._ended = Event()
         self._thread = Thread(target=self._beat, name="sobolev-batch-journal", daemon=True)
@@ -50,13 +54,22 @@ class Journal:
         self._thread.join()
         if error is None:
             self.write("done")
-        elif not self._is_replaced():
-            self.write("failed", "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error))
+        # Another driver may have taken over, as when this one's worker was retired: how that ends counts.
+        elif self._claim.is_on(self._store.location):
+            ended = isinstance(error, KeyboardInterrupt | SystemExit)
+            self.write("failed", "interrupted" if ended else str(error) or repr(error))
 
-    def _is_replaced(self) -> bool:
-        """Whether another driver has taken over, as when this one's worker was retired: how that ends counts."""
-        there = self._store.read_run()
-        return there is not None and there.state == "running" and not there.driver.startswith(_process())
+    def require_claim(self) -> None:
+        """Check that the store was still this run's at the latest beat.
+
+        Raises:
+            ClaimError: it was released, or somebody else has it.
+        """
+        if self._is_lost:
+            raise ClaimError(
+                f"{self._store.path}: the store was released while this run was going on, and is no longer its own; "
+                "what was recorded counts"
+            )
 
     def write(self, state: RunState, error: str = "") -> None:
         """Replace the store's record."""
@@ -64,18 +77,17 @@ class Journal:
 
     @property
     def _driver(self) -> str:
-        return f"{_process()}, cluster {self.cluster}" if self.cluster else _process()
+        return f"{this_process()}, cluster {self.cluster}" if self.cluster else this_process()
 
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):
             try:
+                if not self._claim.is_on(self._store.location):
+                    self._is_lost = True
+                    return
                 worry = self.worry()
                 if worry:
                     _log.warning("%s: %s", self._store.path, worry)
                 self.write("running", worry)
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)
-
-
-def _process() -> str:
-    return f"process {os.getpid()} on {socket.gethostname()}"

@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 # s3fs asks for the size of every key first, to read the larger ones in parts of 50 MB at once.
 _SIZED_SCHEMES = ("s3", "s3a")
 _PART_BYTES = 50 << 20
+# How zarr, too, names a file until it is whole.
+_PARTIAL = ".partial"
 
 
 @dataclass(frozen=True)
@@ -148,9 +150,84 @@ class Location:
                 path = Path(self.name) / key
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # A reader finds the old document or the new one, never a part of it.
-                partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
+                partial = path.with_name(f"{path.name}.{uuid4().hex}{_PARTIAL}")
                 partial.write_bytes(document)
                 partial.replace(path)
+
+    def create(self, key: str, document: bytes) -> bool:
+        """Write a small document unless its key is there; of several who try, one succeeds.
+
+        Storage that does not know conditional writes lets the last one win: read it again later.
+
+        Returns:
+            Whether it was written.
+
+        Raises:
+            StoreError: the location cannot be written, or the folder in which it should lie is not there.
+        """
+        with self.access("written"):
+            try:
+                if self.scheme:
+                    files, root = self._filesystem()
+                    files.pipe_file(f"{root}/{key}", document, mode="create", **_patience(files))
+                    return True
+                path = Path(self.name) / key
+                path.parent.mkdir(exist_ok=True)
+                with path.open("xb") as file:
+                    file.write(document)
+            except FileExistsError:
+                return False
+        return True
+
+    def discard(self, key: str) -> None:
+        """Remove one key, if it is there, and the location itself if that leaves it empty.
+
+        Raises:
+            StoreError: it cannot be removed.
+        """
+        with self.access("written"):
+            try:
+                if self.scheme:
+                    files, root = self._filesystem()
+                    files.rm_file(f"{root}/{key}")
+                    return
+                (Path(self.name) / key).unlink()
+            except FileNotFoundError as error:
+                if _lacks_bucket(error):
+                    raise
+                return
+            with suppress(OSError):  # it holds a store
+                Path(self.name).rmdir()
+
+    def sizes(self, prefix: str) -> dict[str, int]:
+        """The bytes of every key below a prefix; empty where there is none.
+
+        Raises:
+            StoreError: the location cannot be reached.
+        """
+        with self.access("read"):
+            if self.scheme:
+                files, root = self._filesystem()
+                found = files.find(f"{root}/{prefix}", detail=True, **_patience(files))
+                return {path.removeprefix(f"{root}/"): entry["size"] for path, entry in found.items()}
+            return {
+                os.path.relpath(path, self.name).replace(os.sep, "/"): os.stat(path).st_size
+                for folder, _, names in os.walk(os.path.join(self.name, prefix))
+                for path in (os.path.join(folder, name) for name in names)
+            }
+
+    def sweep(self) -> None:
+        """Remove what writers left behind that were killed in the middle of a key; nobody else may be writing.
+
+        Raises:
+            StoreError: it cannot be removed.
+        """
+        if not self.scheme:  # object storage shows a key when the whole of it is there
+            with self.access("written"):
+                for folder, _, names in os.walk(self.name):
+                    for name in names:
+                        if name.endswith(_PARTIAL):
+                            (Path(folder) / name).unlink()
 
     def remove(self, prefix: str) -> None:
         """Remove everything below a prefix, if anything is there.
@@ -169,34 +246,37 @@ class Location:
                 if _lacks_bucket(error):
                     raise
 
-    def exists(self) -> bool:
-        """Whether anything is here.
+    def names(self) -> set[str]:
+        """The names of what lies here at the first level; empty where nothing is.
 
         Raises:
             StoreError: the location cannot be reached.
         """
-        if not self.scheme:
-            return Path(self.name).exists()
         with self.access("read"):
+            if not self.scheme:
+                return set(os.listdir(self.name)) if Path(self.name).exists() else set()
             files, root = self._filesystem()
             # The name alone may stand for a folder that was emptied; only what exists is listed.
-            return files.exists(root, **_patience(files)) and bool(files.ls(root, detail=False, **_patience(files)))
+            if not files.exists(root, **_patience(files)):
+                return set()
+            return {path.rstrip("/").rpartition("/")[2] for path in files.ls(root, detail=False, **_patience(files))}
 
-    def require_free(self) -> None:
+    def require_free(self, besides: str = "") -> None:
         """Check that a store may be laid out here, as far as can be told without writing.
 
+        Args:
+            besides: the name of what may lie here already.
+
         Raises:
-            StoreError: something is there, it cannot be reached, or nobody may write there.
+            StoreError: something is there, it cannot be reached, or there is no folder to hold it.
         """
         path = Path(self.name)
         if not self.scheme and path.exists() and not path.is_dir():
             raise StoreError(f"{self}: a file is there; name a folder that is new or holds a store")
-        if self.exists() and (self.scheme or any(path.iterdir())):
+        if self.names() - {besides}:
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
-        if not self.scheme:
-            nearest = next(folder for folder in [path, *path.absolute().parents] if folder.exists())
-            if not os.access(nearest, os.W_OK):
-                raise StoreError(f"{self}: the store cannot be written: no permission in {nearest}")
+        if not self.scheme and not path.absolute().parent.is_dir():
+            raise StoreError(f"{self}: there is no folder {path.absolute().parent} to hold the store; make it first")
 
     @contextmanager
     def access(self, verb: str) -> Iterator[None]:

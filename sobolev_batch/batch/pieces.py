@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.equipment import backend_of
 from sobolev_batch.batch.records import Facts
 from sobolev_batch.batch.tasks import Job, Part, facts_of, reason_of, settings_of
-from sobolev_batch.errors import MeshError
+from sobolev_batch.errors import MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.probe import Draws, Probe, measure
 from sobolev_batch.spectral.quality import Quality
@@ -96,6 +96,8 @@ def cut_mesh(job: Job, count: int) -> Cut:
         for number, piece in mesh.parts(size):
             job.store.scratch.write(job.row, token, number, piece)
             there.add(number)
+    except StoreError:
+        raise
     except Exception as error:
         return Cut(seconds=time.perf_counter() - started, error=reason_of(job, error))
     return Cut(token, frozenset(there), settings, draws, facts, quality, time.perf_counter() - started)
@@ -111,6 +113,8 @@ def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
         backend = backend_of(job.backend)
         made = transform_block(piece, job.lattice, block, cut.settings, backend=backend, memory=job.memory)
         exact = exact_transform(piece, cut.draws.within(block).frequencies)
+    except StoreError:
+        raise
     except Exception as error:
         return Partial(seconds=time.perf_counter() - started, error=reason_of(job, error))
     return Partial(made.values, exact, made.points, (made.backend,), time.perf_counter() - started)
@@ -141,15 +145,13 @@ def store_block(job: Job, cut: Cut, total: Partial, block: Block) -> Part:
     if error or cut.draws is None or cut.quality is None or total.values is None:
         return Part(Facts(), seconds, error or "no part of the mesh has an area")
     started = time.perf_counter()
-    try:
-        job.store.write_field(job.row, job.lattice.place(block), total.values)
-    except Exception as failure:
-        return Part(Facts(), seconds, reason_of(job, failure))
+    checksum = job.store.write_field(job.row, job.lattice.place(block), total.values)
     draws = cut.draws.within(block)
     probe = measure(draws, total.values[draws.places(block)], np.asarray(total.exact))
     return Part(
         replace(cut.facts, points=total.points),
         seconds + time.perf_counter() - started,
         quality=replace(cut.quality, probe=probe),
+        checksums=(checksum,),
         backends=total.backends,
     )

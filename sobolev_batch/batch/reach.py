@@ -1,4 +1,4 @@
-"""Whether the workers of a cluster reach a store: asked before anything is computed, once of each."""
+"""Whether the workers of a cluster see a store: asked before anything is computed, once of each."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import uuid
 
 from distributed import Client
 
+from sobolev_batch.batch.claim import Claim
 from sobolev_batch.batch.location import Location
 from sobolev_batch.errors import StoreError
 
@@ -17,17 +18,16 @@ _log = logging.getLogger(__name__)
 _PROCESS = uuid.uuid4().hex
 
 
-def require_reach(client: Client, location: Location) -> None:
-    """Check that all workers there are reach the location of a store, where that is a URL.
+def require_reach(client: Client, location: Location, claim: Claim) -> None:
+    """Check that all workers there are see the store that this process has claimed.
 
-    Drivers and credentials are matters of each process: what this one reaches, a worker may not.
+    Drivers and credentials are matters of each process: what this one reaches, a worker may not. And a
+    folder of the same name may be another one on another machine.
 
     Raises:
         StoreError: a worker does not; the message names one.
     """
-    if not location.scheme:
-        return
-    for worker, (process, problem) in _answers(client, location).items():
+    for worker, (process, problem) in _answers(client, location, claim).items():
         if location.is_of_this_process and process != _this_process():
             raise StoreError(
                 f"{location}: what is written there stays in the memory of one process, and the worker {worker} is "
@@ -37,8 +37,8 @@ def require_reach(client: Client, location: Location) -> None:
             raise StoreError(f"the worker {worker} cannot use the store: {problem}")
 
 
-def _answers(client: Client, location: Location) -> dict[str, tuple[str, str]]:
-    found = client.run(_look, location, on_error="return")
+def _answers(client: Client, location: Location, claim: Claim) -> dict[str, tuple[str, str]]:
+    found = client.run(_look, location, claim, on_error="return")
     lost = {worker: answer for worker, answer in found.items() if isinstance(answer, BaseException)}
     for worker, error in lost.items():
         # One that has just gone says nothing about the store; tasks will tell.
@@ -46,13 +46,14 @@ def _answers(client: Client, location: Location) -> dict[str, tuple[str, str]]:
     return {worker: answer for worker, answer in found.items() if worker not in lost}
 
 
-def _look(location: Location) -> tuple[str, str]:
-    """This process, and why it does not reach a location."""
+def _look(location: Location, claim: Claim) -> tuple[str, str]:
+    """This process, and why it does not see the store."""
     try:
-        location.read("zarr.json")
+        seen = claim.is_on(location)
     except StoreError as error:
         return _this_process(), str(error)
-    return _this_process(), ""
+    elsewhere = f"{location} is another place there; name one that all machines share"
+    return _this_process(), "" if seen else elsewhere
 
 
 def _this_process() -> str:

@@ -53,6 +53,8 @@ class Record:
         reason: why it failed; empty otherwise.
         facts: what came out.
         quality: what the errors of norms need to know of the field, see `Quality.to_json`.
+        checksums: of the field's blocks, see `Store.write_field`; a field that has others was not written
+            by the tasks that this record is of, or was damaged.
         seconds: time spent in its tasks.
         worker: address of the worker that finished it.
         backend: what computed the transform.
@@ -64,6 +66,7 @@ class Record:
     reason: str = ""
     facts: Facts = Facts()
     quality: str = ""
+    checksums: tuple[int, ...] = ()
     seconds: float = 0.0
     worker: str = ""
     backend: str = ""
@@ -84,7 +87,8 @@ class Record:
             return None
         try:
             values: dict[str, Any] = json.loads(text)
-            return cls(**{**values, "facts": Facts(**values["facts"])})
+            parts = {"facts": Facts(**values["facts"]), "checksums": tuple(values["checksums"])}
+            return cls(**{**values, **parts})
         except (ValueError, TypeError, KeyError) as error:
             raise StoreError(f"a completion record is damaged ({error}): {text[:80]!r}") from error
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,7 @@ class Reducer:
         areas: (rows,) of every row's surface, NaN without a field.
         errors: (orders, rows) norms of the fields' own errors, likewise.
         widths: (13,) extents of all surfaces together, see `support_widths`.
+        checksums: by row, of the blocks of its field.
     """
 
     store: Store
@@ -51,6 +52,7 @@ class Reducer:
     areas: Reals
     errors: Reals
     widths: Reals
+    checksums: Mapping[int, tuple[int, ...]]
 
     def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
         """Rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
@@ -90,11 +92,10 @@ class Reducer:
         """Norms of rows and their distances to the center, each over (orders, rows); NaN without a center."""
         own = np.zeros((len(rows), self.lattice.shell_count))
         to_center = np.full_like(own, np.nan if self.center is None else 0.0)
-        for block in self.blocks:
-            place = self.lattice.place(block)
-            center = None if self.center is None else self.store.read_fields([self.center], place)[0]
+        for number, block in enumerate(self.blocks):
+            center = None if self.center is None else self._read([self.center], number)[0]
             for part in _parts(len(rows), self._read_at_once):
-                values = self.store.read_fields(rows[part], place)
+                values = self._read(rows[part], number)
                 own[part] += shell_sums(values, None, self.lattice, block)
                 if center is not None:
                     values -= center
@@ -121,7 +122,7 @@ class Reducer:
             sums = Sums.zeros(len(self.orders), len(rows), len(others))
             direct_pairs = np.ones((len(rows), len(others)), dtype=bool)
         else:
-            found = [self._block_sums(rows, others, block, shared) for block in self.blocks]
+            found = [self._block_sums(rows, others, number, shared) for number in range(len(self.blocks))]
             products, left, right = (add_sums(parts) for parts in zip(*found, strict=True))
             sums, direct_pairs = differences(products, left, right)
         for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
@@ -139,19 +140,19 @@ class Reducer:
         return assess(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
 
     def _block_sums(
-        self, rows: Sequence[int], others: Sequence[int], block: Block, shared: int
+        self, rows: Sequence[int], others: Sequence[int], number: int, shared: int
     ) -> tuple[Sums, Sums, Sums]:
         """One block's products of rows and others, and the squares of either.
 
         Of the first ``shared`` others, which are the rows, only the products on and above the diagonal.
         """
+        block = self.blocks[number]
         arrangement = Arrangement.of(self.lattice, block, self.orders)
-        place = self.lattice.place(block)
-        center = None if self.center is None else self.store.read_fields([self.center], place)
+        center = None if self.center is None else self._read([self.center], number)
 
         def read(wanted: Sequence[int], room: Complexes) -> Complexes:
             for part in _parts(len(wanted), self._read_at_once):
-                values = self.store.read_fields(wanted[part], place).astype(np.complex128, copy=False)
+                values = self._read(wanted[part], number).astype(np.complex128, copy=False)
                 if center is not None:
                     values -= center
                 np.take(values.reshape(len(values), -1), arrangement.order, axis=1, out=room[part], mode="clip")
@@ -173,12 +174,17 @@ class Reducer:
             meet(part, read(others[part], room), len(rows))
         return products, left, right
 
+    def _read(self, rows: Sequence[int], number: int) -> Complexes:
+        """One block of fields, as their records say that they are."""
+        expected = [self.checksums[row][number] for row in rows]
+        return self.store.read_fields(rows, self.lattice.place(self.blocks[number]), expected)
+
     def _direct(self, row: int, other: int) -> Sums:
         """The sums of one pair, from the difference of its fields."""
         sums = np.zeros(self.lattice.shell_count)
         if row != other:
-            for block in self.blocks:
-                a, b = self.store.read_fields([row, other], self.lattice.place(block))
+            for number, block in enumerate(self.blocks):
+                a, b = self._read([row, other], number)
                 sums += shell_sums(a - b, None, self.lattice, block)
         return sums_of_shells(sums, self.lattice, self.orders)
 

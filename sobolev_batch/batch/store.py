@@ -1,7 +1,7 @@
 """The store: one zarr hierarchy with the fields, records and tables of a study.
 
-The driver lays out all arrays before any task starts; tasks fill whole chunks of them and nothing
-else, so no two writers ever meet in one chunk. docs/store.md describes the layout for readers.
+The driver lays out all arrays before any task starts (`preparation`); tasks fill whole chunks of them and
+nothing else, so no two writers ever meet in one chunk. docs/store.md describes the layout for readers.
 
 The metadata of all arrays lie together in one document at the root. A store reads that once and its
 tasks take along what they need of it: on object storage every look at a key is a request.
@@ -10,14 +10,16 @@ tasks take along what they need of it: on object storage every look at a key is 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
+import google_crc32c
 import numpy as np
 import xarray as xr
 import zarr
@@ -31,26 +33,31 @@ from zarr.storage import MemoryStore, StorePath
 
 from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.location import Location
-from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.records import Record, RunRecord
 from sobolev_batch.batch.scratch import Scratch
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
-from sobolev_batch.surfaces.similarity import Similarity
 
-SCHEMA_VERSION = 2
+_log = logging.getLogger(__name__)
+
+SCHEMA_VERSION = 3
 
 Place = tuple[slice, slice, slice]
 Document = dict[str, Any]
 
-_ROOT = "zarr.json"
-_FIELD = "fourier/fourier"
-_LABELS = "fourier/mesh"
-_QUALITY = "fourier/quality"
-_RECORD = "records/record"
+ROOT = "zarr.json"
+# The attribute of the root of a store that is being laid out.
+UNFINISHED = "unfinished"
+FIELD = "fourier/fourier"
+LABELS = "fourier/mesh"
+QUALITY = "fourier/quality"
+RECORD = "records/record"
 _RECORDS, _RUN = "records", "run"
+# All other groups are tables, which the reduction makes.
+_GROUPS_OF_TASKS = ("fourier", _RECORDS)
+# Bytes of the codec at the end of a chunk.
+_CHECKSUM_BYTES = 4
 _REQUESTS_AT_ONCE = 64
-_RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
 class Store:
@@ -58,45 +65,26 @@ class Store:
 
     What it has read of the metadata it keeps: make another one to see what other processes have
     changed of it. Chunks are read anew each time.
+
+    Attributes:
+        location: where it is.
+        documents: metadata documents by the path of their node; that of the root, under "", without the others.
     """
 
     def __init__(self, place: str | Path | Location) -> None:
         self.location = Location.of(place)
-        # Metadata documents by the path of their node; of the root, under "", without the others.
-        self._documents: dict[str, Document] = {}
+        self.documents: dict[str, Document] = {}
+        self._withdrawn: list[str] = []
 
     def __getstate__(self) -> dict[str, Any]:
         # What tasks write and read; tables have fifty times as much.
-        carried = {name: self._documents[name] for name in (_FIELD, _RECORD) if name in self._documents}
-        return {"location": self.location, "_documents": carried}
+        carried = {name: self.documents[name] for name in (FIELD, RECORD) if name in self.documents}
+        return {"location": self.location, "documents": carried, "_withdrawn": []}
 
     @property
     def path(self) -> str:
         """The path or URL."""
         return self.location.name
-
-    @classmethod
-    def prepare(cls, place: str | Path | Location, plan: Plan) -> Self:
-        """Create the store of a plan, or open it if it is already there and take up new meshes.
-
-        Raises:
-            StoreError: the place cannot be reached or written, holds something else, or a store of
-                another study; nothing is changed then.
-        """
-        store = cls(place)
-        if not store.is_there():
-            store.location.require_free()
-            store._lay_out(plan)
-        else:
-            store._check_same_study(plan)
-            with store.location.access("written"):
-                if store._lattice() != _lattice_entry(plan):
-                    store._replace_fields(plan)
-                store._extend(plan)
-                store._documents[""]["attributes"].update(_attributes(plan))
-                # Written even if nothing changed: a place that refuses it must do so before tasks start.
-                store.consolidate()
-        return store
 
     @classmethod
     def open(cls, place: str | Path | Location) -> Self:
@@ -115,20 +103,20 @@ class Store:
         Raises:
             StoreError: the place cannot be reached.
         """
-        if "" not in self._documents:
+        if "" not in self.documents:
             root = self._read_document("")
             if root is None:
                 return False
             # What the root repeats of groups, these repeat of what is in them.
             for name, document in root.pop("consolidated_metadata", {}).get("metadata", {}).items():
                 document.pop("consolidated_metadata", None)
-                self._documents.setdefault(name, document)
-            self._documents[""] = root
+                self.documents.setdefault(name, document)
+            self.documents[""] = root
         return True
 
-    def keys(self, name: str = _FIELD) -> ZarrStore:
+    def keys(self, name: str = FIELD) -> ZarrStore:
         """What zarr and xarray take to read the store, with an eye to the chunks of one array."""
-        chunk = self._document(name)["chunk_grid"]["configuration"]["chunk_shape"]
+        chunk = self.document(name)["chunk_grid"]["configuration"]["chunk_shape"]
         return self.location.keys(math.prod(chunk) * np.dtype(np.complex128).itemsize)
 
     def attributes(self) -> dict[str, Any]:
@@ -137,44 +125,100 @@ class Store:
         Raises:
             StoreError: no store of this package's schema is there.
         """
-        if not self.is_there() or self._documents[""].get("node_type") != "group":
+        if not self.is_there() or self.documents[""].get("node_type") != "group":
             raise StoreError(f"{self.path}: no store of a study is there")
-        found: dict[str, Any] = self._documents[""].get("attributes", {})
+        found: dict[str, Any] = self.documents[""].get("attributes", {})
+        if self.is_unfinished:
+            raise StoreError(
+                f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
+            )
         if "schema_version" not in found or "study" not in found:
             raise StoreError(f"{self.path}: a zarr store, but not one of a study")
         if found["schema_version"] != SCHEMA_VERSION:
             raise StoreError(
-                f"{self.path}: its schema has version {found['schema_version']}, this program reads {SCHEMA_VERSION}"
+                f"{self.path}: its schema has version {found['schema_version']}, this program reads {SCHEMA_VERSION}; "
+                "name another store for this program, or read this one with the version that has written it"
             )
         return found
 
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether a store is there that was not laid out to the end: nothing in it counts."""
+        return self.is_there() and bool(self.documents[""].get("attributes", {}).get(UNFINISHED))
+
     def labels(self) -> tuple[str, ...]:
-        """The label of each row."""
-        return self._read_texts(_LABELS)
-
-    def records(self) -> tuple[Record | None, ...]:
-        """The completion record of each row, None where there is none."""
-        return tuple(Record.from_json(line) for line in self._read_texts(_RECORD))
-
-    def write_record(self, row: int, record: Record) -> None:
-        """Write the completion record of a row: one chunk, replaced as a whole."""
-        array = self._array(_RECORD)
-        with self.location.access("written"):
-            array[row] = record.to_json()
-
-    def write_field(self, row: int, place: Place, values: NDArray[Any]) -> None:
-        """Write one block of a row's field, which must be whole chunks."""
-        array = self._array(_FIELD)
-        with self.location.access("written"):
-            array[(row, *place)] = values
-
-    def read_fields(self, rows: Sequence[int], place: Place) -> NDArray[Any]:
-        """One block of several rows' fields, complex (len(rows), ...).
+        """The label of each row.
 
         Raises:
-            StoreError: a chunk is damaged or cannot be read; the message names its row.
+            StoreError: the store cannot be reached or read.
         """
-        array = self._array(_FIELD)
+        return self._read_texts(LABELS)
+
+    def records(self) -> tuple[Record | None, ...]:
+        """The completion record of each row, None where there is none that can be read."""
+        records, damaged = self._examine_records()
+        for row, what in damaged.items():
+            label = self.labels()[row]
+            _log.warning("%s: the record of %s is damaged and counts as not there: %s", self.path, label, what)
+        return records
+
+    def read_record(self, row: int) -> Record | None:
+        """The completion record of one row, None where there is none that can be read."""
+        line = self._read_record(row)
+        try:
+            return None if isinstance(line, DamageError) else Record.from_json(line)
+        except StoreError:
+            return None
+
+    def damaged_records(self) -> dict[int, str]:
+        """What is wrong with the record of each row that has one which cannot be read."""
+        return self._examine_records()[1]
+
+    def places(self) -> tuple[Place, ...]:
+        """Where each block of a field lies in it, in the order of a plan's blocks."""
+        array = self.array(FIELD)
+        starts = (range(0, total, step) for total, step in zip(array.shape[1:], array.chunks[1:], strict=True))
+        places = []
+        for offsets in product(*starts):
+            x, y, z = (
+                slice(offset, min(offset + step, total))
+                for offset, total, step in zip(offsets, array.shape[1:], array.chunks[1:], strict=True)
+            )
+            places.append((x, y, z))
+        return tuple(places)
+
+    def write_record(self, row: int, record: Record | None) -> None:
+        """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
+        array = self.array(RECORD)
+        with self.location.access("written"):
+            array[row] = "" if record is None else record.to_json()
+
+    def write_field(self, row: int, place: Place, values: NDArray[Any]) -> int:
+        """Write one block of a row's field, which must be whole chunks.
+
+        Returns:
+            The checksum by which `read_fields` knows it again.
+        """
+        array = self.array(FIELD)
+        values = np.ascontiguousarray(values, dtype=array.dtype)
+        with self.location.access("written"):
+            array[(row, *place)] = values
+        return _checksum(values)
+
+    def read_fields(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
+        """One block of several rows' fields, complex (len(rows), ...).
+
+        Args:
+            rows: which.
+            place: of the block.
+            checksums: that its blocks have if they are what the tasks have written; without them, a
+                block that is not there reads as NaN.
+
+        Raises:
+            DamageError: a block is damaged, lost, or another one; it names its row.
+            StoreError: the store cannot be reached.
+        """
+        array = self.array(FIELD)
         values = np.empty((len(rows), *(part.stop - part.start for part in place)), dtype=array.dtype)
         # On object storage all but a wrong checksum is a failure to reach it.
         damage = ValueError if self.location.scheme else (OSError, ValueError)
@@ -185,10 +229,10 @@ class Store:
                     # Into its place: a copy of a field costs as much as reading it.
                     array.get_basic_selection((rows[i], *place), out=NDBuffer.from_numpy_array(values[i]))
                 except damage as error:
-                    raise StoreError(
-                        f"{self.path}: the field of {self.labels()[rows[i]]} is damaged ({error}); "
-                        "remove the store's record of it and run the study again"
-                    ) from error
+                    raise self._damage(rows[i], str(error)) from error
+            if checksums is not None and _checksum(values[i]) != checksums[i]:
+                lost = bool(np.isnan(values[i]).all())
+                raise self._damage(rows[i], "it is not there" if lost else "it is not what was written for its record")
 
         if self.location.scheme and len(rows) > 1:
             # Most of the time of a request is spent waiting.
@@ -198,6 +242,18 @@ class Store:
             for i in range(len(rows)):
                 read(i)
         return values
+
+    def rows_with_whole_fields(self) -> set[int]:
+        """The rows of which every block is there, as long as it should be; nothing is read of them."""
+        array = self.array(FIELD)
+        whole = math.prod(array.chunks) * array.dtype.itemsize + _CHECKSUM_BYTES
+        sizes = self.location.sizes(f"{FIELD}/c")
+        blocks = list(np.ndindex(*(-(-n // m) for n, m in zip(array.shape[1:], array.chunks[1:], strict=True))))
+        return {
+            row
+            for row in range(array.shape[0])
+            if all(sizes.get(f"{FIELD}/{array.metadata.encode_chunk_key((row, *block))}") == whole for block in blocks)
+        }
 
     @property
     def scratch(self) -> Scratch:
@@ -212,197 +268,183 @@ class Store:
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, with one key written at once."""
-        document = self._document(_RECORDS)
+        document = self.document(_RECORDS)
         # Not remembered: consolidated metadata would tell readers of a run that ended long ago.
         changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: record.to_table()}}
-        self.location.write({f"{_RECORDS}/{_ROOT}": json.dumps(changed).encode()})
+        self.location.write({f"{_RECORDS}/{ROOT}": json.dumps(changed).encode()})
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
         """Set the coordinate `quality` of all fields."""
-        array = self._array(_QUALITY)
+        array = self.array(QUALITY)
         with self.location.access("written"):
             array[:] = np.array(qualities, dtype=object)
+
+    def withdraw_tables(self) -> None:
+        """Have no reader find the tables until `consolidate`: while they are written they do not fit together."""
+        self._withdrawn = self._tables()
+        for name in self._withdrawn:
+            del self.documents[name]
+        if self._withdrawn:
+            self.consolidate()
 
     def write_table(self, group: str, dataset: xr.Dataset) -> None:
         """Replace a group of small arrays, each in one chunk; `consolidate` makes it known to readers."""
         made: dict[str, Buffer] = {}
-        dataset.to_zarr(
-            MemoryStore(made),
-            group=group,
-            mode="w",
-            zarr_format=3,
-            consolidated=False,
-            encoding=_table_encoding(dataset),
-        )
-        made.pop(_ROOT, None)
-        there = [name for name in self._documents if name.startswith(f"{group}/")]
-        for name in there:
-            if f"{name}/{_ROOT}" not in made:
+        # A chunk that is not there is a lost one, and never a table of zeros.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            dataset.to_zarr(
+                MemoryStore(made),
+                group=group,
+                mode="w",
+                zarr_format=3,
+                consolidated=False,
+                encoding=table_encoding(dataset),
+            )
+        made.pop(ROOT, None)
+        for name in self._withdrawn:
+            if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in made:
                 self.location.remove(name)
-                del self._documents[name]
-        self._publish(made, last=f"{group}/{_ROOT}")
+        self.publish(made, last=f"{group}/{ROOT}")
+
+    def lost_tables(self) -> tuple[str, ...]:
+        """The arrays of tables that are not all there; nothing is read of them."""
+        return self._lost(self._tables(), self._table_groups())
+
+    def damaged_arrays(self) -> dict[str, str]:
+        """What is wrong with each small array, of tables and coordinates, that cannot be read."""
+        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES)]
+        lost = {*self.lost_tables(), *self._lost(coordinates, coordinates)}
+        damaged = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
+        for name in [*coordinates, *self._tables()]:
+            if name not in damaged and self.document(name).get("node_type") == "array":
+                try:
+                    self._read(name, ...)
+                except DamageError as error:
+                    damaged[name] = error.what
+        return damaged
+
+    def _lost(self, names: Sequence[str], prefixes: Sequence[str]) -> tuple[str, ...]:
+        """Which of some arrays of one chunk are not there as long as they should be, by the sizes of keys."""
+        sizes = {key: size for prefix in prefixes for key, size in self.location.sizes(prefix).items()}
+        lost = []
+        for name in names:
+            if self.document(name).get("node_type") != "array":
+                continue
+            array = self.array(name)
+            found = sizes.get(f"{name}/{array.metadata.encode_chunk_key((0,) * array.ndim)}", 0)
+            # Texts have no size that could be foretold.
+            fixed = array.dtype.kind in "biufc"
+            expected = array.nbytes + _CHECKSUM_BYTES * bool(array.ndim)
+            if array.size and (found != expected if fixed else not found):
+                lost.append(name)
+        return tuple(lost)
 
     def table_attributes(self, group: str) -> dict[str, Any] | None:
         """The attributes of a group of small arrays, or None where it was not written yet."""
-        return self._documents[group].get("attributes", {}) if self.is_there() and group in self._documents else None
+        return self.documents[group].get("attributes", {}) if self.is_there() and group in self.documents else None
 
     def consolidate(self) -> None:
         """Collect the metadata of all groups at the root, so that one read opens everything."""
-        nodes = {f"{name}/{_ROOT}".lstrip("/"): document for name, document in self._documents.items()}
+        nodes = {f"{name}/{ROOT}".lstrip("/"): document for name, document in self.documents.items()}
         known: dict[str, Buffer] = {key: _to_buffer(document) for key, document in nodes.items()}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
             zarr.consolidate_metadata(MemoryStore(known), zarr_format=3)
-        self.location.write({_ROOT: known[_ROOT].to_bytes()})
+        self.location.write({ROOT: known[ROOT].to_bytes()})
 
-    def _document(self, name: str) -> Document:
+    def _damage(self, row: int, what: str) -> DamageError:
+        return DamageError(
+            f"{self.path}: the field of {self.labels()[row]} is damaged ({what}); run the study again", what, row
+        )
+
+    def _examine_records(self) -> tuple[tuple[Record | None, ...], dict[int, str]]:
+        lines: list[str | DamageError]
+        try:
+            lines = list(self._read_texts(RECORD))
+        except DamageError:
+            # One of them at least: which, is seen one by one.
+            lines = [self._read_record(row) for row in range(self.array(RECORD).shape[0])]
+        records: list[Record | None] = []
+        damaged = {}
+        for row, line in enumerate(lines):
+            try:
+                if isinstance(line, DamageError):
+                    raise line
+                records.append(Record.from_json(line))
+            except StoreError as error:
+                damaged[row] = str(error)
+                records.append(None)
+        return tuple(records), damaged
+
+    def _read_record(self, row: int) -> str | DamageError:
+        try:
+            return str(self._read(RECORD, row))
+        except DamageError as error:
+            return error
+
+    def _table_groups(self) -> list[str]:
+        return sorted({name.split("/")[0] for name in self.documents if name} - set(_GROUPS_OF_TASKS))
+
+    def _tables(self) -> list[str]:
+        groups = self._table_groups()
+        return [name for name in self.documents if name.split("/")[0] in groups]
+
+    def document(self, name: str) -> Document:
         """The metadata document of a node, from the root's if it was not read yet."""
-        if name not in self._documents and self.is_there() and name not in self._documents:
+        if name not in self.documents and self.is_there() and name not in self.documents:
             document = self._read_document(name)
             if document is not None:
-                self._documents[name] = document
-        if name not in self._documents:
+                self.documents[name] = document
+        if name not in self.documents:
             raise StoreError(
                 f"{self.path}: the store is incomplete: it has no {name}; remove it and run the study again"
             )
-        return self._documents[name]
+        return self.documents[name]
 
     def _read_document(self, name: str) -> Document | None:
-        text = self.location.read(f"{name}/{_ROOT}".lstrip("/"))
+        text = self.location.read(f"{name}/{ROOT}".lstrip("/"))
         if text is None:
             return None
         try:
             return dict(json.loads(text))
         except (ValueError, TypeError) as error:
             raise StoreError(
-                f"{self.path}: no store of a study is there: {name}/{_ROOT} is damaged ({error})"
+                f"{self.path}: no store of a study is there: {name}/{ROOT} is damaged ({error})"
             ) from error
 
-    def _array(self, name: str) -> zarr.Array[Any]:
+    def array(self, name: str) -> zarr.Array[Any]:
+        """An array by the path of its node, for reading and writing."""
         place = StorePath(self.keys(name), name)
-        known = zarr.AsyncArray.from_dict(place, self._document(name))
+        known = zarr.AsyncArray.from_dict(place, self.document(name))
         # Chunks of zeros are data too: they must exist, or they would read as never computed.
         return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": True}))
 
     def _read_texts(self, name: str) -> tuple[str, ...]:
-        array = self._array(name)
+        return tuple(map(str, np.asarray(self._read(name, ...)).tolist()))
+
+    def _read(self, name: str, where: Any) -> Any:
+        """Some of an array.
+
+        Raises:
+            DamageError: it is damaged.
+            StoreError: the store cannot be reached.
+        """
+        array = self.array(name)
         # Each record is a chunk, and a chunk a request.
         with self.location.access("read"), zarr.config.set({"async.concurrency": _REQUESTS_AT_ONCE}):
-            return tuple(map(str, np.asarray(array[:]).tolist()))
+            try:
+                return array[where]
+            except ValueError as error:
+                raise DamageError(f"{self.path}: {name} is damaged ({error})", str(error)) from error
 
-    def _publish(self, made: dict[str, Buffer], last: str) -> None:
+    def publish(self, made: dict[str, Buffer], last: str) -> None:
         """Write keys that were made in memory, the one that says that the others are there at the end."""
         self.location.write({key: value.to_bytes() for key, value in made.items() if key != last})
         if last in made:
             self.location.write({last: made[last].to_bytes()})
         for key, value in made.items():
-            if key.endswith(f"/{_ROOT}"):
-                self._documents[key.removesuffix(f"/{_ROOT}")] = json.loads(value.to_bytes())
-
-    def _replace_fields(self, plan: Plan) -> None:
-        """Remove everything that was computed and lay out the arrays for another lattice."""
-        tables = {name.split("/")[0] for name in self._documents if name} - {"fourier", "records"}
-        # Records go first: without one, a mesh counts as not computed, whatever is left of it.
-        for prefix in (f"{_RECORD}/c", *sorted(tables), f"{_FIELD}/c", f"{_QUALITY}/c"):
-            self.location.remove(prefix)
-        self._lay_out(plan)
-
-    def _lay_out(self, plan: Plan) -> None:
-        labels = [row.label for row in plan.rows]
-        lattice = plan.lattice
-        chunk = plan.blocks[0].shape
-        made: dict[str, Buffer] = {}
-        root = zarr.create_group(MemoryStore(made), zarr_format=3)
-        root.create_array(
-            _FIELD,
-            shape=(len(labels), *lattice.shape),
-            dtype=plan.choice.precision,
-            chunks=(1, *chunk),
-            compressors=(Crc32cCodec(),),
-            fill_value=complex(np.nan, np.nan),
-            dimension_names=("mesh", *AXES),
-            # xarray takes what `coordinates` names for coordinates, so it stays with a selected field.
-            attributes={
-                "long_name": "Fourier transform of the area measure, xi_z >= 0 half",
-                "coordinates": "quality",
-            },
-        )
-        root.create_array(
-            _QUALITY,
-            shape=(len(labels),),
-            dtype=str,
-            chunks=(len(labels),),
-            compressors=(Crc32cCodec(),),
-            fill_value="",
-            dimension_names=("mesh",),
-        )
-        units = {"units": "cycles per unit length"}
-        coordinates: dict[str, Any] = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
-        coordinates["mesh"] = ("mesh", np.array(labels, dtype=object))
-        axes = xr.Dataset(coords=coordinates)
-        axes.to_zarr(
-            MemoryStore(made),
-            group="fourier",
-            mode="a",
-            zarr_format=3,
-            consolidated=False,
-            encoding=_table_encoding(axes),
-        )
-        root.create_array(
-            _RECORD,
-            shape=(len(labels),),
-            dtype=str,
-            chunks=(1,),
-            compressors=(Crc32cCodec(),),
-            dimension_names=("mesh",),
-            fill_value="",
-        )
-        kept = self._documents.get("", {}).get("attributes", {})
-        self._documents = {"": {**json.loads(made.pop(_ROOT).to_bytes()), "attributes": {**kept, **_attributes(plan)}}}
-        self._publish(made, last="")
-        # The root comes last: a folder without it is not taken for a store.
-        self.consolidate()
-
-    def _check_same_study(self, plan: Plan) -> None:
-        study = self.attributes()["study"]
-        # A lattice that was chosen may be chosen anew; one that was given is part of the study.
-        chosen = plan.study.accuracy is not None
-        differences = [
-            f"{what} {old}, not {new}"
-            for what, old, new in (
-                ("the study", repr(study["name"]), repr(plan.study.name)),
-                ("a lattice of", *map(_described, (study["lattice"], _lattice_entry(plan)["lattice"]))),
-                ("dtype", repr(study["dtype"]), repr(plan.choice.precision)),
-            )
-            if old != new and not (chosen and what != "the study" and study.get("choice"))
-        ]
-        removed = set(self.labels()) - {row.label for row in plan.rows}
-        if removed:
-            differences.append(f"meshes that this study lacks, such as {min(removed)!r}")
-        if differences:
-            raise StoreError(
-                f"{self.path}: a store of another study is there, with {'; '.join(differences)}. "
-                "Name another store, or remove this one"
-            )
-
-    def _lattice(self) -> dict[str, Any]:
-        study = self.attributes()["study"]
-        return {"lattice": study["lattice"], "dtype": study["dtype"]}
-
-    def _extend(self, plan: Plan) -> None:
-        """Append rows for meshes that the study has gained; the rows that are there stay."""
-        there = self.labels()
-        known = set(there)
-        added = [row.label for row in plan.rows if row.label not in known]
-        if not added:
-            return
-        for name in (_RECORD, _FIELD, _QUALITY, _LABELS):
-            array = self._array(name)
-            array.resize((len(there) + len(added), *array.shape[1:]))
-            if name == _LABELS:
-                array[len(there) :] = np.array(added, dtype=object)
-            del self._documents[name]
-            self._document(name)
+            if key.endswith(f"/{ROOT}"):
+                self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(value.to_bytes())
 
 
 def stored_choice(place: str | Path | Location) -> Choice | None:
@@ -412,49 +454,25 @@ def stored_choice(place: str | Path | Location) -> Choice | None:
         StoreError: the place cannot be reached, or holds something else.
     """
     store = Store(place)
-    if not store.is_there():
+    if not store.is_there() or store.is_unfinished:
         return None
     table = store.attributes()["study"].get("choice")
     return Choice.from_table(table) if table else None
 
 
-def _attributes(plan: Plan) -> dict[str, Any]:
-    """What the root of the store of a plan says."""
-    study = plan.study
-    return {
-        "title": study.title,
-        "schema_version": SCHEMA_VERSION,
-        "study": {
-            "name": study.name,
-            **_lattice_entry(plan),
-            "eps": None if study.accuracy else study.transform.accuracy,
-            "choice": plan.choice.to_table() if study.accuracy else None,
-            "orders": list(study.orders),
-            "reference": plan.reference,
-            "table": dict(study.table),
-        },
-        "similarity": _similarity_entry(plan.similarity),
-        "versions": {name: version(name) for name in _RECORDED_VERSIONS},
-    }
+def _checksum(values: NDArray[Any]) -> int:
+    """CRC-32C of a C-ordered array."""
+    data: Any = values.view(np.uint8).reshape(-1)
+    # The library takes what cannot change while it reads.
+    data.flags.writeable = False
+    return int(google_crc32c.value(data))
 
 
 def _to_buffer(document: Document) -> Buffer:
     return BytesBuffer.from_bytes(json.dumps(document).encode())
 
 
-def _described(lattice: dict[str, Any]) -> str:
-    return f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
-
-
-def _lattice_entry(plan: Plan) -> dict[str, Any]:
-    return {"lattice": {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}, "dtype": plan.choice.precision}
-
-
-def _similarity_entry(similarity: Similarity) -> dict[str, Any]:
-    return {"scale": similarity.scale, "origin": list(similarity.origin)}
-
-
-def _table_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+def table_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
     """One chunk per array, with a checksum."""
     return {
         str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}

@@ -5,19 +5,22 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from distributed import Client, Future, fire_and_forget, worker_client
+from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
+from sobolev_batch.batch.claim import Claim, give_up, take
 from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.journal import Journal
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.preparation import prepare_store, require_place
 from sobolev_batch.batch.reach import require_reach
-from sobolev_batch.batch.run import rows_of, rows_without_field, run
+from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import ClusterError
@@ -59,38 +62,62 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
         ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
     """
     location = Location.of(store).absolute()
-    known = stored_choice(location)
-    require_reach(client, location)
-    plan = make_plan(study, known)
+    require_place(location)
+    claim = Claim.of_this_process(outlives_process=True)
+    take(location, claim)
+    try:
+        return _hand_over(study, location, claim, client)
+    except BaseException:
+        give_up(location, claim)
+        raise
+
+
+def _hand_over(study: Study, location: Location, claim: Claim, client: Client) -> Submission:
+    require_reach(client, location, claim)
+    plan = make_plan(study, stored_choice(location))
     enlist(client).with_backend(study.backend)
-    place = Store.prepare(location, plan)
+    place = prepare_store(location, plan)
     missing = rows_without_field(place.records(), rows_of(place, plan))
-    journal = Journal(place)
+    journal = Journal(place, claim)
     journal.cluster = client.scheduler.address
     journal.write("submitted")
     key = f"sobolev-batch-drive-{uuid4().hex}"
     # Before all tasks of other studies, which it takes no thread from: it leaves its own at once.
     future = client.submit(
-        drive, dict(study.table), str(study.folder.absolute()), place.path, key=key, pure=False, priority=1
+        drive, dict(study.table), str(study.folder.absolute()), place.path, claim.run, key=key, pure=False, priority=1
     )
     fire_and_forget(future)
     _await_acceptance(client, future)
     return Submission(place.path, len(plan.rows), len(missing))
 
 
-def drive(table: Mapping[str, Any], folder: str, store: str) -> None:
-    """Run a study from a worker of the cluster that computes it.
+def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
+    """Run a study from a worker of the cluster that computes it, with the claim of its submission.
 
     It does not fail: what goes wrong is in the store, and running into it again would not help.
     """
+    location = Location.of(store)
+    claim = Claim.of_this_process(run, outlives_process=True)
+    there = Claim.read(location)
+    if there is None or there.run != run:
+        _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
+        return
+    take(location, claim)
     try:
         with worker_client() as client:
-            run(Study.from_table(table, folder=folder), store, client)
+            study = Study.from_table(table, folder=folder)
+            carry_out(study, location, claim, nullcontext(client), lambda progress: None)
     except Exception as error:
+        if get_worker().status != Status.running:
+            # Dask has another worker drive, which takes the claim over.
+            _log.warning("%s: this worker leaves before the end of the study it drove", store)
+            return
         _log.error("%s: the study could not be carried out: %s", store, error)
         # Most of what goes wrong is known by now to the run's own journal, but not that a file of the
         # study is missing on this machine.
-        Journal(Store(store)).write("failed", f"{error} (on the worker that drove the study)")
+        if claim.is_on(location):
+            Journal(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
+    give_up(location, claim)
 
 
 def _await_acceptance(client: Client, future: Future) -> None:

@@ -17,7 +17,7 @@ from sobolev_batch.batch.equipment import backend_of
 from sobolev_batch.batch.records import Facts, Record, utc_now
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study import Backends
-from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.errors import InputError, LatticeError, StoreError
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.forecast import settle
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -69,11 +69,16 @@ class Part:
     seconds: float
     error: str = ""
     quality: Quality | None = None
+    checksums: tuple[int, ...] = ()
     backends: tuple[str, ...] = ()
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
-    """Compute and store the whole field of a mesh, then its completion record."""
+    """Compute and store the whole field of a mesh, then its completion record, unless that is there."""
+    # Dask has a task done again whose worker was lost with the result.
+    there = job.store.read_record(job.row)
+    if there is not None and there.completes(job.key):
+        return there
     return finish_mesh(job, [compute_blocks(job, blocks)])
 
 
@@ -82,15 +87,19 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
 
     A mesh that cannot be made or transformed does not raise: the reason is part of the outcome, so
     that one bad mesh stops nothing else.
+
+    Raises:
+        StoreError: the store cannot be written, which is not the mesh's fault.
     """
     started = time.perf_counter()
     try:
         surface = job.similarity.apply(job.member.load())
-        quality, points, backends = _compute(job, surface, blocks)
-        facts = facts_of(surface, points)
+        part = _compute(job, surface, blocks)
+        return replace(part, facts=facts_of(surface, part.facts.points), seconds=time.perf_counter() - started)
+    except StoreError:
+        raise
     except Exception as error:
         return Part(Facts(), time.perf_counter() - started, reason_of(job, error))
-    return Part(facts, time.perf_counter() - started, quality=quality, backends=backends)
 
 
 def reason_of(job: Job, error: Exception) -> str:
@@ -111,8 +120,8 @@ def settings_of(job: Job, surface: Surface) -> Transform:
     return settle(surface, job.lattice, job.aim.goal(surface), job.transform)
 
 
-def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quality, int, tuple[str, ...]]:
-    """Compute and store some blocks; what is known of their errors, of how many points, by what."""
+def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
+    """Compute and store some blocks; what there is to tell of the surface itself is left out."""
     backend = backend_of(job.backend)
     if tuple(blocks) == (job.lattice.half,):
         if job.aim is not None and isinstance(surface, Mesh):
@@ -120,17 +129,18 @@ def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> tuple[Quali
             field = field_for(surface, job.lattice, goal, job.transform, backend=backend, memory=job.memory)
         else:
             field = compute_field(surface, job.lattice, job.transform, job.orders, backend=backend, memory=job.memory)
-        job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
-        return field.quality, field.points, (field.backend,)
+        checksum = job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
+        return Part(Facts(points=field.points), 0.0, "", field.quality, (checksum,), (field.backend,))
     settings = settings_of(job, surface)
-    probes, backends, points = [], [], 0
+    probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         made = transform_block(surface, job.lattice, block, settings, backend=backend, memory=job.memory)
-        job.store.write_field(job.row, job.lattice.place(block), made.values)
+        checksums.append(job.store.write_field(job.row, job.lattice.place(block), made.values))
         probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values))
         backends.append(made.backend)
         points = made.points
-    return Quality.of_surface(surface, join(probes)), points, tuple(backends)
+    quality = Quality.of_surface(surface, join(probes))
+    return Part(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
 
 
 def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
@@ -143,6 +153,7 @@ def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
         reason=errors[0] if errors else "",
         facts=Facts() if errors else parts[0].facts,
         quality="" if errors else _whole(qualities).to_json(),
+        checksums=() if errors else tuple(checksum for part in parts for checksum in part.checksums),
         seconds=sum(part.seconds for part in parts),
         worker=_worker_address(),
         backend=", ".join(dict.fromkeys(backend for part in parts for backend in part.backends)),

@@ -9,6 +9,7 @@ import xarray as xr
 
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import DamageError
 
 
 def open_store(place: str | Path | Location) -> xr.DataTree:
@@ -19,8 +20,16 @@ def open_store(place: str | Path | Location) -> xr.DataTree:
 
     Raises:
         StoreError: no store of a study is there, or it cannot be reached.
+        DamageError: data of a table are not there. (Those that are damaged raise when they are read.)
     """
     store = Store.open(place)
+    lost = store.lost_tables()
+    if lost:
+        # They would read as NaN, zero or nothing, like data.
+        raise DamageError(
+            f"{store.path}: the table {lost[0]} is not there, or not all of it; run the study again to make it anew",
+            "it is not there",
+        )
     if not store.location.scheme:
         return xr.open_datatree(store.path, engine="zarr")
     # Left to itself, xarray looks for older formats and lists what it knows already: 35 requests, not 14.

@@ -6,14 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sobolev_batch.batch.journal import HEARTBEAT_SECONDS
+from sobolev_batch.batch.journal import PATIENCE_SECONDS
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import RunRecord, age_seconds
 from sobolev_batch.batch.store import Store
 
-# A driver that missed this many beats is taken for lost.
-_MISSED_BEATS = 6
-_PATIENCE_SECONDS = 600.0
+_SUBMITTED_PATIENCE_SECONDS = 600.0
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Status:
         if self.run is None or self.run.state not in ("submitted", "running"):
             return False
         # What was submitted may wait for a busy cluster, and nobody beats for it.
-        patience = _MISSED_BEATS * HEARTBEAT_SECONDS if self.run.state == "running" else _PATIENCE_SECONDS
+        patience = PATIENCE_SECONDS if self.run.state == "running" else _SUBMITTED_PATIENCE_SECONDS
         return self.silence_seconds > patience
 
     def lines(self) -> Iterator[str]:
@@ -91,13 +89,14 @@ class Status:
         if run.state == "submitted":
             yield f"submitted {_span(self.silence_seconds)} ago, no worker has taken it up yet; {where}"
             if self.lost:
-                yield "if that cluster is gone, submit the study again"
+                yield f"if that cluster is gone, submit the study again after: sobolev-batch release {self.store}"
         elif run.state == "running":
             yield f"running: {run.stage or 'planning'}; {where}, last sign of life {_span(self.silence_seconds)} ago"
             if run.error:
                 yield run.error
             if self.lost:
                 yield "the process that drove it is probably gone; run or submit the study again, it goes on from here"
+                yield f"if that says that the store is taken: sobolev-batch release {self.store}"
         elif run.state == "failed":
             yield f"the latest run failed: {run.error}; {where}, ended {run.seen}"
         else:

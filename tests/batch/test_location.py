@@ -65,14 +65,14 @@ def test_an_unknown_protocol() -> None:
 
 
 def test_documents_of_a_folder_and_of_a_url(tmp_path: Path) -> None:
-    for location in (Location.of(tmp_path / "new" / "a"), Location.of("memory://documents/a")):
+    for location in (Location.of(tmp_path / "new"), Location.of("memory://documents/a")):
         location.require_free()
-        assert not location.exists()
+        assert location.names() == set()
         assert location.read("b/c") is None
         location.write({"b/c": b"1", "d": b"2"})
         location.write({"d": b"3"})
         assert (location.read("b/c"), location.read("d")) == (b"1", b"3")
-        assert location.exists()
+        assert location.names() == {"b", "d"}
         with pytest.raises(StoreError, match="not empty and holds no store"):
             location.require_free()
         location.remove("b")

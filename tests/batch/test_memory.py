@@ -14,7 +14,7 @@ import resource, sys
 import numpy as np
 import sobolev_batch as sb
 from sobolev_batch.batch.plan import make_plan
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.tasks import Job, compute_mesh
 from sobolev_batch.surfaces.sources import Member
 
@@ -39,7 +39,7 @@ table = {
     "family": [{"name": "a", "source": "icosphere", "levels": [0]}],
 }
 plan = make_plan(sb.Study.from_table(table))
-store = Store.prepare(sys.argv[1], plan)
+store = prepare_store(sys.argv[1], plan)
 study = plan.study
 sheet = Sheet("sheet", 0)
 job = Job(store, 0, "a/0", "key", sheet, plan.similarity, plan.lattice, plan.transform, study.orders)

@@ -24,8 +24,9 @@ from sobolev_batch import Lattice, StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.preparation import prepare_store
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.records import Record
-from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
 from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, serving
@@ -166,7 +167,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
     del table["lattice"]
     plan = make_plan(Study.from_table(table))
-    store = Store.prepare(url, plan)
+    store = prepare_store(url, plan)
     prefix = url.removeprefix(f"s3://{BUCKET}/")
     empty = server.keys(prefix)
     store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
@@ -175,7 +176,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     store.consolidate()
     assert len(server.keys(prefix)) == len(empty) + 5
     finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
-    again = Store.prepare(url, finer)
+    again = prepare_store(url, finer)
     assert server.keys(prefix) == empty
     assert again.records() == (None,) * 5
     assert again.table_attributes("norms") is None
@@ -223,7 +224,7 @@ def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url
 
 def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -> None:
     plan = make_plan(Study.from_table(small_table()))
-    store = Store.prepare(url, plan)
+    store = prepare_store(url, plan)
     place = plan.lattice.place(plan.blocks[0])
     for row, value in ((1, 0), (3, 1)):
         store.write_field(row, place, np.full(plan.lattice.shape, value, dtype=complex))
@@ -242,7 +243,7 @@ def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -
 
 def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
     plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 240})))
-    store = Store.prepare(url, plan)
+    store = prepare_store(url, plan)
     place = plan.lattice.place(plan.blocks[0])
     values = np.arange(plan.lattice.half.size, dtype=complex).reshape(plan.lattice.shape)
     assert values.nbytes > 100 << 20
@@ -259,11 +260,11 @@ def test_places_that_hold_something_else(server: Server, url: str) -> None:
     plan = make_plan(Study.from_table(small_table()))
     server.client().put_object(Bucket=BUCKET, Key=url.removeprefix(f"s3://{BUCKET}/") + "/precious.txt", Body=b"text")
     with pytest.raises(StoreError, match="not empty and holds no store"):
-        Store.prepare(url, plan)
+        prepare_store(url, plan)
     assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == 1
-    Store.prepare(url + "/below", plan)
+    prepare_store(url + "/below", plan)
     with pytest.raises(StoreError, match="a store of another study is there, with the study 'small', not 'other'"):
-        Store.prepare(url + "/below", make_plan(Study.from_table(small_table(study={"name": "other"}))))
+        prepare_store(url + "/below", make_plan(Study.from_table(small_table(study={"name": "other"}))))
 
 
 @pytest.fixture
@@ -424,11 +425,11 @@ def listening() -> set[tuple[str, int]]:
 
 def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
     location, key = Location.of(url), url.removeprefix(f"s3://{BUCKET}/") + "/a/b"
-    assert not location.exists()
+    assert location.names() == set()
     server.client().put_object(Bucket=BUCKET, Key=key, Body=b"1")
-    assert location.exists()
+    assert location.names() == {"a"}
     assert location.read("a/b") == b"1"
     server.client().put_object(Bucket=BUCKET, Key=key, Body=b"2")
     assert location.read("a/b") == b"2"
     server.client().delete_object(Bucket=BUCKET, Key=key)
-    assert not location.exists()
+    assert location.names() == set()

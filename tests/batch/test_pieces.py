@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import Lattice, Mesh, MeshError, Study, icosphere
+from sobolev_batch import Lattice, Mesh, MeshError, StoreError, Study, icosphere
 from sobolev_batch.batch.layout import Layout
 from sobolev_batch.batch.pieces import Cut, Partial, add_partials, cut_mesh, transform_piece
 from sobolev_batch.batch.plan import Plan, make_plan
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.records import Record
-from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job
 from sobolev_batch.spectral.lattice import Block
@@ -52,7 +52,7 @@ def plan() -> Plan:
 
 
 def job_of(plan: Plan, store_path: Path, member: Member, row: int = 0) -> Job:
-    store = Store.prepare(store_path, plan)
+    store = prepare_store(store_path, plan)
     orders = plan.study.orders
     return Job(store, row, "a/0", "key", member, plan.similarity, plan.lattice, plan.transform, orders)
 
@@ -100,14 +100,13 @@ def test_a_mesh_that_cannot_be_cut_fails_alone(
     assert re.search(reason, record.reason)
 
 
-def test_a_piece_that_is_gone_fails_with_its_number(plan: Plan, store_path: Path) -> None:
+def test_a_piece_that_is_gone_is_no_failure_of_its_mesh(plan: Plan, store_path: Path) -> None:
     job = job_of(plan, store_path, Ball("ball", 0))
     cut = cut_mesh(job, 3)
     assert cut.there == {0, 1, 2}
     job.store.scratch.discard(0)
-    partial = transform_piece(job, cut, 1, plan.blocks[0])
-    assert partial.values is None
-    assert "piece 1 of the mesh of row 0 cannot be read" in partial.error
+    with pytest.raises(StoreError, match="piece 1 of the mesh of row 0 cannot be read"):
+        transform_piece(job, cut, 1, plan.blocks[0])
 
 
 def test_errors_survive_the_sum() -> None:

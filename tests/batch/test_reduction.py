@@ -13,8 +13,8 @@ from sobolev_batch import Study
 from sobolev_batch.batch import plan as planning
 from sobolev_batch.batch import reduction
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.reduction import Reducer
-from sobolev_batch.batch.store import Store
 from sobolev_batch.spectral.shells import shell_sums, shell_weights
 from tests.batch.conftest import SMALL_LATTICE, small_table
 
@@ -41,14 +41,15 @@ def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytes
     study = Study.from_table(small_table(family=[family]))
     plan = make_plan(study)
     assert len(plan.blocks) > 2
-    store = Store.prepare(store_path, plan)
+    store = prepare_store(store_path, plan)
+    checksums: dict[int, tuple[int, ...]] = dict.fromkeys(range(ROWS), ())
     for block in plan.blocks:
         place = plan.lattice.place(block)
         for row, field in enumerate(fields):
-            store.write_field(row, place, field[place])
+            checksums[row] += (store.write_field(row, place, field[place]),)
     monkeypatch.setattr(reduction, "_TILE_BYTES", 5 * 16 * plan.blocks[0].size)
     areas, errors = np.ones(ROWS), np.zeros((2, ROWS))
-    return Reducer(store, plan.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13))
+    return Reducer(store, plan.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13), checksums)
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2, 500])

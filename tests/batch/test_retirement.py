@@ -18,7 +18,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import Study, icosphere, open_store, run
-from sobolev_batch.batch.run import Progress
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop

@@ -11,7 +11,7 @@ from distributed import Client
 
 from sobolev_batch import Mesh, Sphere, StoreError, Study, distance, fourier_transform, icosphere, open_store, run
 from sobolev_batch.batch import plan as plan_module
-from sobolev_batch.batch.run import Progress
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import SMALL_LATTICE, small_table, variable
 

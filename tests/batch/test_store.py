@@ -13,6 +13,7 @@ import zarr
 
 from sobolev_batch import StoreError, Study
 from sobolev_batch.batch.plan import Plan, make_plan
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table
@@ -27,7 +28,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Path) -> None:
-    store = Store.prepare(store_path, small_plan())
+    store = prepare_store(store_path, small_plan())
     plan = small_plan()
     place = plan.lattice.place(plan.blocks[0])
     store.write_field(1, place, np.zeros(plan.lattice.shape, dtype=complex))
@@ -39,10 +40,10 @@ def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Pa
 
 def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None:
     plan = small_plan()
-    store = Store.prepare(store_path, plan)
+    store = prepare_store(store_path, plan)
     record = Record("key", "complete", facts=Facts(vertices=3, area=1.5, digest="é"), seconds=0.1, worker="w")
     store.write_record(2, record)
-    again = Store.prepare(store_path, plan)
+    again = prepare_store(store_path, plan)
     assert again.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
     found = again.records()
     assert found[:2] == (None, None)
@@ -52,16 +53,17 @@ def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None
     assert not found[2].completes("other")
 
 
-def test_a_damaged_record_is_an_error(store_path: Path) -> None:
-    store = Store.prepare(store_path, small_plan())
+def test_a_record_that_is_none_counts_as_not_there(store_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = prepare_store(store_path, small_plan())
+    store.write_record(1, Record("k", "complete"))
     zarr.open_array(str(store_path), path="records/record", mode="r+")[0] = '{"key": "x"}'
-    with pytest.raises(StoreError, match="a completion record is damaged"):
-        store.records()
+    assert [record is None for record in store.records()] == [True, False, True, True, True]
+    assert "the record of ico/0 is damaged and counts as not there" in caplog.text
 
 
 def test_a_flipped_bit_in_a_field_raises_and_names_the_mesh(store_path: Path) -> None:
     plan = small_plan()
-    store = Store.prepare(store_path, plan)
+    store = prepare_store(store_path, plan)
     place = plan.lattice.place(plan.blocks[0])
     store.write_field(3, place, np.ones(plan.lattice.shape, dtype=complex))
     chunk = store_path / "fourier/fourier/c/3/0/0/0"
@@ -84,21 +86,21 @@ def test_a_flipped_bit_in_a_field_raises_and_names_the_mesh(store_path: Path) ->
 def test_refuses_the_store_of_another_study_and_leaves_it_alone(
     store_path: Path, changes: dict[str, object], message: str
 ) -> None:
-    Store.prepare(store_path, small_plan())
+    prepare_store(store_path, small_plan())
     before = snapshot(store_path)
     with pytest.raises(StoreError, match=message):
-        Store.prepare(store_path, small_plan(**changes))
+        prepare_store(store_path, small_plan(**changes))
     assert snapshot(store_path) == before
 
 
 def test_new_meshes_become_new_rows(store_path: Path) -> None:
-    store = Store.prepare(store_path, small_plan())
+    store = prepare_store(store_path, small_plan())
     store.write_record(0, Record("k", "complete"))
     more = [
         {"name": "more", "source": "icosphere", "levels": [0, 1]},
         {"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]},
     ]
-    grown = Store.prepare(store_path, small_plan(family=more))
+    grown = prepare_store(store_path, small_plan(family=more))
     assert grown.labels()[:5] == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
     assert grown.labels()[5:] == ("more/0", "more/1")
     assert [record is None for record in grown.records()] == [False, True, True, True, True, True, True]
@@ -107,28 +109,28 @@ def test_new_meshes_become_new_rows(store_path: Path) -> None:
 def test_refuses_places_that_hold_something_else(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("text")
     with pytest.raises(StoreError, match="a file is there"):
-        Store.prepare(tmp_path / "file", small_plan())
+        prepare_store(tmp_path / "file", small_plan())
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "precious.txt").write_text("text")
     with pytest.raises(StoreError, match="not empty and holds no store"):
-        Store.prepare(folder, small_plan())
+        prepare_store(folder, small_plan())
     assert snapshot(folder) == {"precious.txt": b"text"}
     zarr.create_group(str(tmp_path / "other.zarr"))
     with pytest.raises(StoreError, match="not one of a study"):
-        Store.prepare(tmp_path / "other.zarr", small_plan())
+        prepare_store(tmp_path / "other.zarr", small_plan())
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that nobody can write to")
 def test_refuses_a_folder_that_cannot_be_written() -> None:
     with pytest.raises(StoreError, match=r"/proc/results\.zarr: the store cannot be written"):
-        Store.prepare("/proc/results.zarr", small_plan())
+        prepare_store("/proc/results.zarr", small_plan())
 
 
 def test_refuses_a_place_below_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("text")
-    with pytest.raises(StoreError, match="cannot be written"):
-        Store.prepare(tmp_path / "file" / "results.zarr", small_plan())
+    with pytest.raises(StoreError, match=r"there is no folder .*/file to hold the store; make it first"):
+        prepare_store(tmp_path / "file" / "results.zarr", small_plan())
 
 
 def test_opening_what_is_no_store(tmp_path: Path) -> None:
@@ -137,14 +139,14 @@ def test_opening_what_is_no_store(tmp_path: Path) -> None:
 
 
 def test_a_newer_schema_is_refused(store_path: Path) -> None:
-    Store.prepare(store_path, small_plan())
+    prepare_store(store_path, small_plan())
     zarr.open_group(str(store_path), mode="r+").attrs["schema_version"] = 99
-    with pytest.raises(StoreError, match="its schema has version 99, this program reads 2"):
+    with pytest.raises(StoreError, match="its schema has version 99, this program reads 3"):
         Store.open(store_path)
 
 
 def test_every_array_carries_a_checksum(store_path: Path) -> None:
-    Store.prepare(store_path, small_plan())
+    prepare_store(store_path, small_plan())
     metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
     arrays = [entry for entry in metadata if entry["node_type"] == "array"]
     assert len(arrays) >= 6

@@ -1,0 +1,51 @@
+"""Releasing a store: taking away the claim of a run that is gone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sobolev_batch.batch.claim import CLAIM, Claim
+from sobolev_batch.batch.journal import PATIENCE_SECONDS
+from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.records import age_seconds
+from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import ClaimError
+
+
+def release(place: str | Path | Location, *, force: bool = False) -> Claim | None:
+    """Take away the claim of a run that cannot do so itself, because it or its machine was killed.
+
+    A run that is still going on ends when it notices, within seconds.
+
+    Args:
+        place: path or URL of the store.
+        force: even if there was a sign of life of the run a moment ago.
+
+    Returns:
+        The claim, or None where there was none.
+
+    Raises:
+        ClaimError: the run was alive a moment ago.
+        StoreError: the store cannot be reached or written.
+    """
+    location = Location.of(place)
+    claim = Claim.read(location)
+    if claim is None:
+        return None
+    silence = _silence_seconds(location, claim)
+    if not force and not claim.is_of_the_dead and silence is not None and silence < PATIENCE_SECONDS:
+        raise ClaimError(
+            f"{location}: {claim.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
+            f"silent for {PATIENCE_SECONDS:.0f} s; --force releases the store all the same"
+        )
+    location.discard(CLAIM)
+    return claim
+
+
+def _silence_seconds(location: Location, claim: Claim) -> float | None:
+    """Since the latest sign of life of a claim's holder; None where it has given none."""
+    store = Store(location)
+    run = store.read_run() if store.is_there() else None
+    if run is None or not run.driver.startswith(claim.driver) or run.state not in ("submitted", "running"):
+        return None
+    return age_seconds(run.seen)

@@ -1,0 +1,189 @@
+"""Tables from stored fields: the reduction dealt out to the cluster, and what it finds written down."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from distributed import Client, as_completed
+from numpy.typing import NDArray
+
+from sobolev_batch.batch.crew import MEMORY, Crew
+from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.outcomes import is_suspect, outcomes
+from sobolev_batch.batch.plan import Plan, Row
+from sobolev_batch.batch.progress import Notify, Progress
+from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.reduction import Reducer
+from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import ClusterError
+from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
+from sobolev_batch.spectral.quality import Quality
+
+Reals = NDArray[np.float64]
+_Call = tuple[Callable[..., Any], tuple[Sequence[int], ...]]
+
+
+def tabulate_fields(
+    client: Client,
+    crew: Crew,
+    store: Store,
+    plan: Plan,
+    rows: Sequence[Row],
+    records: Sequence[Record | None],
+    notify: Notify,
+) -> Assessed | None:
+    """Make the tables; the distances to the reference, or None where the tables were there.
+
+    Raises:
+        DamageError: a field is not what was stored; it names its row.
+        StoreError: the store cannot be read or written.
+        ClusterError: the scheduler was lost, or no worker survives a task.
+    """
+    if are_tabulated(store, plan, rows, records):
+        return None
+    complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
+    reference = next(i for i, row in enumerate(rows) if row.label == plan.reference)
+    orders = plan.study.orders
+    center = reference if reference in complete else None
+    reducer = _reducer(store, plan, records, center)
+    norms, to_reference = (np.full((4, len(orders), len(rows)), np.nan) for _ in range(2))
+    every_pair = plan.study.pairs == "all"
+    others = range(len(rows)) if every_pair else [reference]
+    distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
+
+    calls: list[_Call] = [(reducer.norms, (strip,)) for strip in reducer.strips(complete, crew.threads)]
+    if every_pair:
+        calls += [(reducer.tile, tile) for tile in reducer.tiles(complete, crew.threads)]
+    notify(Progress("reduction", 0, len(calls)))
+    claims = reducer.task_bytes > crew.share_bytes
+    resources = {MEMORY: min(reducer.task_bytes, crew.largest_bytes)} if claims else None
+    done = 0
+
+    def enter(call: _Call, outcome: Any) -> None:
+        nonlocal done
+        done += 1
+        if isinstance(outcome, BaseException):
+            raise outcome
+        tile, *other = call[1]
+        if not other:
+            norms[..., tile], to_reference[..., tile] = (np.stack(list(found)) for found in outcome)
+        else:
+            found = np.stack(list(outcome))
+            distances[..., np.array(tile)[:, None], np.array(other[0])] = found
+            distances[..., np.array(other[0])[:, None], np.array(tile)] = np.swapaxes(found, -1, -2)
+        notify(Progress("reduction", done, len(calls)))
+
+    suspects = _deal(client, calls, resources, enter)
+    for call in suspects:
+        if _deal(client, [call], resources, enter):
+            raise ClusterError(
+                "a task of the reduction ended the worker that it ran on again and again, at last with nothing else "
+                "beside it, as happens for want of memory; start workers with more memory"
+            )
+    if every_pair:
+        # The direct sums are the more exact ones, and the same numbers in both tables.
+        distances[..., reference] = distances[..., reference, :] = to_reference
+    else:
+        distances[..., 0] = to_reference
+    _write_tables(store, plan, rows, records, norms, to_reference, distances, [rows[j] for j in others])
+    return Assessed(*to_reference)
+
+
+def _deal(
+    client: Client, calls: Sequence[_Call], resources: dict[str, float] | None, enter: Callable[[_Call, Any], None]
+) -> list[_Call]:
+    """Have tasks done, and enter what each returns; those that were on workers which died are left over."""
+    jobs = {client.submit(call[0], *call[1], pure=False, resources=resources): call for call in calls}
+    suspects = []
+    try:
+        for batch in as_completed(list(jobs)).batches():
+            for future, outcome in zip(batch, outcomes(client, batch), strict=True):
+                call = jobs.pop(future)
+                if is_suspect(outcome):
+                    suspects.append(call)
+                else:
+                    enter(call, outcome)
+    finally:
+        for future in jobs:
+            future.release()
+    return suspects
+
+
+def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
+    """The reducer of a store, with what the records say of its fields."""
+    lattice, orders = plan.lattice, plan.study.orders
+    qualities = {
+        i: Quality.from_json(record.quality)
+        for i, record in enumerate(records)
+        if record is not None and record.status == "complete"
+    }
+    areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
+    for i, quality in qualities.items():
+        areas[i], errors[:, i] = quality.area, quality.probe.norms(lattice, orders)
+    widths = support_widths(list(qualities.values())) if qualities else np.zeros(len(DIRECTIONS))
+    checksums = {i: record.checksums for i, record in enumerate(records) if record is not None}
+    return Reducer(store, lattice, plan.blocks, orders, center, areas, errors, widths, checksums)
+
+
+def _write_tables(
+    store: Store,
+    plan: Plan,
+    rows: Sequence[Row],
+    records: Sequence[Record | None],
+    norms: Reals,
+    to_reference: Reals,
+    distances: Reals,
+    others: Sequence[Row],
+) -> None:
+    orders = plan.study.orders
+    reference = [row.label for row in rows].index(plan.reference)
+    meshes = meshes_dataset(rows, records)
+    sizes = meshes["edge_length_mean"].to_numpy()
+    convergence = convergence_dataset(
+        rows,
+        orders,
+        Assessed(*to_reference),
+        Assessed(*norms[..., reference]),
+        sizes,
+        plan.reference,
+        plan.study.accuracy,
+    )
+    store.withdraw_tables()
+    store.write_qualities([record.quality if record else "" for record in records])
+    store.write_table("meshes", meshes)
+    store.write_table("norms", norms_dataset(rows, orders, Assessed(*norms)))
+    store.write_table("distances", distances_dataset(rows, others, orders, Assessed(*distances)))
+    # Written last: its digest says that all tables belong to the fields that are there.
+    digest = _reduction_digest(plan, rows, records)
+    store.write_table("convergence", convergence.assign_attrs(digest=digest))
+    store.consolidate()
+
+
+def are_tabulated(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
+    """Whether the tables of a store are there, and belong to its fields and to the plan."""
+    attributes = store.table_attributes("convergence")
+    current = attributes is not None and attributes.get("digest") == _reduction_digest(plan, rows, records)
+    return current and not store.lost_tables()
+
+
+def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
+    parts = {
+        "rows": [
+            [
+                row.label,
+                row.family,
+                record.key if record else "",
+                record.status if record else "",
+                record.reason if record else "",
+            ]
+            for row, record in zip(rows, records, strict=True)
+        ],
+        "orders": plan.study.orders,
+        "pairs": plan.study.pairs,
+        "reference": plan.reference,
+    }
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

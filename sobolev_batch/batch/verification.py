@@ -1,0 +1,127 @@
+"""Verification: everything that is stored read back, against its checksums and records."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from distributed import Client, wait
+
+from sobolev_batch.batch.claim import Claim, give_up, take
+from sobolev_batch.batch.cluster import available_cores
+from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.outcomes import outcomes
+from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.store import Store
+from sobolev_batch.errors import ClaimError, DamageError, StoreError
+
+_log = logging.getLogger(__name__)
+
+# Reading waits for a disk or a network most of the time.
+_THREADS_PER_CORE = 2
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was found of a store.
+
+    Attributes:
+        store: its path or URL.
+        complete: surfaces with a completion record; their fields were read.
+        total: surfaces of the study.
+        fields: what is wrong with the field or the record of each surface that is damaged.
+        tables: likewise for arrays of tables and coordinates.
+        withdrawn: whether the records of these fields, and the tables if any of them is damaged, were taken
+            away, so that the next run makes them anew.
+    """
+
+    store: str
+    complete: int
+    total: int
+    fields: Mapping[str, str]
+    tables: Mapping[str, str]
+    withdrawn: bool
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.fields and not self.tables
+
+
+def verify(place: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
+    """Read everything that a store holds, and withdraw what is damaged so that a run computes it again.
+
+    Args:
+        place: path or URL of the store. If it cannot be written, nothing is withdrawn.
+        on_progress: called with the number of fields that were read, and of all.
+
+    Raises:
+        StoreError: no store is there, or it cannot be read at all.
+        ClaimError: a run is going on in it.
+    """
+    store = Store.open(place)
+    claim = Claim.of_this_process()
+    try:
+        take(store.location, claim)
+    except ClaimError:
+        raise
+    except StoreError as error:
+        _log.info("%s: read without the right to write (%s)", store.path, error)
+        return _verify(store, on_progress, withdraw=False)
+    try:
+        # Anew: the last run may have ended since.
+        return _verify(Store.open(place), on_progress, withdraw=True)
+    finally:
+        give_up(store.location, claim)
+
+
+def damaged_rows(client: Client, store: Store, records: Sequence[Record | None]) -> list[int]:
+    """The rows whose fields are not what their records say, found by the workers of a cluster."""
+    rows = _complete(records)
+    futures = [client.submit(_damage_of, store, row, record, pure=False) for row, record in rows.items()]
+    wait(futures)
+    found = outcomes(client, futures)
+    for outcome in found:
+        if isinstance(outcome, BaseException):
+            raise outcome
+    return [row for row, what in zip(rows, found, strict=True) if what]
+
+
+def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, withdraw: bool) -> Verification:
+    labels, records = store.labels(), store.records()
+    complete = _complete(records)
+    damaged = {row: f"its completion record is damaged ({what})" for row, what in store.damaged_records().items()}
+    with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
+        found = pool.map(lambda item: _damage_of(store, *item), complete.items())
+        for done, (row, what) in enumerate(zip(complete, found, strict=True), 1):
+            if what:
+                damaged[row] = what
+            if on_progress is not None:
+                on_progress(done, len(complete))
+    tables = store.damaged_arrays()
+    if withdraw and (damaged or tables):
+        store.withdraw_tables()
+        for row in damaged:
+            store.write_record(row, None)
+    fields = {labels[row]: damaged[row] for row in sorted(damaged)}
+    return Verification(store.path, len(complete), len(labels), fields, tables, withdraw and bool(damaged or tables))
+
+
+def _complete(records: Sequence[Record | None]) -> dict[int, Record]:
+    return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
+
+
+def _damage_of(store: Store, row: int, record: Record) -> str:
+    """What is wrong with the field of a row; empty if nothing is."""
+    places = store.places()
+    if len(record.checksums) != len(places):
+        return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
+    for place, checksum in zip(places, record.checksums, strict=True):
+        try:
+            store.read_fields([row], place, [checksum])
+        except DamageError as error:
+            return error.what
+    return ""

@@ -1,0 +1,1 @@
+"""What docs/reliability.md promises, with real processes that are really killed."""

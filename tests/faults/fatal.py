@@ -1,0 +1,97 @@
+"""Loaded into a worker before it starts: ends it at one moment of the tasks of one row, like an OOM killer would.
+
+The moment is in the environment, which workers have from the process that starts them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+
+from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.store import Store
+
+_VARIABLE = "FATAL_MOMENT"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a worker ends.
+
+    Attributes:
+        what: "field" before a field is written, "rename" between its file and its name, "record" before the
+            record is written, "recorded" after it.
+        row: whose.
+        log: a file with one line for each worker that ended.
+        times: how many end, of all workers together.
+    """
+
+    what: str
+    row: int
+    log: str
+    times: int = 1
+
+    @property
+    def deaths(self) -> int:
+        """How many workers have ended."""
+        path = Path(self.log)
+        return len(path.read_text().splitlines()) if path.exists() else 0
+
+    def strike(self) -> None:
+        """End this process, unless enough have ended."""
+        for number in range(self.times):
+            try:
+                os.close(os.open(f"{self.log}.{number}", os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                continue
+            with Path(self.log).open("a") as log:
+                log.write(f"{os.getpid()}\n")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def before(self, function: Callable[..., Any], concerns: Callable[..., bool]) -> Callable[..., Any]:
+        """A function before whose calls the worker ends, if they concern the row."""
+
+        def wrapped(*arguments: Any, **options: Any) -> Any:
+            if concerns(*arguments):
+                self.strike()
+            return function(*arguments, **options)
+
+        return wrapped
+
+
+@contextmanager
+def fatal(monkeypatch: pytest.MonkeyPatch, moment: Moment) -> Iterator[Moment]:
+    """Workers that are started inside end at a moment."""
+    monkeypatch.setenv(_VARIABLE, json.dumps(asdict(moment)))
+    with dask.config.set({"distributed.worker.preload": [__file__]}):
+        yield moment
+
+
+def dask_setup(worker: object) -> None:
+    """What Dask calls in a worker that has this for a preload."""
+    moment = Moment(**json.loads(os.environ[_VARIABLE]))
+    write_record = Store.write_record
+    if moment.what == "field":
+        Store.write_field = moment.before(Store.write_field, lambda store, row, *_: row == moment.row)  # type: ignore[method-assign]
+    elif moment.what == "rename":
+        part = f"fourier/fourier/c/{moment.row}/"
+        Path.replace = moment.before(Path.replace, lambda path, *_: part in str(path))  # type: ignore[method-assign]
+    elif moment.what == "record":
+        Store.write_record = moment.before(write_record, lambda store, row, *_: row == moment.row)  # type: ignore[method-assign]
+    elif moment.what == "recorded":
+
+        def write_and_end(store: Store, row: int, record: Record | None) -> None:
+            write_record(store, row, record)
+            if row == moment.row:
+                moment.strike()
+
+        Store.write_record = write_and_end  # type: ignore[method-assign, assignment]

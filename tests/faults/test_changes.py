@@ -1,0 +1,91 @@
+"""What is computed again after a change: what depends on it, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from distributed import Client
+
+from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch.batch import plan as plan_module
+from sobolev_batch.results.status import Status
+from tests.batch.conftest import small_table, variable
+
+ALL = ("f/a", "f/b", "reference")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("a", "b"):
+        trimesh.creation.box().export(tmp_path / f"{name}.off")
+    return tmp_path
+
+
+def study_of(folder: Path, **changes: Any) -> Study:
+    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+    return Study.from_table(small_table(family=family, **changes), folder=folder)
+
+
+def written(store: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in (store / "fourier/fourier/c").rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "computed"),
+    [
+        ({}, ()),
+        ({"norm": {"orders": [-7.0, -3.0]}}, ()),
+        ({"norm": {"orders": [-10.0, -3.0], "pairs": "reference"}}, ()),
+        ({"study": {"name": "small", "title": "another title"}}, ()),
+        ({"transform": {"backend": "cpu"}}, ()),
+        ({"transform": {"eps": 1e-7}}, ALL),
+        ({"transform": {"quadrature": 4}}, ALL),
+        ({"scaling": {"mode": "fixed", "scale": 0.5}}, ALL),
+    ],
+)
+def test_a_change_of_the_study(
+    changes: dict[str, Any], computed: tuple[str, ...], folder: Path, store_path: Path, client: Client
+) -> None:
+    assert run(study_of(folder), store_path, client).computed == ALL
+    before = written(store_path)
+    assert run(study_of(folder, **changes), store_path, client).computed == computed
+    after = written(store_path)
+    assert {path for path in after if after[path] != before[path]} == (set(after) if computed else set())
+    orders = changes.get("norm", {}).get("orders", [-10.0, -3.0])
+    tree = open_store(store_path)
+    assert variable(tree, "convergence", "order").values.tolist() == orders
+    assert np.isfinite(variable(tree, "convergence", "distance").values).all()
+
+
+def test_a_changed_file_and_changed_numerics(
+    folder: Path, store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(study_of(folder), store_path, client)
+    trimesh.creation.box((1.0, 1.0, 0.5)).export(folder / "b.off")
+    assert run(study_of(folder), store_path, client).computed == ("f/b",)
+    # The same content with another date is no change.
+    (folder / "a.off").touch()
+    assert run(study_of(folder), store_path, client).computed == ()
+    monkeypatch.setattr(plan_module, "NUMERICS_VERSION", -1)
+    assert run(study_of(folder), store_path, client).computed == ALL
+
+
+@pytest.mark.parametrize("version", [1, 2, 99, "3", None])
+def test_a_store_of_another_schema_is_refused_and_left_alone(
+    version: object, folder: Path, store_path: Path, client: Client
+) -> None:
+    run(study_of(folder), store_path, client)
+    root = store_path / "zarr.json"
+    document = json.loads(root.read_text())
+    document["attributes"]["schema_version"] = version
+    root.write_text(json.dumps(document))
+    before = {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
+    for use in (open_store, Status.of, lambda place: run(study_of(folder), place, client)):
+        with pytest.raises(StoreError, match=f"its schema has version {version}, this program reads 3; name another"):
+            use(store_path)
+    assert before == {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}

@@ -1,0 +1,164 @@
+"""One run at a time has a store to itself."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import pytest
+
+from sobolev_batch import ClaimError, Study, release, run
+from sobolev_batch.batch.claim import CLAIM, Claim, claimed, take
+from sobolev_batch.batch.location import Location
+from tests.faults.commands import command, write_toml
+
+# Stops in the middle of a study until it is told to go on; beats often.
+DRIVER = """
+import sys
+import sobolev_batch as sb
+from sobolev_batch.batch import journal
+
+journal.HEARTBEAT_SECONDS = 0.05
+
+def pause(progress):
+    if progress.done == 2:
+        print("paused", flush=True)
+        sys.stdin.readline()
+
+if __name__ == "__main__":
+    sb.run(sb.Study.from_toml(sys.argv[1]), sys.argv[2], workers=1, on_progress=pause)
+"""
+
+
+def driving(study: Path, store: Path) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, str(study), str(store)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "paused\n"
+    return process
+
+
+def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: Path) -> None:
+    study = write_toml(tmp_path)
+    first = driving(study, store_path)
+    try:
+        for arguments in (["run", study, "--store", store_path], ["verify", store_path]):
+            second = command(*arguments)
+            assert second.returncode == 2
+            assert f"another run has this store to itself: process {first.pid} on " in second.stderr
+            assert f"sobolev-batch release {store_path}" in second.stderr
+        # Not from somebody who is alive.
+        refused = command("release", store_path)
+        assert refused.returncode == 2
+        assert f"process {first.pid} on" in refused.stderr
+        assert "was alive" in refused.stderr
+    finally:
+        _, said = first.communicate("go on\n")
+    assert first.returncode == 0, said
+    assert not (store_path / CLAIM).exists()
+    assert command("run", study, "--store", store_path).returncode == 0
+
+
+def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -> None:
+    first = driving(write_toml(tmp_path), store_path)
+    released = command("release", "--force", store_path)
+    assert released.returncode == 0
+    assert f"released from process {first.pid} on" in released.stdout
+    # It notices at a beat, and beats while it is paused.
+    _, said = first.communicate("\n" * 9)
+    assert first.returncode != 0
+    assert "ClaimError" in said
+    assert "is no longer its own" in said
+
+
+def test_the_claim_of_another_machine_is_released_by_hand(
+    study: Study, store_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run(study, store_path, workers=1)
+    elsewhere = Claim("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
+    assert Location.of(store_path).create(CLAIM, elsewhere.to_json())
+    with pytest.raises(ClaimError, match=r"process 12 on far\.example, since 2026-01-01"):
+        run(study, store_path, workers=1)
+    assert release(store_path) == elsewhere
+    assert release(store_path) is None
+    assert len(run(study, store_path, workers=1).reused) == 5
+
+
+def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
+    child = subprocess.Popen(
+        [sys.executable, "-c", CLAIMING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    child.stdout.readline()
+    location = Location.of(tmp_path / "store")
+    with pytest.raises(ClaimError, match=f"process {child.pid} on"):
+        take(location, Claim.of_this_process())
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    left = Claim.read(location)
+    assert left is not None
+    assert left.is_of_the_dead
+    # The same number is another process if it was started at another time.
+    here = Claim.of_this_process()
+    assert not here.is_of_the_dead
+    table = json.loads(here.to_json())
+    assert Claim(**{**table, "process": here.process + "1"}).is_of_the_dead
+    with claimed(location, here):
+        assert here.is_on(location)
+    assert not (tmp_path / "store").exists()
+
+
+CLAIMING = """
+import sys
+import threading
+from sobolev_batch.batch.claim import Claim, take
+from sobolev_batch.batch.location import Location
+take(Location.of(sys.argv[1]), Claim.of_this_process())
+print("taken", flush=True)
+threading.Event().wait()
+"""
+
+
+@pytest.mark.parametrize("place", ["folder", "memory://claims/a"])
+def test_of_many_at_once_one_has_it(place: str, tmp_path: Path) -> None:
+    location = Location.of(place if ":" in place else tmp_path / place)
+    together = Barrier(8)
+
+    def attempt(number: int) -> bool:
+        together.wait()
+        try:
+            take(location, Claim.of_this_process())
+        except ClaimError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(20):
+            assert sum(pool.map(attempt, range(8))) == 1
+            location.discard(CLAIM)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}'])
+def test_a_claim_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
+    location = Location.of(tmp_path / "store")
+    location.create(CLAIM, text)
+    with pytest.raises(ClaimError, match="a process that has not written its name"):
+        take(location, Claim.of_this_process())
+
+
+def test_nothing_is_left_where_nothing_was_begun(tmp_path: Path) -> None:
+    bad = '[[family]]\nname = "f"\nsource = "files"\npaths = ["*.ply"]'
+    (tmp_path / "bad.toml").write_text(write_toml(tmp_path).read_text() + bad)
+    done = command("run", tmp_path / "bad.toml", "--store", tmp_path / "new.zarr")
+    assert done.returncode == 2
+    assert not (tmp_path / "new.zarr").exists()

@@ -1,0 +1,194 @@
+"""Stores that something else has damaged: named, never shown as data, and repaired by a run."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import Client
+
+from sobolev_batch import DamageError, StoreError, Study, open_store, run, verify
+from sobolev_batch.batch.store import Store
+from tests.batch.conftest import small_table, variable
+from tests.faults.commands import command, write_toml
+from tests.faults.comparing import assert_same_fields, assert_same_tables
+
+FIELD = "fourier/fourier/c/{row}/0/0/0"
+
+
+def truncate(chunk: Path) -> None:
+    chunk.write_bytes(chunk.read_bytes()[:-10])
+
+
+def empty(chunk: Path) -> None:
+    chunk.write_bytes(b"")
+
+
+def flip(chunk: Path) -> None:
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 3] ^= 1
+    chunk.write_bytes(data)
+
+
+def delete(chunk: Path) -> None:
+    chunk.unlink()
+
+
+def swap(chunk: Path) -> None:
+    """Another mesh's field: its own checksum is right."""
+    shutil.copy(chunk.parents[3] / "0/0/0/0", chunk)
+
+
+DAMAGES = (truncate, empty, flip, delete, swap)
+Damage = Callable[[Path], None]
+
+
+@pytest.fixture
+def store(finished_store: Path, store_path: Path) -> Path:
+    shutil.copytree(finished_store, store_path)
+    return store_path
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_verify_names_the_mesh_and_run_repairs_it(
+    damage: Damage, store: Path, study: Study, finished_store: Path, client: Client
+) -> None:
+    assert verify(store).is_sound
+    damage(store / FIELD.format(row=2))
+    found = verify(store)
+    assert (list(found.fields), found.tables, found.withdrawn) == (["ico/2"], {}, True)
+    assert (found.complete, found.total) == (5, 5)
+    assert run(study, store, client).computed == ("ico/2",)
+    assert verify(store).is_sound
+    assert_same_fields(store, finished_store)
+    assert_same_tables(store, finished_store)
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("pairs", ["all", "reference"])
+@pytest.mark.parametrize("row", [1, 4])
+def test_a_reduction_names_the_mesh_and_computes_it_again(
+    damage: Damage, pairs: str, row: int, store: Path, client: Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    damage(store / FIELD.format(row=row))
+    label = ("ico/1", "reference")[row == 4]
+    # New orders need all fields and no transform.
+    study = Study.from_table(small_table(norm={"orders": [-4.0], "pairs": pairs}))
+    assert run(study, store, client).computed == (label,)
+    assert f"the field of {label} is damaged" in caplog.text
+    tree = open_store(store)
+    assert np.isfinite(variable(tree, "convergence", "distance").values).all()
+    assert verify(store).is_sound
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, delete])
+def test_a_run_with_nothing_to_do_sees_what_is_missing(
+    damage: Damage, store: Path, study: Study, client: Client
+) -> None:
+    damage(store / FIELD.format(row=3))
+    assert run(study, store, client).computed == ("ico/3",)
+
+
+def test_what_is_damaged_again_and_again_ends_the_run(
+    store: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ruin(progress: object) -> None:
+        flip(store / FIELD.format(row=1))
+
+    study = Study.from_table(small_table(norm={"orders": [-4.0]}))
+    with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
+        run(study, store, client, on_progress=lambda p: ruin(p) if p.stage == "reduction" and not p.done else None)
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
+@pytest.mark.parametrize(
+    "name", ["convergence/distance/c/0/0", "meshes/status/c/0", "meshes/triangles/c/0", "distances/error/c/0/0/0"]
+)
+def test_tables_are_never_read_damaged(
+    damage: Damage, name: str, store: Path, study: Study, finished_store: Path, client: Client
+) -> None:
+    damage(store / name)
+    with pytest.raises((DamageError, ValueError)):
+        load(store)
+    found = verify(store)
+    assert list(found.tables) == [name.partition("/c/")[0]]
+    # Until they are made anew, there are none.
+    assert "convergence" not in open_store(store).children
+    assert run(study, store, client).computed == ()
+    assert_same_tables(store, finished_store)
+    assert verify(store).is_sound
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
+def test_coordinates_are_written_again(
+    damage: Damage, store: Path, study: Study, finished_store: Path, client: Client
+) -> None:
+    damage(store / "fourier/xi_x/c/0")
+    assert list(verify(store).tables) == ["fourier/xi_x"]
+    run(study, store, client)
+    assert verify(store).is_sound
+    assert_same_fields(store, finished_store)
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
+def test_a_damaged_record_counts_as_none(damage: Damage, store: Path, study: Study, client: Client) -> None:
+    damage(store / "records/record/c/2")
+    found = verify(store)
+    # One that is gone looks like one that was never written.
+    assert list(found.fields) == ([] if damage is delete else ["ico/2"])
+    assert found.complete == 4
+    assert run(study, store, client).computed == ("ico/2",)
+    assert verify(store).is_sound
+
+
+def test_damaged_labels_are_said(store: Path, study: Study, client: Client) -> None:
+    flip(store / "fourier/mesh/c/0")
+    with pytest.raises(StoreError, match="fourier/mesh is damaged"):
+        run(study, store, client)
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, delete])
+def test_damaged_metadata_are_said(damage: Damage, store: Path, study: Study) -> None:
+    damage(store / "zarr.json")
+    for use in (Store.open, open_store, lambda place: run(study, place, workers=1)):
+        with pytest.raises(StoreError, match=r"results\.zarr: .*(no store of a study is there|holds no store)"):
+            use(store)
+
+
+def load(store: Path) -> None:
+    for node in open_store(store).subtree:
+        node.to_dataset().load()
+
+
+def test_a_field_of_zeros_is_one(store: Path, study: Study, client: Client) -> None:
+    there = Store.open(store)
+    (place,) = there.places()
+    record = there.read_record(1)
+    assert record is not None
+    zeros = np.zeros([part.stop for part in place], dtype=complex)
+    checksum = there.write_field(1, place, zeros)
+    there.write_record(1, replace(record, checksums=(checksum,)))
+    assert verify(store).is_sound
+    assert run(study, store, client).computed == ()
+    assert (there.read_fields([1], place, [checksum]) == 0).all()
+
+
+def test_the_command_says_what_is_damaged(store: Path, tmp_path: Path) -> None:
+    sound = command("verify", store)
+    assert (sound.returncode, sound.stdout.splitlines()[-1]) == (0, "nothing is damaged")
+    flip(store / FIELD.format(row=2))
+    flip(store / "norms/norm/c/0/0")
+    found = command("verify", store)
+    assert found.returncode == 1
+    assert found.stdout.splitlines()[1].startswith("ico/2: ")
+    assert found.stdout.splitlines()[2].startswith("table norms/norm: ")
+    assert (
+        found.stdout.splitlines()[3]
+        == "1 surfaces and 1 arrays of tables are damaged; run the study again to repair it"
+    )
+    assert command("run", write_toml(tmp_path), "--store", store, "--workers", "1").returncode == 0
+    assert command("verify", store).returncode == 0

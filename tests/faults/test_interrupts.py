@@ -1,0 +1,70 @@
+"""Ctrl-C and its like: the command ends within seconds, says how to go on, and goes on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sobolev_batch.batch.claim import CLAIM
+from tests.faults.commands import command, read_until, started, write_toml
+
+# Generous for a machine that does other things too; alone it takes two.
+_SECONDS = 30
+
+
+def interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[str, str]:
+    """Interrupt a command as a terminal does, every process of it at once; what it still says."""
+    begun = time.monotonic()
+    os.killpg(process.pid, number)
+    said = process.communicate(timeout=_SECONDS + 10)
+    assert time.monotonic() - begun < _SECONDS
+    return said
+
+
+@pytest.mark.parametrize(
+    ("line", "number", "status", "words"),
+    [
+        ("dashboard:", signal.SIGINT, 130, "interrupted; the same command goes on"),
+        ("[2/5]", signal.SIGINT, 130, "interrupted; the same command goes on"),
+        ("[5/5]", signal.SIGINT, 130, "interrupted; the same command goes on"),
+        ("[2/5]", signal.SIGTERM, 143, "terminated; the same command goes on"),
+    ],
+)
+def test_a_run_ends_and_goes_on(
+    line: str, number: int, status: int, words: str, store_path: Path, tmp_path: Path
+) -> None:
+    study = write_toml(tmp_path)
+    with started("run", study, "--store", store_path, "--workers", "2") as process:
+        said = read_until(process, line)
+        _, rest = interrupted(process, number)
+    assert process.returncode == status, rest
+    assert rest.splitlines()[-1].startswith(words)
+    assert "Traceback" not in said + rest
+    assert not (store_path / CLAIM).exists()
+    again = command("run", study, "--store", store_path, "--workers", "1")
+    assert again.returncode == 0, again.stderr
+    assert "taken over" not in again.stderr
+
+
+def test_a_command_that_has_not_begun_says_so(tmp_path: Path) -> None:
+    script = "import sobolev_batch.__main__ as door\nprint('here', flush=True)\ndoor.main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, "run", str(write_toml(tmp_path)), "--store", str(tmp_path / "s.zarr")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "here\n"
+    _, rest = interrupted(process)
+    assert process.returncode == 130, rest
+    assert rest.strip().startswith("interrupted")
+    assert len(rest.strip().splitlines()) == 1
+    assert not (tmp_path / "s.zarr").exists()

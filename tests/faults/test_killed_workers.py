@@ -1,0 +1,79 @@
+"""Workers that are killed in the middle of a mesh."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from sobolev_batch import Study, open_store, run
+from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.store import Store
+from tests.batch.conftest import variable
+from tests.faults.commands import TOML, write_toml
+from tests.faults.comparing import assert_same_fields, assert_same_tables
+from tests.faults.fatal import Moment, fatal
+
+LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
+
+
+@pytest.mark.parametrize("what", ["field", "rename", "record", "recorded"])
+def test_the_result_is_that_of_a_clean_run(
+    what: str, study: Study, store_path: Path, finished_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fatal(monkeypatch, Moment(what, 2, str(tmp_path / "deaths"))) as moment, local_client(2) as client:
+        summary = run(study, store_path, client)
+    assert moment.deaths == 1
+    assert (summary.computed, summary.failed) == (LABELS, {})
+    assert_same_fields(store_path, finished_store)
+    assert_same_tables(store_path, finished_store)
+    strays = list(store_path.rglob("*.partial"))
+    assert len(strays) == (what == "rename")
+    # The next run sweeps them.
+    run(study, store_path, workers=1)
+    assert list(store_path.rglob("*.partial")) == []
+
+
+def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
+    study: Study, store_path: Path, finished_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fatal(monkeypatch, Moment("field", 2, str(tmp_path / "deaths"), times=99)) as moment:
+        done = subprocess.run(
+            [sys.executable, "-c", COMMAND, str(write_toml(tmp_path)), str(store_path)],
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=False,
+        )
+    assert done.returncode == 3, done.stderr
+    # Twice beside others, twice alone.
+    assert moment.deaths == 4
+    assert "ico/2 is failed: its tasks ended the worker that they ran on again and again" in done.stdout
+    assert "Traceback" not in done.stderr
+    records = Store.open(store_path).records()
+    assert [record.status for record in records if record] == ["complete", "complete", "failed", "complete", "complete"]
+    assert_same_fields(store_path, finished_store, besides={"ico/2"})
+    assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
+    # Without what kills its workers, it is computed and nothing else is.
+    assert run(study, store_path, workers=1).computed == ("ico/2",)
+    assert_same_tables(store_path, finished_store)
+
+
+# Dask's configuration is this process's own; what the command inherits is the environment.
+COMMAND = """
+import sys
+import dask
+from tests.faults import fatal
+dask.config.set({"distributed.worker.preload": [fatal.__file__]})
+sys.argv = ["sobolev-batch", "run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
+if __name__ == "__main__":
+    from sobolev_batch.__main__ import main
+    main()
+"""
+
+
+def test_the_file_and_the_table_are_one_study(study: Study) -> None:
+    assert tomllib.loads(TOML) == study.table
