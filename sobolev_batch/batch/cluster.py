@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -48,6 +47,8 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
+                # Of what workers say when they are ended in the middle of a task, nothing helps.
+                "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "error",
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,
             }
@@ -57,8 +58,6 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
             threads_per_worker=1,
             memory_limit=limit,
             processes=True,
-            # Of what workers say when they are ended in the middle of a task, nothing helps.
-            silence_logs=logging.ERROR,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
         ) as cluster,

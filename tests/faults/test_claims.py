@@ -104,7 +104,7 @@ def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     with pytest.raises(ClaimError, match=f"process {child.pid} on"):
         take(location, Claim.of_this_process())
     child.send_signal(signal.SIGKILL)
-    child.wait()
+    child.communicate()
     left = Claim.read(location)
     assert left is not None
     assert left.is_of_the_dead
