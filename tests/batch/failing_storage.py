@@ -22,11 +22,15 @@ from urllib.parse import urlsplit
 
 from tests.batch.object_storage import Server
 
-Kind = Literal["error", "slow down", "reset before", "reset after", "truncated"]
+Kind = Literal["error", "slow down", "reset before", "reset after", "truncated", "kept"]
 # The request after which a connection is reset has been carried out, which its sender cannot know.
-KINDS: tuple[Kind, ...] = ("error", "slow down", "reset before", "reset after", "truncated")
+KINDS: tuple[Kind, ...] = ("error", "slow down", "reset before", "reset after", "truncated", "kept")
 
-_ANSWERS: dict[str, tuple[int, str]] = {"error": (500, "InternalError"), "slow down": (503, "SlowDown")}
+_ANSWERS: dict[str, tuple[int, str]] = {
+    "error": (500, "<Error><Code>InternalError</Code><Message>InternalError by a test</Message></Error>"),
+    "slow down": (503, "<Error><Code>SlowDown</Code><Message>SlowDown by a test</Message></Error>"),
+    "kept": (200, "<DeleteResult><Error><Key>one</Key><Code>InternalError</Code></Error></DeleteResult>"),
+}
 _OF_ONE_HOP = ("connection", "expect", "keep-alive", "transfer-encoding")
 
 
@@ -36,7 +40,8 @@ class Rule:
 
     Attributes:
         rate: the share of the requests, drawn at random.
-        kinds: how they fail, in turn; only an answer with a body can be truncated.
+        kinds: how they fail, in turn; only what is read can be truncated, and only a key that is to be removed
+            can be kept, in an answer that is otherwise a good one.
         methods: those that may fail; all if empty.
         most: after so many failures nothing fails any more.
         part: of the path and query of those that may fail.
@@ -116,7 +121,8 @@ class FailingStorage:
 
     def _drawn(self, method: str, path: str) -> Kind | None:
         rule = self._rule
-        kinds = [kind for kind in rule.kinds if kind != "truncated" or method == "GET"]
+        possible = {"truncated": method == "GET", "kept": method == "POST" and path.endswith("?delete")}
+        kinds = [kind for kind in rule.kinds if possible.get(kind, True)]
         concerned = (not rule.methods or method in rule.methods) and rule.part in path
         if not kinds or not concerned or self._failed == rule.most or self._random.random() >= rule.rate:
             return None
@@ -164,8 +170,7 @@ class _Handler(BaseHTTPRequestHandler):
         if kind == "reset before":
             self._reset()
         elif kind in _ANSWERS:
-            status, code = _ANSWERS[kind]
-            document = f'<?xml version="1.0"?><Error><Code>{code}</Code><Message>{code} by a test</Message></Error>'
+            status, document = _ANSWERS[kind]
             self._answer(status, [("Content-Type", "application/xml")], document.encode())
         else:
             status, headers, answer = self._ask(body)
@@ -177,7 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 self._answer(status, headers, answer)
 
-    do_DELETE = do_GET = do_HEAD = do_POST = do_PUT = _pass_on
+    do_DELETE = do_GET = do_HEAD = do_POST = do_PUT = _pass_on  # noqa: N815
 
     def _ask(self, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
         upstream = self.server.storage.upstream()
