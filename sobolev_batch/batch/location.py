@@ -243,7 +243,7 @@ class Location:
             return text
         if _lacks_bucket(error) or (self.scheme in _BUCKET_SCHEMES and isinstance(error, FileNotFoundError)):
             return f"there is no bucket {self.name.split('/')[2]!r} ({text})"
-        if isinstance(error, TimeoutError) and not str(error):
+        if isinstance(error, TimeoutError):
             return f"nothing answers there within {_ANSWER_SECONDS} s"
         if "Credentials" in type(error).__name__:
             return f"no credentials ({text}); set those of {self.scheme}:// in the environment of every process"

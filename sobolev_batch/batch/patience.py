@@ -41,7 +41,7 @@ async def patiently(
         final: what it raises if it need not be called again.
 
     Raises:
-        TimeoutError: nothing came of it in the time that any storage in use should need.
+        OSError: nothing came of it in the time that any storage in use should need.
     """
     failures: list[Exception] = []
 
@@ -57,10 +57,13 @@ async def patiently(
     seconds = _SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND
     try:
         async with asyncio.timeout(seconds):
-            found, error = await retry(outcome, _MORE_TIMES, _LEAST_DELAY, _LARGEST_DELAY, _JITTER, Exception)
+            found, error = await retry(
+                outcome, _MORE_TIMES, _LEAST_DELAY, _LARGEST_DELAY, _JITTER, Exception, "access to object storage"
+            )
     except TimeoutError as late:
-        # What was said before tells more.
-        raise failures[-1] if failures else TimeoutError(f"nothing came of it within {seconds:.0f} s") from late
+        # What was said before tells more. Of a TimeoutError, fsspec would not keep the message.
+        silent = OSError(f"no success within {seconds:.0f} s, however often it was tried")
+        raise failures[-1] if failures else silent from late
     if error is not None:
         raise error
     return found  # type: ignore[no-any-return]

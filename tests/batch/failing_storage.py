@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Literal
@@ -22,9 +22,10 @@ from urllib.parse import urlsplit
 
 from tests.batch.object_storage import Server
 
-Kind = Literal["error", "slow down", "reset before", "reset after", "truncated", "kept"]
-# The request after which a connection is reset has been carried out, which its sender cannot know.
-KINDS: tuple[Kind, ...] = ("error", "slow down", "reset before", "reset after", "truncated", "kept")
+Kind = Literal["kept", "truncated", "error", "slow down", "reset before", "reset after"]
+# Those that few requests can meet come first, and are taken first. The request after which a connection is
+# reset has been carried out, which its sender cannot know.
+KINDS: tuple[Kind, ...] = ("kept", "truncated", "error", "slow down", "reset before", "reset after")
 
 _ANSWERS: dict[str, tuple[int, str]] = {
     "error": (500, "<Error><Code>InternalError</Code><Message>InternalError by a test</Message></Error>"),
@@ -40,7 +41,7 @@ class Rule:
 
     Attributes:
         rate: the share of the requests, drawn at random.
-        kinds: how they fail, in turn; only what is read can be truncated, and only a key that is to be removed
+        kinds: how they fail, the rarest first; only what is read can be truncated, and only a key that is to be removed
             can be kept, in an answer that is otherwise a good one.
         methods: those that may fail; all if empty.
         most: after so many failures nothing fails any more.
@@ -57,6 +58,16 @@ class Rule:
 HEALTHY = Rule(0.0)
 GONE = Rule(1.0, ("error",))
 READ_ONLY = Rule(1.0, ("error",), frozenset({"PUT", "POST", "DELETE"}))
+
+
+@dataclass(frozen=True)
+class Turn:
+    """When the rule changes: with the request of this number of those with a method and a part of the path."""
+
+    method: str
+    part: str
+    number: int
+    rule: Rule
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,8 @@ class FailingStorage:
     _server: Server
     _random: random.Random
     _rule: Rule = HEALTHY
-    _failed: int = 0
+    _turn: Turn | None = None
+    _failed: Counter[Kind] = field(default_factory=Counter)
     _requests: list[Request] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -93,7 +105,12 @@ class FailingStorage:
     @rule.setter
     def rule(self, rule: Rule) -> None:
         with self._lock:
-            self._rule, self._failed = rule, 0
+            self._rule, self._failed = rule, Counter()
+
+    def await_turn(self, turn: Turn) -> None:
+        """Have another rule take the place of the present one with a request that is to come."""
+        with self._lock:
+            self._turn = turn
 
     def environment(self) -> dict[str, str]:
         """What a process that uses it has in its environment."""
@@ -111,6 +128,11 @@ class FailingStorage:
     def draw(self, method: str, path: str) -> Kind | None:
         """Whether and how a request that has just come is to fail."""
         with self._lock:
+            turn = self._turn
+            if turn and turn.method == method and turn.part in path:
+                self._turn = replace(turn, number=turn.number - 1) if turn.number > 1 else None
+                if self._turn is None:
+                    self._rule, self._failed = turn.rule, Counter()
             kind = self._drawn(method, path)
             self._requests.append(Request(method, path, time.monotonic(), kind))
             return kind
@@ -124,10 +146,11 @@ class FailingStorage:
         possible = {"truncated": method == "GET", "kept": method == "POST" and path.endswith("?delete")}
         kinds = [kind for kind in rule.kinds if possible.get(kind, True)]
         concerned = (not rule.methods or method in rule.methods) and rule.part in path
-        if not kinds or not concerned or self._failed == rule.most or self._random.random() >= rule.rate:
+        if not kinds or not concerned or self._failed.total() == rule.most or self._random.random() >= rule.rate:
             return None
-        self._failed += 1
-        return kinds[self._failed % len(kinds)]
+        kind = min(kinds, key=self._failed.__getitem__)
+        self._failed[kind] += 1
+        return kind
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
-from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, serving
+from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.batch.test_store import READER
 from tests.test_cli import STUDY
 
@@ -40,11 +40,8 @@ COMMAND = [sys.executable, "-m", "sobolev_batch"]
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
     """A server that this process, and all that it starts, takes for S3."""
-    with serving() as server, pytest.MonkeyPatch.context() as patch:
-        for name, value in server.environment().items():
-            patch.setenv(name, value)
+    with serving() as server, taken_for_s3(server.environment()):
         yield server
-        forget_drivers()
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +63,6 @@ def stored(server: Server, s3_client: Client) -> str:
     url = f"s3://{BUCKET}/finished/results.zarr"
     assert len(run(Study.from_table(small_table()), url, s3_client).computed) == 5
     return url
-
-
-def forget_drivers() -> None:
-    """Have the drivers read their environment again."""
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
 def call(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
