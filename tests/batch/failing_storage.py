@@ -12,7 +12,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from http.client import HTTPConnection
@@ -93,6 +93,7 @@ class FailingStorage:
     _random: random.Random
     _rule: Rule = HEALTHY
     _turn: Turn | None = None
+    _listener: Callable[[], None] = lambda: None
     _failed: Counter[Kind] = field(default_factory=Counter)
     _requests: list[Request] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -112,6 +113,10 @@ class FailingStorage:
         with self._lock:
             self._turn = turn
 
+    def call(self, listener: Callable[[], None]) -> None:
+        """Have something called with each request, before that is dealt with."""
+        self._listener = listener
+
     def environment(self) -> dict[str, str]:
         """What a process that uses it has in its environment."""
         return {**self._server.environment(), "AWS_ENDPOINT_URL": self.url}
@@ -127,6 +132,7 @@ class FailingStorage:
 
     def draw(self, method: str, path: str) -> Kind | None:
         """Whether and how a request that has just come is to fail."""
+        self._listener()
         with self._lock:
             turn = self._turn
             if turn and turn.method == method and turn.part in path:
