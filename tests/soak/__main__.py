@@ -21,7 +21,8 @@ from tests.soak.trial import Outcome, soak
 @click.option("--rate", default=0.05, show_default=True, help="Share of the requests to the storage that fail.")
 def main(meshes: int, seed: int, kills: int, driver_kills: int, rate: float) -> None:
     """Run a study while processes are killed and the storage fails; status 1 if anything is lost by that."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for talkative in ("distributed", "asyncio"):
+        logging.getLogger(talkative).setLevel(logging.CRITICAL)
     with TemporaryDirectory() as folder:
         outcome = soak(Path(folder), meshes, seed, kills, driver_kills, rate)
     click.echo(tabulate(rows(outcome), headers=[f"{meshes} meshes, seed {seed}", ""], floatfmt=".1f"))

@@ -25,9 +25,9 @@ class Plan:
     drivers: tuple[int, ...]
 
     @classmethod
-    def of(cls, seed: int, requests: int, workers: int, drivers: int) -> Plan:
-        """Some kills, at random among a number of requests."""
-        chosen = random.Random(seed).sample(range(1, requests), workers + drivers)
+    def of(cls, seed: int, requests: range, workers: int, drivers: int) -> Plan:
+        """Some kills, at random among these requests."""
+        chosen = random.Random(seed).sample(requests, workers + drivers)
         return cls(tuple(sorted(chosen[:workers])), tuple(sorted(chosen[workers:])))
 
 

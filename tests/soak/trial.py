@@ -20,9 +20,6 @@ from tests.soak.havoc import Havoc, Plan
 from tests.soak.meshes import write_study
 
 _WORKERS = 2
-# Requests for each mesh: a look at its record, its field and its record written, its field read. Those before
-# the first mesh and after the last are not counted, so that all kills come.
-_REQUESTS_PER_MESH = 3
 # Workers and drivers that are killed leave much to say to those that go on.
 _QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}
 _LONGEST_SECONDS = 3600
@@ -56,7 +53,9 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
     path = write_study(folder, meshes, seed)
     clean = Location.of(folder / "clean.zarr")
     soaked = Location.of(f"s3://{BUCKET}/soaked.zarr")
-    plan = Plan.of(seed, _REQUESTS_PER_MESH * meshes, kills, driver_kills)
+    # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
+    # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
+    plan = Plan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)
     with serving() as server, failing(server, seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
         with local_client(_WORKERS) as client:
             started = time.monotonic()
