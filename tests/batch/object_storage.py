@@ -21,6 +21,8 @@ from botocore.config import Config
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
+# Has the driver try less often than it would, where it is to find out that nothing helps.
+IMPATIENT = {"AWS_MAX_ATTEMPTS": "2"}
 _REQUEST = re.compile(r'"(?:\x1b\[\d+m)*([A-Z]+) (\S+) HTTP')
 
 

@@ -28,7 +28,7 @@ from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.run import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
-from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
+from tests.batch.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.batch.test_store import READER
 from tests.test_cli import STUDY
 
@@ -349,7 +349,7 @@ def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.
             brief.process.kill()
 
     with serving() as brief:
-        for name, value in brief.environment().items():
+        for name, value in {**brief.environment(), **IMPATIENT}.items():
             monkeypatch.setenv(name, value)
         forget_drivers()
         try:
