@@ -35,24 +35,26 @@ class Havoc:
     """Kills worker processes of this process's cluster, and a driver, as a plan says.
 
     It counts requests rather than seconds, so that the kills are spread over the work, however long that
-    takes; and it strikes while a request is under way.
+    takes; and it strikes while a request is under way. One worker is left each time: a run on a cluster
+    that has none does not begin.
 
     Attributes:
         workers, drivers: killed so far.
     """
 
-    def __init__(self, plan: Plan, seed: int, ready: Callable[[], bool]) -> None:
+    def __init__(self, plan: Plan, seed: int, workers: int, known: Callable[[], int]) -> None:
         """Take up a plan.
 
         Args:
             plan: when to kill.
             seed: of the choice among the workers.
-            ready: whether the workers may be killed just now.
+            workers: that the cluster has when all are there.
+            known: how many its scheduler knows of.
         """
         self.workers = self.drivers = 0
         self._due = deque(sorted([(at, "worker") for at in plan.workers] + [(at, "driver") for at in plan.drivers]))
         self._random = random.Random(seed)
-        self._ready = ready
+        self._all, self._known = workers, known
         self._driver: subprocess.Popen[str] | None = None
         self._requests = 0
         self._lock = threading.Lock()
@@ -71,7 +73,7 @@ class Havoc:
             # Who is not there yet is killed with a later request.
             if self._due[0][1] == "worker":
                 alive = worker_processes()
-                if alive and self._ready():
+                if len(alive) == self._known() == self._all:
                     self._random.choice(alive).send_signal(signal.SIGKILL)
                     self.workers += 1
                     self._due.popleft()

@@ -61,7 +61,7 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
             started = time.monotonic()
             run(Study.from_toml(path), clean, client)
             clean_seconds = time.monotonic() - started
-            havoc = Havoc(plan, seed, lambda: len(client.cluster.scheduler.workers) == _WORKERS)
+            havoc = Havoc(plan, seed, _WORKERS, lambda: len(client.cluster.scheduler.workers))
             storage.call(havoc.on_request)
             storage.rule = Rule(rate)
             started = time.monotonic()
