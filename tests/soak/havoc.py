@@ -52,7 +52,7 @@ class Havoc:
             known: how many its scheduler knows of.
         """
         self.workers = self.drivers = 0
-        self._due = deque(sorted([(at, "worker") for at in plan.workers] + [(at, "driver") for at in plan.drivers]))
+        self._workers_due, self._drivers_due = deque(plan.workers), deque(plan.drivers)
         self._random = random.Random(seed)
         self._all, self._known = workers, known
         self._driver: subprocess.Popen[str] | None = None
@@ -68,20 +68,21 @@ class Havoc:
         """Kill whoever is due."""
         with self._lock:
             self._requests += 1
-            if not self._due or self._due[0][0] > self._requests:
-                return
             # Who is not there yet is killed with a later request.
-            if self._due[0][1] == "worker":
+            if self._is_due(self._drivers_due) and self._driver is not None and self._driver.poll() is None:
+                self._driver.kill()
+                self._driver = None
+                self.drivers += 1
+                self._drivers_due.popleft()
+            if self._is_due(self._workers_due):
                 alive = worker_processes()
                 if len(alive) == self._known() == self._all:
                     self._random.choice(alive).send_signal(signal.SIGKILL)
                     self.workers += 1
-                    self._due.popleft()
-            elif self._driver is not None and self._driver.poll() is None:
-                self._driver.kill()
-                self._driver = None
-                self.drivers += 1
-                self._due.popleft()
+                    self._workers_due.popleft()
+
+    def _is_due(self, plan: deque[int]) -> bool:
+        return bool(plan) and plan[0] <= self._requests
 
 
 def worker_processes() -> list[psutil.Process]:
