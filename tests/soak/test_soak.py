@@ -28,7 +28,9 @@ def outcome(folder: Path) -> Outcome:
 
 def test_nothing_is_lost_by_kills_and_failing_requests(outcome: Outcome) -> None:
     assert outcome.differences == ()
-    assert (outcome.workers, outcome.drivers) == (2, 1)
+    assert outcome.drivers == 1
+    # The second comes when the first is back, if there is still something to do then.
+    assert outcome.workers in (1, 2)
     assert outcome.failures.total() >= 5
 
 
