@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test coverage check bench format clean
+.PHONY: study icosphere test coverage soak check bench format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -17,6 +17,9 @@ test: $(READY)  ## the tests
 
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage
+
+soak: $(READY)  ## 2,000 meshes while workers and drivers are killed and the storage fails; some ten minutes
+	$(BIN)/python -m tests.soak
 
 check: $(READY)  ## lint, formatting, types
 	$(BIN)/ruff check .

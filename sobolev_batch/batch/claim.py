@@ -119,6 +119,7 @@ def take(location: Location, claim: Claim) -> None:
     """
     if location.create(CLAIM, claim.to_json()):
         return
+    # Of a request whose answer was lost, a driver hears that the key is there.
     there = Claim.read(location)
     if there is not None and there.run != claim.run:
         if not there.is_of_the_dead:

@@ -22,6 +22,9 @@ _LEAST_BYTES = 700_000_000
 # for each took a third of a reduction's time. What glibc may keep is bounded.
 _KEPT_BYTES = 64 << 20
 _LARGEST_KEPT_BYTES = 32 << 20
+# After a worker has died, Dask looks once whether it is back, and gives it up for ever if it is just then
+# being started again, as after a second death. Nannies start workers for as long as they live themselves.
+_LOST_WORKER_SECONDS = 10**7
 
 
 @contextmanager
@@ -49,6 +52,7 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
                 "distributed.worker.profile.enabled": False,
                 # Of what workers say when they are ended in the middle of a task, nothing helps.
                 "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "error",
+                "distributed.deploy.lost-worker-timeout": _LOST_WORKER_SECONDS,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,
             }

@@ -6,7 +6,6 @@ process, so a location can be stored, logged and sent to a worker.
 
 from __future__ import annotations
 
-import asyncio
 import os
 import re
 import shutil
@@ -21,8 +20,9 @@ from fsspec import AbstractFileSystem, available_protocols
 from fsspec.asyn import sync
 from fsspec.core import url_to_fs
 from zarr.abc.store import Store as ZarrStore
-from zarr.storage import FsspecStore, LocalStore
+from zarr.storage import LocalStore
 
+from sobolev_batch.batch.patience import PatientKeys, put_all, remove_all
 from sobolev_batch.errors import SobolevBatchError, StoreError
 
 # Drivers repeat what fails for minutes. That helps a run that is under way; who asks whether a store is
@@ -111,7 +111,7 @@ class Location:
         if not self.scheme:
             return LocalStore(self.name)
         self._filesystem()
-        return FsspecStore.from_url(self.name, storage_options=self._options(largest_bytes))
+        return PatientKeys.at(self.name, self._options(largest_bytes), largest_bytes)
 
     def read(self, key: str) -> bytes | None:
         """The bytes of a key, or None where there are none.
@@ -142,7 +142,7 @@ class Location:
                 files, root = self._filesystem()
                 named = {f"{root}/{key}": document for key, document in documents.items()}
                 if files.async_impl:
-                    sync(files.loop, _put_all, files, named)
+                    sync(files.loop, put_all, files, named)
                 else:
                     files.pipe(named)
                 return
@@ -239,7 +239,10 @@ class Location:
             try:
                 if self.scheme:
                     files, root = self._filesystem()
-                    files.rm(f"{root}/{prefix}", recursive=True)
+                    if files.async_impl:
+                        sync(files.loop, remove_all, files, f"{root}/{prefix}")
+                    else:
+                        files.rm(f"{root}/{prefix}", recursive=True)
                 else:
                     shutil.rmtree(Path(self.name) / prefix)
             except FileNotFoundError as error:
@@ -337,14 +340,6 @@ def _require_no_credentials(scheme: str, rest: str) -> None:
     before, at, _ = rest.partition("@")
     if at and (":" in before or (scheme in _BUCKET_SCHEMES and "/" not in before)):
         raise StoreError(f"a {scheme}:// URL of a store with credentials in it; {advice}")
-
-
-async def _put_all(files: AbstractFileSystem, documents: Mapping[str, bytes]) -> None:
-    # All are waited for, since asyncio logs the failures that nobody asked for.
-    puts = (files._pipe_file(path, document) for path, document in documents.items())
-    for outcome in await asyncio.gather(*puts, return_exceptions=True):
-        if isinstance(outcome, BaseException):
-            raise outcome
 
 
 def _lacks_bucket(error: Exception) -> bool:

@@ -9,16 +9,20 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import boto3
+import fsspec
+import pytest
 from botocore.config import Config
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
+# Has the driver try less often than it would, where it is to find out that nothing helps.
+IMPATIENT = {"AWS_MAX_ATTEMPTS": "2"}
 _REQUEST = re.compile(r'"(?:\x1b\[\d+m)*([A-Z]+) (\S+) HTTP')
 
 
@@ -87,6 +91,22 @@ class Server:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self._log.append(line)
+
+
+def forget_drivers() -> None:
+    """Have the drivers read their environment again."""
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
+
+
+@contextmanager
+def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
+    """Have this process, and all that it starts meanwhile, take a server for S3."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        forget_drivers()
+        yield
+        forget_drivers()
 
 
 @contextmanager

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import dask as dask_settings
 import numpy as np
 import psutil
 import pytest
@@ -67,3 +69,18 @@ def test_a_local_cluster_listens_on_loopback_only() -> None:
         ]
     assert len(listening) >= 3  # scheduler, dashboard, worker
     assert set(listening) <= {"127.0.0.1", "::1"}
+
+
+def _die_once(mark: Path) -> int:
+    """End this process the first time; its id the second."""
+    if not mark.exists():
+        mark.touch()
+        os._exit(1)
+    return os.getpid()
+
+
+def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
+    # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
+    with dask_settings.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1) as client:
+        first = client.submit(os.getpid, pure=False).result(timeout=60)
+        assert client.submit(_die_once, tmp_path / "mark").result(timeout=120) != first

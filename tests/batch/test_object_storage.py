@@ -29,7 +29,7 @@ from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
-from tests.batch.object_storage import BUCKET, SECRET, TOKEN, Server, serving
+from tests.batch.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.batch.test_store import READER
 from tests.test_cli import STUDY
 
@@ -41,11 +41,8 @@ COMMAND = [sys.executable, "-m", "sobolev_batch"]
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
     """A server that this process, and all that it starts, takes for S3."""
-    with serving() as server, pytest.MonkeyPatch.context() as patch:
-        for name, value in server.environment().items():
-            patch.setenv(name, value)
+    with serving() as server, taken_for_s3(server.environment()):
         yield server
-        forget_drivers()
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +64,6 @@ def stored(server: Server, s3_client: Client) -> str:
     url = f"s3://{BUCKET}/finished/results.zarr"
     assert len(run(Study.from_table(small_table()), url, s3_client).computed) == 5
     return url
-
-
-def forget_drivers() -> None:
-    """Have the drivers read their environment again."""
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
 def call(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -358,7 +350,7 @@ def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.
             brief.process.kill()
 
     with serving() as brief:
-        for name, value in brief.environment().items():
+        for name, value in {**brief.environment(), **IMPATIENT}.items():
             monkeypatch.setenv(name, value)
         forget_drivers()
         try:

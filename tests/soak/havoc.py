@@ -1,0 +1,98 @@
+"""Processes that are killed all through a run: workers, and the process that drives it."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import psutil
+
+
+@dataclass(frozen=True)
+class Plan:
+    """After how many requests to the storage each kill comes, in order.
+
+    Attributes:
+        workers, drivers: of a worker, and of the driver.
+    """
+
+    workers: tuple[int, ...]
+    drivers: tuple[int, ...]
+
+    @classmethod
+    def of(cls, seed: int, requests: range, workers: int, drivers: int) -> Plan:
+        """Some kills, at random among these requests."""
+        chosen = random.Random(seed).sample(requests, workers + drivers)
+        return cls(tuple(sorted(chosen[:workers])), tuple(sorted(chosen[workers:])))
+
+
+class Havoc:
+    """Kills worker processes of this process's cluster, and a driver, as a plan says.
+
+    It counts requests rather than seconds, so that the kills are spread over the work, however long that
+    takes; and it strikes while a request is under way. One worker is left each time: a run on a cluster
+    that has none does not begin.
+
+    Attributes:
+        workers, drivers: killed so far.
+    """
+
+    def __init__(self, plan: Plan, seed: int, workers: int, known: Callable[[], int]) -> None:
+        """Take up a plan.
+
+        Args:
+            plan: when to kill.
+            seed: of the choice among the workers.
+            workers: that the cluster has when all are there.
+            known: how many its scheduler knows of.
+        """
+        self.workers = self.drivers = 0
+        self._workers_due, self._drivers_due = deque(plan.workers), deque(plan.drivers)
+        self._random = random.Random(seed)
+        self._all, self._known = workers, known
+        self._driver: subprocess.Popen[str] | None = None
+        self._requests = 0
+        self._lock = threading.Lock()
+
+    def drive(self, driver: subprocess.Popen[str]) -> None:
+        """Name the process that drives the run from now on."""
+        with self._lock:
+            self._driver = driver
+
+    def on_request(self) -> None:
+        """Kill whoever is due."""
+        with self._lock:
+            self._requests += 1
+            # Who is not there yet is killed with a later request.
+            if self._is_due(self._drivers_due) and self._driver is not None and self._driver.poll() is None:
+                self._driver.kill()
+                self._driver = None
+                self.drivers += 1
+                self._drivers_due.popleft()
+            if self._is_due(self._workers_due):
+                alive = worker_processes()
+                if len(alive) == self._known() == self._all:
+                    self._random.choice(alive).send_signal(signal.SIGKILL)
+                    self.workers += 1
+                    self._workers_due.popleft()
+
+    def _is_due(self, plan: deque[int]) -> bool:
+        return bool(plan) and plan[0] <= self._requests
+
+
+def worker_processes() -> list[psutil.Process]:
+    """The worker processes that nannies in this process have started, in the order of their ids."""
+    found = []
+    for child in psutil.Process().children():
+        try:
+            # Beside them there is the process that keeps track of shared resources.
+            if child.status() != psutil.STATUS_ZOMBIE and "--multiprocessing-fork" in child.cmdline():
+                found.append(child)
+        except psutil.NoSuchProcess:
+            continue
+    return sorted(found, key=lambda child: child.pid)

@@ -1,0 +1,55 @@
+"""A small soak test, and that it would notice."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sobolev_batch.batch.location import Location
+from tests.soak.comparison import differences
+from tests.soak.havoc import Plan
+from tests.soak.trial import Outcome, soak
+
+pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("soak")
+
+
+@pytest.fixture(scope="module")
+def outcome(folder: Path) -> Outcome:
+    """A soaked run of a few meshes; the store of the clean one stays in the folder."""
+    return soak(folder, meshes=24, seed=1, kills=2, driver_kills=1, rate=0.05)
+
+
+def test_nothing_is_lost_by_kills_and_failing_requests(outcome: Outcome) -> None:
+    assert outcome.differences == ()
+    assert outcome.drivers == 1
+    # The second comes when the first is back, if there is still something to do then.
+    assert outcome.workers in (1, 2)
+    assert outcome.failures.total() >= 5
+
+
+def test_what_is_lost_would_be_noticed(outcome: Outcome, folder: Path) -> None:
+    clean, other = folder / "clean.zarr", folder / "other.zarr"
+    assert list(differences(Location.of(clean), Location.of(clean))) == []
+    shutil.copytree(clean, other)
+    fields = other / "fourier" / "fourier" / "c"
+    shutil.copyfile(fields / "1" / "0" / "0" / "0", fields / "2" / "0" / "0" / "0")
+    (fields / "3" / "0" / "0" / "0").unlink()
+    (other / "records" / "record" / "c" / "4").unlink()
+    shutil.copyfile(other / "norms" / "norm" / "c" / "0" / "0", other / "norms" / "error" / "c" / "0" / "0")
+    found = list(differences(Location.of(other), Location.of(clean)))
+    assert found[:3] == ["bumpy/000004: missing", "bumpy/000002: another field", "bumpy/000003: another field"]
+    assert [difference.split(":")[0] for difference in found[3:]] == ["norms"]
+
+
+def test_kills_depend_on_the_seed_alone() -> None:
+    plan = Plan.of(3, range(100, 1000), 5, 2)
+    assert plan == Plan.of(3, range(100, 1000), 5, 2) != Plan.of(4, range(100, 1000), 5, 2)
+    assert (len(plan.workers), len(plan.drivers)) == (5, 2)
+    assert set(plan.workers + plan.drivers) <= set(range(100, 1000))
