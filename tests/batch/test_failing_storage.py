@@ -21,6 +21,7 @@ from sobolev_batch.batch import patience
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table
 from tests.batch.failing_storage import GONE, HEALTHY, KINDS, FailingStorage, Kind, Rule, Turn, failing
@@ -75,7 +76,7 @@ def test_what_fails_once_is_done_again(storage: FailingStorage, location: Locati
     location.write({"a/b": b"new"})
     assert location.read("a/b") == b"new"
     fail_once()
-    assert location.exists()
+    assert location.names()
     fail_once()
     assert got(location, "d") == DOCUMENT
     fail_once()
@@ -185,6 +186,7 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
 
 FULL = """
 import resource, sys
+from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.store import Store
 import numpy as np
 
@@ -200,7 +202,7 @@ except Exception as error:
 
 def test_a_field_that_finds_no_room_leaves_nothing(store_path: Path) -> None:
     plan = make_plan(Study.from_table(small_table()))
-    store = Store.prepare(store_path, plan)
+    store = prepare_store(store_path, plan)
     before = sorted(path for path in store_path.rglob("*") if path.is_file())
     arguments = [str(store_path), *map(str, plan.lattice.shape)]
     done = subprocess.run([sys.executable, "-c", FULL, *arguments], capture_output=True, text=True, check=True)
