@@ -20,6 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.contents import open_regular
 from sobolev_batch.surfaces.similarity import Surface
 
 _GROUP = "sobolev_batch.sources"
@@ -103,10 +104,10 @@ def file_digest(path: Path) -> str:
         MeshError: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read: {error.strerror}") from error
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
 def installed_version(distribution: str) -> str:
