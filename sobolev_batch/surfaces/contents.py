@@ -14,7 +14,7 @@ from sobolev_batch.errors import MeshError
 
 # No file is read beyond this; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
-# What is packed may become so many times larger, for mesh files shrink to a tenth at best, and may do as it likes below a bound.
+# Mesh files shrink to a tenth at best: what is packed may become so many times larger, or as large as does no harm.
 _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
 _STEP_BYTES = 1 << 20
 
@@ -34,6 +34,18 @@ def open_regular(path: Path) -> IO[bytes]:
     return path.open("rb")
 
 
+def bounded_length(file: IO[bytes]) -> int:
+    """The length of an open file.
+
+    Raises:
+        MeshError: it is too large to be read; the message does not name it.
+    """
+    length = os.fstat(file.fileno()).st_size
+    if length > _LARGEST_BYTES:
+        raise MeshError(f"larger than {_LARGEST_BYTES} bytes, which is the most that is read: {length}")
+    return length
+
+
 def is_gzipped(path: Path) -> bool:
     """Whether a file's name says that it is compressed."""
     return path.name.lower().endswith(".gz")
@@ -47,9 +59,7 @@ def read_contents(path: Path, *, gzipped: bool) -> bytes:
     """
     try:
         with open_regular(path) as file:
-            length = os.fstat(file.fileno()).st_size
-            if length > _LARGEST_BYTES:
-                raise MeshError(f"larger than {_LARGEST_BYTES} bytes, which is the most that is read: {length}")
+            length = bounded_length(file)
             if gzipped:
                 most = unpacked_limit(length)
                 with gzip.GzipFile(fileobj=file) as unpacked:

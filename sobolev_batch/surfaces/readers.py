@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.contents import is_gzipped, open_regular, read_bytes, unpacked_limit
+from sobolev_batch.surfaces.contents import bounded_length, is_gzipped, open_regular, read_bytes, unpacked_limit
 from sobolev_batch.surfaces.gifti import parse_gifti
 from sobolev_batch.surfaces.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.mesh import Mesh
@@ -26,8 +25,8 @@ Raw = tuple[NDArray[Any], NDArray[Any]]
 _LONGEST_REASON = 250
 # What gzip makes of mesh files, about.
 _PACKING = 4
-# Of PLY files: the least bytes of a vertex and of a face; bytes of a vertex in double precision and of a corner; how much more
-# reading takes row by row than at once; and what a vertex takes beyond the one for every two triangles
+# Of PLY files: the least bytes of a vertex and of a face; bytes of a vertex in double precision and of a corner;
+# how much more reading takes row by row than at once; and what a vertex takes beyond the one for every two triangles
 # that the table counts in.
 _LEAST_VERTEX_BYTES, _LEAST_FACE_BYTES = 3, 4
 _VERTEX_BYTES, _CORNER_BYTES, _TEXT_FACTOR, _VERTEX_MEMORY = 24, 4.4, 7.0, 70.0
@@ -89,7 +88,7 @@ def expected_size(path: Path) -> tuple[int, float]:
     each_in_file, each_in_memory = _BYTES_PER_TRIANGLE[bare]
     try:
         with open_regular(path) as file:
-            length = os.fstat(file.fileno()).st_size
+            length = bounded_length(file)
             if suffix.endswith(".gz"):
                 length = min(_PACKING * length, unpacked_limit(length))
             if bare == ".ply":

@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import MeshError, StudyError
-from sobolev_batch.surfaces.contents import open_regular
+from sobolev_batch.surfaces.contents import bounded_length, open_regular
 from sobolev_batch.surfaces.similarity import Surface
 
 _GROUP = "sobolev_batch.sources"
@@ -105,7 +105,10 @@ def file_digest(path: Path) -> str:
     """
     try:
         with open_regular(path) as file:
+            bounded_length(file)
             return hashlib.file_digest(file, "sha256").hexdigest()
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
         raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 

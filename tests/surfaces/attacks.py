@@ -61,8 +61,8 @@ def _lying_list(kind: str, length: bytes, items: str = "double") -> bytes:
 
 
 def _wide_rows(encoding: str, kind: str) -> bytes:
-    """Rows of 3,000 properties announced, in a file that holds a byte or two of each."""
-    wide = [f"property {kind} p{i}" for i in range(3000)]
+    """Rows of 900 properties announced, in a file that holds a byte or two of each."""
+    wide = [f"property {kind} p{i}" for i in range(900)]
     body = b"1\n" * 500_000 if encoding == "ascii" else bytes(500_000)
     header = _ply_header(*_vertices(1), *wide, "element face 400000", *wide, encoding=encoding)
     return header.replace(b"vertex 1\n", b"vertex 100000\n") + body
