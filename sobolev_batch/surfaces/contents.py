@@ -7,6 +7,7 @@ import gzip
 import os
 import stat
 import zlib
+from io import BufferedReader
 from pathlib import Path
 from typing import IO, cast
 
@@ -19,7 +20,7 @@ _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
 _STEP_BYTES = 1 << 20
 
 
-def open_regular(path: Path) -> IO[bytes]:
+def open_regular(path: Path) -> BufferedReader:
     """Open a file for reading that is one: a pipe could be waited for without end, and a device read without end.
 
     Raises:

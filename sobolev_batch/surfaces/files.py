@@ -90,7 +90,10 @@ def _matches(folder: Path, path: str) -> list[Path]:
     # A file may have wildcard characters in its name: one that is there is meant.
     if not has_magic(path) or os.path.isfile(folder / path):
         return [folder / path]
-    return expand(folder, path)
+    try:
+        return expand(folder, path)
+    except StudyError as error:
+        raise StudyError(f"paths: {error}") from error
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -10,6 +10,7 @@ from glob import has_magic
 from pathlib import Path
 
 from sobolev_batch.errors import StudyError
+from sobolev_batch.surfaces.names import shown
 
 
 def expand(folder: Path, pattern: str) -> list[Path]:
@@ -29,8 +30,9 @@ def expand(folder: Path, pattern: str) -> list[Path]:
     parts = Path(pattern).parts
     first = next(i for i, part in enumerate(parts) if has_magic(part))
     base, rest = folder.joinpath(*parts[:first]), parts[first:]
+    quoted = shown(pattern, 300)
     if ".." in rest:
-        raise StudyError(f"the glob {pattern!r} goes back up behind a wildcard; name the folder that it is to search")
+        raise StudyError(f"the glob {quoted} goes back up behind a wildcard; name the folder that it is to search")
     found = [base]
     for part in rest:
         # Each folder once, or some patterns would take for ever.
@@ -38,12 +40,12 @@ def expand(folder: Path, pattern: str) -> list[Path]:
     inside = Path(os.path.realpath(base))
     files = [path for path in found if os.path.isfile(path)]
     if not files:
-        raise StudyError(f"the glob {pattern!r} matches no file below {inside}; correct it, or put files there")
+        raise StudyError(f"the glob {quoted} matches no file below {inside}; correct it, or put files there")
     for path in files:
         target = Path(os.path.realpath(path))
         if not target.is_relative_to(inside):
             raise StudyError(
-                f"the glob {pattern!r} matches {str(path)!r}, a link out of {inside} to {target}; "
+                f"the glob {quoted} matches {str(path)!r}, a link out of {inside} to {target}; "
                 "name such files by their paths"
             )
     return files

@@ -15,22 +15,21 @@ _INVISIBLE = frozenset(
     + "".join(map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))))
 )
 
-_short = reprlib.Repr()
-_short.maxstring = _short.maxother = 60
-_short.maxlist = _short.maxtuple = _short.maxdict = 4
-_short.maxlevel = 3
 
-
-def shown(value: object) -> str:
+def shown(value: object, longest: int = 80) -> str:
     """A value as it is quoted in a message: on one line, no longer than it takes to recognise it."""
     if isinstance(value, int) and value.bit_length() > 64:
         # Of long ones Python refuses to tell the digits.
         return f"an integer of {value.bit_length()} bits"
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = longest - 20
+    short.maxlist = short.maxtuple = short.maxdict = 4
+    short.maxlevel = 3
     try:
-        found = _short.repr(value)
+        found = short.repr(value)
     except ValueError:
         return f"a {type(value).__name__} that holds an integer of too many digits"
-    return found if len(found) <= 80 else found[:77] + "..."
+    return found if len(found) <= longest else found[: longest - 3] + "..."
 
 
 def flaw(text: str, longest: int, forbidden: str = "") -> str | None:
