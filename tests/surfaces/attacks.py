@@ -227,7 +227,7 @@ ATTACKS: dict[str, Attack] = {
             *_vertices(0), *[f"property char p{i}" for i in range(100_000)], "element face 0", encoding="ascii"
         ),
     ),
-    "ply, long name": _file(".ply", _ply_header(f"element {'e' * _MEGABYTE} 1", "element face 1", *_vertices(3))),
+    "ply, long name": _file(".ply", _ply_header(*_vertices(3), "element face 1", f"element {'e' * 60_000} 1")),
     "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0"), 1 << 40),
     "ply ascii, float overflow": _file(".ply", ply(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
     "ply ascii, index that overflows": _file(
