@@ -19,6 +19,7 @@ from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
 from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
 from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member, sole_member
 
@@ -164,13 +165,20 @@ def _blocks(choice: Choice) -> tuple[Block, ...]:
 def _members(study: Study) -> dict[str, tuple[str, Member]]:
     members: dict[str, tuple[str, Member]] = {}
     for family in study.families:
-        for member in family.source.members(study.folder):
+        try:
+            found = family.source.members(study.folder)
+        except StudyError as error:
+            raise StudyError(f"family {family.name!r}: {error}") from error
+        for member in found:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
             members[label] = family.name, member
     if not isinstance(study.reference, FamilyReference):
-        members[REFERENCE_LABEL] = REFERENCE_LABEL, sole_member(study.reference, study.folder)
+        try:
+            members[REFERENCE_LABEL] = REFERENCE_LABEL, sole_member(study.reference, study.folder)
+        except StudyError as error:
+            raise StudyError(f"reference: {error}") from error
     return members
 
 
@@ -188,7 +196,9 @@ def _reference_label(study: Study, members: Mapping[str, tuple[str, Member]]) ->
         return f"{study.reference.family}/{finest.name}"
     label = f"{study.reference.family}/{study.reference.member}"
     if label not in members:
-        raise StudyError(f"reference: the family {study.reference.family!r} has no member {study.reference.member!r}")
+        raise StudyError(
+            f"reference: the family {study.reference.family!r} has no member {shown(study.reference.member)}"
+        )
     return label
 
 

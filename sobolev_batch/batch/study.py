@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import codecs
 import json
+import os
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy
@@ -18,19 +21,48 @@ from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
+from sobolev_batch.surfaces.contents import open_regular
+from sobolev_batch.surfaces.names import flaw, folded, shown, twins
 from sobolev_batch.surfaces.similarity import Similarity
-from sobolev_batch.surfaces.sources import Source, parse_source
+from sobolev_batch.surfaces.sources import Source, at_most, parse_source
 
 REFERENCE_LABEL = "reference"
 
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
 
-# One line of printable text. Names become labels in the store and never paths or keys.
-Name = Annotated[
-    str,
-    Field(min_length=1, max_length=100, pattern=r"^[^\s/\\\x00-\x1f\x7f]([^/\\\x00-\x1f\x7f]*[^\s/\\\x00-\x1f\x7f])?$"),
-]
+# Larger study files and deeper tables are typing errors, or made to keep the parser busy.
+_LARGEST_FILE_BYTES = 4 << 20
+_DEEPEST = 20
+_MOST_VALUES = 1_000_000
+_LONGEST_TEXT = 10_000
+_MOST_ORDERS = 100
+_MOST_OFFENDERS = 10
+_LONGEST_NAME, _LONGEST_TITLE = 100, 1000
+# TOML's integers.
+_LARGEST_INTEGER = (1 << 63) - 1
+# A key of so many dotted parts would take the parser the square of their number.
+_LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.[ \t]*+){100}""")
+
+
+def _name(text: str) -> str:
+    """Names become labels in the store and never paths or keys."""
+    wrong = flaw(text, _LONGEST_NAME, "/\\")
+    if wrong is not None:
+        raise ValueError(
+            f"a name is 1 to {_LONGEST_NAME} visible characters, blanks only between them, without / and \\; {wrong}"
+        )
+    return text
+
+
+def _title(text: str) -> str:
+    wrong = flaw(text, _LONGEST_TITLE) if text else None
+    if wrong is not None:
+        raise ValueError(f"a title is one line of up to {_LONGEST_TITLE} visible characters and blanks; {wrong}")
+    return text
+
+
+Name = Annotated[str, AfterValidator(_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -109,13 +141,7 @@ class Study:
         """
         path = Path(path)
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise StudyError(f"{path}: not a TOML file: {error}") from error
-        try:
-            return cls.from_table(table, folder=path.parent)
+            return cls.from_table(_parsed(path), folder=path.parent)
         except InputError as error:
             raise StudyError(f"{path}: {error}") from error
 
@@ -131,17 +157,21 @@ class Study:
         Raises:
             StudyError: as for `from_toml`.
         """
+        _require_modest(table)
         try:
             document = _Document.model_validate(dict(table))
         except ValidationError as error:
             raise StudyError(_explain(error)) from error
         families = tuple(_family(i, entry) for i, entry in enumerate(document.family))
-        folded = [family.name.casefold() for family in families]
-        twins = sorted({family.name for family in families if folded.count(family.name.casefold()) > 1})
-        if twins:
-            raise StudyError(f"family names must differ by more than case, found {', '.join(map(repr, twins))} twice")
-        if REFERENCE_LABEL in folded:
-            raise StudyError(f"no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
+        same = twins(family.name for family in families)
+        if same:
+            found = ", ".join(shown(name) for group in same[:3] for name in group[:3])
+            raise StudyError(
+                "family: names must differ by more than case and the spelling of accents, "
+                f"found {found} twice; rename one"
+            )
+        if any(folded(family.name) == REFERENCE_LABEL for family in families):
+            raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
         try:
             return cls(
                 name=document.study.name,
@@ -171,7 +201,7 @@ class _Section(BaseModel):
 
 class _Header(_Section):
     name: Name
-    title: Annotated[str, Field(max_length=1000)] = ""
+    title: Annotated[str, AfterValidator(_title)] = ""
 
 
 class _LatticeSection(_Section):
@@ -191,7 +221,7 @@ class _AccuracySection(_Section):
 
 
 class _NormSection(_Section):
-    orders: Annotated[tuple[Number, ...], Field(min_length=1, max_length=100, strict=False)]
+    orders: Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)]
     pairs: Literal["all", "reference"] = "all"
 
 
@@ -251,7 +281,7 @@ class _FamilyName(_Section):
 
 
 def _family(index: int, entry: dict[str, Any]) -> Family:
-    where = f"family {entry.get('name', index + 1)!r}"
+    where = f"family {shown(entry.get('name', index + 1))}"
     parameters = {key: value for key, value in entry.items() if key != "name"}
     try:
         name = _FamilyName.model_validate({key: entry[key] for key in ("name",) if key in entry}).name
@@ -267,7 +297,7 @@ def _reference(entry: dict[str, Any], families: tuple[Family, ...]) -> Source | 
         if entry.get("source") == "family":
             section = _FamilyReferenceSection.model_validate({k: v for k, v in entry.items() if k != "source"})
             if section.family not in {family.name for family in families}:
-                raise StudyError(f"no family is named {section.family!r}")
+                raise StudyError(f"no family is named {shown(section.family)}")
             return FamilyReference(section.family, section.member)
         return parse_source(entry)
     except ValidationError as error:
@@ -276,21 +306,80 @@ def _reference(entry: dict[str, Any], families: tuple[Family, ...]) -> Source | 
         raise StudyError(f"reference: {error}") from error
 
 
+def _parsed(path: Path) -> dict[str, Any]:
+    """The tables of a study file, if it is one.
+
+    Raises:
+        StudyError: it cannot be read, is too large, or is not TOML; the message does not name it.
+    """
+    try:
+        with open_regular(path) as file:
+            length = os.fstat(file.fileno()).st_size
+            data = file.read(_LARGEST_FILE_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if len(data) > _LARGEST_FILE_BYTES:
+        raise StudyError(
+            f"a study file has at most {_LARGEST_FILE_BYTES} bytes, found {max(length, len(data))}; "
+            "globs name many meshes in few words"
+        )
+    if data.startswith(codecs.BOM_UTF8):
+        raise StudyError("not a TOML file: it begins with a byte order mark; save it as UTF-8 without one")
+    if _LONG_KEY.search(data):
+        raise StudyError("a key has 100 dotted parts or more; a study's have two")
+    try:
+        return tomllib.loads(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise StudyError(f"not a TOML file: {error}; save it as UTF-8") from error
+    except RecursionError as error:
+        raise StudyError("its tables and lists are nested too deeply") from error
+    # Beyond TOML's own errors, numbers and dates that Python cannot hold.
+    except ValueError as error:
+        raise StudyError(f"not a TOML file: {error}") from error
+
+
+def _require_modest(table: object) -> None:
+    """Refuse what would keep validation, or the messages about it, busy: too deep, too long, too many."""
+    waiting: list[tuple[object, tuple[object, ...]]] = [(table, ())]
+    count = 0
+    while waiting:
+        value, place = waiting.pop()
+        count += 1
+        if len(place) > _DEEPEST:
+            raise StudyError(f"{_place(place)}: nested more than {_DEEPEST} deep")
+        if count > _MOST_VALUES:
+            raise StudyError(f"{_place(place)}: the study has more than {_MOST_VALUES} values")
+        if isinstance(value, Mapping):
+            if not all(isinstance(key, str) for key in value):
+                raise StudyError(f"{_place(place)}: keys must be strings")
+            waiting += ((entry, (*place, key)) for key, entry in value.items())
+        elif isinstance(value, list | tuple):
+            waiting += ((entry, (*place, index)) for index, entry in enumerate(value))
+        elif isinstance(value, str) and len(value) > _LONGEST_TEXT:
+            raise StudyError(f"{_place(place)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
+        elif isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+            raise StudyError(f"{_place(place)}: integers go up to {_LARGEST_INTEGER}, found {shown(value)}")
+
+
+def _place(location: Sequence[object]) -> str:
+    """Where a value stands, with dots between keys; keys that are no words are quoted."""
+    return ".".join(str(key) if flaw(str(key), 40) is None else shown(key) for key in location[:8]) or "study"
+
+
 def _explain(error: ValidationError) -> str:
     """Every offender on one line: where it stands, what was found, what was expected."""
     lines = []
-    for item in error.errors(include_url=False):
-        where = ".".join(map(str, item["loc"])) or "study"
+    for item in error.errors(include_url=False)[:_MOST_OFFENDERS]:
+        where = _place(item["loc"])
         if item["type"] == "extra_forbidden":
             lines.append(f"unknown key {where}")
         elif item["type"] == "missing":
             lines.append(f"{where} is missing")
         else:
             message = item["msg"].removeprefix("Value error, ")
-            found = repr(item["input"])
-            shown = found if len(found) <= 60 else found[:57] + "..."
-            lines.append(f"{where}: {message[0].lower() + message[1:]}, found {shown}")
-    return "; ".join(lines)
+            lines.append(f"{where}: {message[0].lower() + message[1:]}, found {shown(item['input'])}")
+    more = error.error_count() - len(lines)
+    return "; ".join(lines) + (f"; and {more} more" if more else "")
 
 
 def _distinct(orders: tuple[float, ...]) -> tuple[float, ...]:

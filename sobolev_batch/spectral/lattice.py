@@ -16,6 +16,8 @@ from sobolev_batch.errors import LatticeError
 
 # Beyond this the half lattice of doubles alone takes 34 GB and more; no FFT of it is sensible.
 LARGEST_M = 2048
+# Beyond this and its inverse, cells and periods leave double precision.
+_LOWEST_XI_MAX = 1e-50
 AXES = ("xi_x", "xi_y", "xi_z")
 
 
@@ -62,6 +64,11 @@ class Lattice:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.xi_max) and self.xi_max > 0):
             raise LatticeError(f"xi_max must be positive and finite, found {self.xi_max}")
+        if not _LOWEST_XI_MAX <= self.xi_max <= 1 / _LOWEST_XI_MAX:
+            raise LatticeError(
+                f"xi_max must lie between {_LOWEST_XI_MAX:g} and {1 / _LOWEST_XI_MAX:g}, found {self.xi_max:g}; "
+                "choose another unit of length"
+            )
         if isinstance(self.M, bool) or not isinstance(self.M, int) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
             raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
 

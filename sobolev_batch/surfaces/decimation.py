@@ -13,12 +13,28 @@ from pydantic import Field
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, installed_version, sole_member
+from sobolev_batch.surfaces.sources import (
+    MOST_ENTRIES,
+    Fingerprint,
+    Member,
+    NestedSource,
+    Size,
+    at_most,
+    installed_version,
+    sole_member,
+)
 
 # Measured peak of simplifying and of clustering, for each triangle of the original.
 _REDUCING_BYTES = 450
 
-TriangleCounts = Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1, strict=False)]
+# No mesh that can be read has as many.
+_MOST_TRIANGLES = 10**9
+
+TriangleCounts = Annotated[
+    tuple[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)], ...],
+    Field(min_length=1, strict=False),
+    at_most(MOST_ENTRIES),
+]
 
 
 class Decimate(NestedSource):

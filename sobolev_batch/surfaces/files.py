@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import glob
+import os
 from collections import Counter
 from dataclasses import dataclass
+from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +13,15 @@ from typing import Annotated
 from pydantic import Field
 
 from sobolev_batch.errors import StudyError
+from sobolev_batch.surfaces.globs import expand
+from sobolev_batch.surfaces.names import flaw, folded, shown, twins
 from sobolev_batch.surfaces.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, file_digest
+from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, at_most, file_digest
+
+# A stem has up to 255 bytes; a path that stands in for it may be longer.
+_LONGEST_NAME = 1000
+_MOST_PATHS = 100_000
 
 
 class Files(Source):
@@ -22,12 +29,15 @@ class Files(Source):
 
     Attributes:
         paths: paths or globs (``**`` crosses folders), relative to the study file. A path that is
-            named must exist when its mesh is computed; a glob must match something at once.
+            named must exist when its mesh is computed, and may lie anywhere; a glob must match something
+            at once, and finds nothing outside the folder that it names, see `globs.expand`.
         distribution: an installed Python distribution. Paths are then those of files that it
             recorded at its installation, without wildcards; nothing of it is imported.
     """
 
-    paths: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False)]
+    paths: Annotated[
+        tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(_MOST_PATHS)
+    ]
     distribution: Annotated[str, Field(min_length=1)] | None = None
 
     def members(self, folder: Path) -> tuple[Member, ...]:
@@ -75,20 +85,37 @@ class FileMember(Member):
 
 
 def _matches(folder: Path, path: str) -> list[Path]:
+    if "\0" in path:
+        raise StudyError(f"paths: no file can have the name {shown(path)}, which holds the character NUL")
     # A file may have wildcard characters in its name: one that is there is meant.
-    if not glob.has_magic(path) or (folder / path).is_file():
+    if not has_magic(path) or os.path.isfile(folder / path):
         return [folder / path]
-    found = [folder / match for match in glob.glob(path, root_dir=folder, recursive=True)]
-    found = [match for match in found if match.is_file()]
-    if not found:
-        raise StudyError(f"the glob {path!r} matches no file below {folder.resolve()}")
-    return found
+    try:
+        return expand(folder, path)
+    except StudyError as error:
+        raise StudyError(f"paths: {error}") from error
 
 
 def _names(paths: list[Path]) -> list[str]:
     """Stems; file names where stems collide, and whole paths where these collide with any other name."""
     stems = [mesh_stem(path) for path in paths]
-    counts = Counter(stems)
-    names = [stem if counts[stem] == 1 else path.name for stem, path in zip(stems, paths, strict=True)]
-    counts = Counter(names)
-    return [name if counts[name] == 1 else path.as_posix() for name, path in zip(names, paths, strict=True)]
+    names = [stem if alone else path.name for stem, path, alone in zip(stems, paths, _alone(stems), strict=True)]
+    names = [name if alone else path.as_posix() for name, path, alone in zip(names, paths, _alone(names), strict=True)]
+    for path, name in zip(paths, names, strict=True):
+        wrong = flaw(name, _LONGEST_NAME, "\\")
+        if wrong is not None:
+            raise StudyError(f"paths: the name of the file {shown(path.name)} is no label: {wrong}; rename the file")
+    same = twins(names)
+    if same:
+        raise StudyError(
+            f"paths: the files {' and '.join(map(shown, same[0][:3]))} have names that differ in nothing but case or "
+            "the spelling of accents; rename one"
+        )
+    return names
+
+
+def _alone(names: list[str]) -> list[bool]:
+    """Which names cannot be taken for any other."""
+    keys = list(map(folded, names))
+    counts = Counter(keys)
+    return [counts[key] == 1 for key in keys]

@@ -10,13 +10,14 @@ from pydantic import Field
 
 from sobolev_batch.surfaces.icosphere import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, installed_version
+from sobolev_batch.surfaces.sources import MOST_ENTRIES, Fingerprint, Member, Size, Source, at_most, installed_version
 from sobolev_batch.surfaces.sphere import Sphere
 
 # Measured peak of the subdivision, for each triangle that it makes.
 _MAKING_BYTES = 140
 
 Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
+Levels = Annotated[tuple[Level, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
 
 
 class Icospheres(Source):
@@ -26,7 +27,7 @@ class Icospheres(Source):
         levels: the levels N to make.
     """
 
-    levels: Annotated[tuple[Level, ...], Field(min_length=1, strict=False)]
+    levels: Levels
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """One member per level, coarse to fine."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.contents import read_contents, unpacked_limit
 from sobolev_batch.surfaces.polygons import merge_coincident
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
@@ -45,11 +46,16 @@ def parse_gltf(data: bytes, path: Path) -> Raw:
     if required:
         raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
     buffers = _Buffers(tree, binary, path)
-    parts = [
-        (vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles)
-        for matrix, mesh in _placed_meshes(tree)
-        for vertices, triangles in _primitives(tree["meshes"][mesh], buffers)
-    ]
+    parts: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+    total = 0
+    for matrix, mesh in _placed_meshes(tree):
+        for vertices, triangles in _primitives(tree["meshes"][mesh], buffers):
+            parts.append((vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
+            total += vertices.nbytes + triangles.nbytes
+            # Any number of nodes may place one mesh, and any number of parts use one array.
+            most = unpacked_limit(len(data) + buffers.loaded_bytes)
+            if total > most:
+                raise MeshError(f"its scene repeats parts until they take more than {most} bytes; export it unfolded")
     if not parts:
         raise MeshError("the file's scene has no faces")
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
@@ -74,6 +80,13 @@ class _Buffers:
     def __init__(self, tree: dict[str, Any], binary: bytes | None, path: Path) -> None:
         self._tree, self._binary, self._path = tree, binary, path
         self._loaded: dict[int, bytes] = {}
+        # By path: buffers of a document may be one file under several names.
+        self._files: dict[Path, bytes] = {}
+
+    @property
+    def loaded_bytes(self) -> int:
+        """The size of the files that were read."""
+        return sum(map(len, self._files.values()))
 
     def array(self, index: int, kind: str) -> NDArray[Any]:
         """The values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
@@ -87,7 +100,9 @@ class _Buffers:
         stride = view.get("byteStride", dtype.itemsize * width)
         offset = accessor.get("byteOffset", 0)
         needed = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
-        if min(offset, count, stride) < 0 or needed > view["byteLength"]:
+        if stride < dtype.itemsize * width:
+            raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
+        if min(offset, count) < 0 or needed > view["byteLength"]:
             raise MeshError(
                 f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold"
             )
@@ -116,17 +131,21 @@ class _Buffers:
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2], validate=True)
         beside = _beside(self._path, uri)
-        try:
-            return beside.read_bytes()
-        except OSError as error:
-            raise MeshError(f"its buffer {beside.name} cannot be read: {error.strerror}") from error
+        if beside not in self._files:
+            try:
+                self._files[beside] = read_contents(beside, gzipped=False)
+            except MeshError as error:
+                raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
+        return self._files[beside]
 
 
 def _beside(path: Path, uri: str) -> Path:
-    name = unquote(uri)
-    if "://" in name or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise MeshError(f"its buffer {uri[:80]!r} lies outside the file's folder")
-    return path.parent / name
+    name, folder = unquote(uri), path.parent.resolve()
+    outside = "://" in name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts
+    # A link may lead anywhere.
+    if outside or not (folder / name).resolve().is_relative_to(folder):
+        raise MeshError(f"its buffer {uri[:80]!r} lies outside the file's folder; put it there")
+    return (folder / name).resolve()
 
 
 def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:

@@ -22,6 +22,9 @@ _EVERYTHING = slice(None)
 # Triangles that are measured at a time: their edges and temporaries stay in cache.
 _SLICE = 1 << 14
 
+# The squared distance of two vertices further out may overflow.
+_LARGEST_COORDINATE = 1e150
+
 # Odd numbers without pattern, that spread three indices over 64 bits.
 _MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 
@@ -72,10 +75,11 @@ class Mesh:
         checked_triangles = _check_triangles(triangles, len(checked_vertices))
         object.__setattr__(self, "vertices", checked_vertices)
         object.__setattr__(self, "triangles", checked_triangles)
-        if not np.isfinite(self.area):
+        largest = float(np.abs(checked_vertices).max(initial=0.0))
+        if largest > _LARGEST_COORDINATE or not np.isfinite(self.area):
             raise MeshError(
-                "the mesh has coordinates so large that its area overflows double precision: "
-                f"largest absolute coordinate {np.abs(checked_vertices).max():.3g}; rescale it"
+                "the mesh has coordinates so large that areas or squared lengths overflow double precision: "
+                f"largest absolute coordinate {largest:.3g}; rescale it"
             )
         if not self._has_area():
             raise MeshError(
@@ -105,7 +109,8 @@ class Mesh:
     @cached_property
     def area(self) -> float:
         """Total area, in squared units of length."""
-        return float(self.areas.sum())
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(self.areas.sum())
 
     @property
     def edge_lengths(self) -> NDArray[np.float64]:

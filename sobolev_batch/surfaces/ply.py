@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import re
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
@@ -17,8 +17,16 @@ from sobolev_batch.surfaces.polygons import fans_of_lists
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
+# A header ends within so many bytes: room for a thousand lines, and no more to look through for a plan.
+HEADER_BYTES = 1 << 16
+
 _END = b"end_header"
 _CORNERS = ("vertex_indices", "vertex_index")
+_MOST_DIGITS = 18
+_SHORT, _LONG = (b"short", b"ushort", b"int16", b"uint16"), (b"int", b"uint", b"float", b"int32", b"uint32", b"float32")
+_TYPE_BYTES = dict.fromkeys(_SHORT, 2) | dict.fromkeys(_LONG, 4) | dict.fromkeys((b"double", b"float64"), 8)
+# A digit and what ends it.
+_TEXT_BYTES = 2
 
 
 def parse_ply(data: bytes, path: Path) -> Raw:
@@ -31,21 +39,21 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     Raises:
         MeshError: no vertices or faces, or counts that do not fit what follows.
     """
-    start = data.find(_END)
-    header, length = data[: max(start, 0)], len(data) - start - len(_END)
-    counts = _announced(header)
+    start = data.find(_END, 0, HEADER_BYTES)
+    header, length = _Header.of(data[: max(start, 0)]), len(data) - start - len(_END)
+    counts = header.counts
     if start < 0 or "vertex" not in counts or "face" not in counts:
-        raise MeshError("the PLY header does not announce vertices and faces")
-    # Every element takes at least a byte: a count beyond that would only reserve memory.
-    if sum(counts.values()) > length:
+        raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
+    # A count beyond what can follow would only reserve memory.
+    if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
-    text = _is_text(header)
-    lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if text else sum(counts.values())
-    if lines != sum(counts.values()):
-        raise MeshError(f"the PLY header announces {sum(counts.values())} entries, found {lines}")
+    entries = sum(counts.values())
+    lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if header.text else entries
+    if lines != entries:
+        raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
     # A real file where it is binary, since of any other stream the library reads row by row.
     with TemporaryFile() as stream:
-        source, total = (data, 0) if text else (stream, stream.write(data))
+        source, total = (data, 0) if header.text else (stream, stream.write(data))
         del data
         try:
             # Reads all faces at once; the library refuses it where one of them is no triangle.
@@ -53,7 +61,7 @@ def parse_ply(data: bytes, path: Path) -> Raw:
         except (PlyElementParseError, KeyError):
             ply = _read(source, {})
         # Of a text the lines were counted.
-        left = 0 if text else total - stream.tell()
+        left = 0 if header.text else total - stream.tell()
     if left:
         raise MeshError(f"the PLY header announces {counts}, but {left} bytes more follow")
     vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
@@ -61,17 +69,49 @@ def parse_ply(data: bytes, path: Path) -> Raw:
 
 
 def announced_sizes(header: bytes) -> tuple[int, int, bool]:
-    """How many vertices and faces the beginning of a file announces, 0 where it does not, and whether it is a text."""
-    counts = _announced(header.partition(_END)[0])
-    return counts.get("vertex", 0), counts.get("face", 0), _is_text(header)
+    """How many vertices and faces the beginning of a file announces, 0 where it does not, and whether it is a text.
+
+    Raises:
+        MeshError: a count that is none.
+    """
+    found = _Header.of(header.partition(_END)[0])
+    return found.counts.get("vertex", 0), found.counts.get("face", 0), found.text
 
 
-def _announced(header: bytes) -> dict[str, int]:
-    return {name.decode(): int(count) for name, count in re.findall(rb"^element\s+(\w+)\s+(\d+)", header, re.M)}
+@dataclass(frozen=True)
+class _Header:
+    """What a header announces.
 
+    Attributes:
+        counts: of each element.
+        least_bytes: the fewest that can follow it.
+        text: whether what follows is text.
+    """
 
-def _is_text(header: bytes) -> bool:
-    return re.search(rb"^format\s+ascii", header, re.M) is not None
+    counts: dict[str, int]
+    least_bytes: int
+    text: bool
+
+    @classmethod
+    def of(cls, header: bytes) -> _Header:
+        """The header of which these are the lines; the library complains of those that are malformed."""
+        counts: dict[str, int] = {}
+        row_bytes: dict[str, int] = {}
+        element, text = "", False
+        for line in header.splitlines():
+            match line.split():
+                case [b"format", kind, *_]:
+                    text = kind == b"ascii"
+                case [b"element", name, count, *_]:
+                    element = name.decode("ascii", errors="replace")
+                    if not count.isdigit() or len(count) > _MOST_DIGITS:
+                        raise MeshError(f"the PLY header announces {count[:40]!r} entries of {element[:40]!r}")
+                    counts[element], row_bytes[element] = int(count), 0
+                case [b"property", b"list", kind, _, _] | [b"property", kind, _] if element:
+                    row_bytes[element] += _TEXT_BYTES if text else _TYPE_BYTES.get(kind, 1)
+        # The last number of a text need not be followed by anything.
+        least = sum(count * max(row_bytes[name], 1) for name, count in counts.items()) - text
+        return cls(counts, least, text)
 
 
 def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:
@@ -85,6 +125,9 @@ def _triangles(faces: PlyElement) -> NDArray[np.int64]:
     names = [name for name in _CORNERS if name in faces.data.dtype.names]
     if not names:
         raise MeshError("the PLY faces have no list vertex_indices")
+    kind = faces.ply_property(names[0]).val_dtype
+    if not kind.startswith(("i", "u")):
+        raise MeshError(f"the PLY faces have indices that are not integers, but of the type {kind}")
     corners = faces[names[0]]
     if corners.ndim == 2:
         return np.asarray(corners, dtype=np.int64)

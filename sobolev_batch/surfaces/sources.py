@@ -17,10 +17,15 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, v
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, SerializeAsAny, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.contents import bounded_length, open_regular
+from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.similarity import Surface
+
+# Of levels, or of triangle counts of one mesh.
+MOST_ENTRIES = 1000
 
 _GROUP = "sobolev_batch.sources"
 
@@ -96,6 +101,17 @@ class Member(ABC):
         return Size()
 
 
+def at_most(count: int) -> BeforeValidator:
+    """A bound on the length of a list, looked at before its entries are."""
+
+    def check(value: object) -> object:
+        if isinstance(value, list | tuple) and len(value) > count:
+            raise ValueError(f"at most {count} entries are allowed, found {len(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal.
 
@@ -103,10 +119,13 @@ def file_digest(path: Path) -> str:
         MeshError: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
+            bounded_length(file)
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read: {error.strerror}") from error
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
 def installed_version(distribution: str) -> str:
@@ -154,7 +173,7 @@ def parse_source(table: Mapping[str, Any]) -> Source:
     name = table.get("source")
     registry = _registry()
     if not isinstance(name, str) or name not in registry:
-        raise StudyError(f"no source is named {name!r}; known are {', '.join(sorted(registry))}")
+        raise StudyError(f"no source is named {shown(name)}; known are {', '.join(sorted(registry))}")
     try:
         source_type = registry[name].load()
     except (ImportError, AttributeError) as error:

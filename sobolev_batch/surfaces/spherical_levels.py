@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, field_validator
+from pydantic import SerializeAsAny, field_validator
 from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.decimation import reduced_size
-from sobolev_batch.surfaces.generated import Level
+from sobolev_batch.surfaces.generated import Levels
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, Source, sole_member
@@ -32,7 +31,7 @@ class SphericalLevels(NestedSource):
     """
 
     sphere: SerializeAsAny[Source]
-    levels: Annotated[tuple[Level, ...], Field(min_length=1, strict=False)]
+    levels: Levels
 
     @field_validator("sphere", mode="before")
     @classmethod

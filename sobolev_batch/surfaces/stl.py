@@ -67,6 +67,8 @@ def _corner(words: list[str], facet: int) -> list[float]:
     if len(words) != 3:
         raise MeshError(f"facet {facet} has a vertex of {len(words)} coordinates, expected three")
     try:
+        if any("_" in word for word in words):
+            raise ValueError("Python's spelling, not that of any mesh format")
         return [float(word) for word in words]
     except ValueError as error:
         raise MeshError(f"facet {facet} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error

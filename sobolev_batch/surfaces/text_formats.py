@@ -21,6 +21,8 @@ _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
 # Numbers per vertex line beside x y z, and per face line behind the corners: a colour or its index.
 _OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
+# Of an index or count: any that fits into 64 bits, and a few that nobody has.
+_MOST_DIGITS = 18
 
 
 def parse_obj(data: bytes) -> Raw:
@@ -65,7 +67,7 @@ def parse_off(data: bytes) -> Raw:
     if kind is None:
         raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
     counts, rows = (lines[0][1:], lines[1:]) if len(lines[0]) > 1 else (lines[1] if lines[1:] else [], lines[2:])
-    if len(counts) not in (2, 3) or not all(count.isdigit() for count in counts):
+    if len(counts) not in (2, 3) or not all(map(_is_count, counts)):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
     if vertex_count + face_count != len(rows):
@@ -86,14 +88,23 @@ def _text(data: bytes) -> str:
     return data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
+def _is_count(word: str) -> bool:
+    # Other digits than these are digits to Python too.
+    return word.isascii() and word.isdigit() and len(word) <= _MOST_DIGITS
+
+
 def _numbers(words: list[str], what: str) -> list[float]:
     try:
+        if any("_" in word for word in words):
+            raise ValueError("Python's spelling, not that of any mesh format")
         return [float(word) for word in words]
     except ValueError as error:
         raise MeshError(f"{what} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
 
 
 def _integer(word: str, what: str) -> int:
+    if len(word) > _MOST_DIGITS or "_" in word:
+        raise MeshError(f"{what} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}")
     try:
         return int(word)
     except ValueError as error:
@@ -126,4 +137,4 @@ def _off_polygon(words: list[str], number: int) -> list[int]:
 
 
 def _complete_face(words: list[str]) -> bool:
-    return words[0].isdigit() and len(words) - 1 - int(words[0]) in _OFF_FACE_EXTRAS
+    return _is_count(words[0]) and len(words) - 1 - int(words[0]) in _OFF_FACE_EXTRAS

@@ -207,6 +207,13 @@ def test_a_needle_of_extreme_lengths_raises_nothing_but_mesh_errors() -> None:
     assert mesh.area == pytest.approx(0.5)
 
 
+def test_lengths_whose_squares_overflow_are_refused_whatever_else_there_is() -> None:
+    vertices = [*VERTICES, [0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]]
+    count = len(VERTICES)
+    with pytest.raises(MeshError, match=r"squared lengths overflow .* 1e\+200; rescale it"):
+        Mesh(vertices, [*TRIANGLES, [count, count + 1, count + 2]])
+
+
 def test_areas_and_lengths_of_a_right_triangle() -> None:
     mesh = Mesh(VERTICES, TRIANGLES)
     assert mesh.areas.tolist() == [6.0]

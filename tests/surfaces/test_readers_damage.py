@@ -152,6 +152,8 @@ BAD: dict[str, tuple[str, bytes, str]] = {
         "",
     ),
     "obj, a coordinate that is no number": (".obj", changed(OBJ_BOX, b"v 0.0 2.0 4.0\n", b"v 0.0 2.0 x\n"), ""),
+    "obj, a coordinate in Python's spelling": (".obj", changed(OBJ_BOX, b"v 0.0 2.0 4.0\n", b"v 0.0 2_0 4.0\n"), ""),
+    "obj, an index in Python's spelling": (".obj", OBJ_BOX + b"f 1 2 0_3\n", "index"),
     "obj, two coordinates": (".obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", ""),
     "obj, no faces": (".obj", without_faces(OBJ_BOX), "no faces|no triangles"),
     "obj, no vertices": (".obj", b"f 1 2 3\n", ""),
@@ -166,6 +168,7 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "off, a length above the corners": (".off", changed(OFF_BOX, b"3 4 6 7\n", b"4 4 6 7\n"), ""),
     "off, a corner missing": (".off", changed(OFF_BOX, b"3 4 6 7\n", b"3 4 6\n"), ""),
     "off, two corners missing among quads": (".off", changed(OFF_QUADS, b"4 4 6 7 5\n", b"4 4 6\n"), ""),
+    "off, an index in Python's spelling": (".off", changed(OFF_BOX, b"3 4 6 7\n", b"3 4 6 0_7\n"), "index"),
     "off, two corners": (".off", off(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1]]), ""),
     "off, two corners among quads": (".off", off(BOX_VERTICES, [*BOX_MIXED, [0, 1]]), ""),
     "off, no corners": (".off", off(BOX_VERTICES, [*BOX_TRIANGLES, []]), ""),
@@ -212,6 +215,11 @@ BAD: dict[str, tuple[str, bytes, str]] = {
             b"vertex 1.0 0.0 0.0 1.0\n",
         ),
         "",
+    ),
+    "stl ascii, a coordinate in Python's spelling": (
+        ".stl",
+        changed(STL_TEXT, b"vertex 0.0 2.0 4.0\n", b"vertex 0.0 2_0 4.0\n"),
+        "not a number",
     ),
     "stl ascii, a coordinate that is no number": (
         ".stl",
@@ -392,9 +400,9 @@ def test_zipped_content_under_a_plain_name_is_refused(tmp_path: Path) -> None:
 def test_files_beyond_the_bound_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
     path = tmp_path / f"scan{ending}"
     path.write_bytes(gzip.compress(PLY_BOX) if ending.endswith(".gz") else PLY_BOX)
-    monkeypatch.setattr("sobolev_batch.surfaces.readers._LARGEST_BYTES", len(PLY_BOX))
+    monkeypatch.setattr("sobolev_batch.surfaces.contents._LARGEST_BYTES", len(PLY_BOX))
     assert read_mesh(path).area == 28.0
-    monkeypatch.setattr("sobolev_batch.surfaces.readers._LARGEST_BYTES", len(PLY_BOX) - 1)
+    monkeypatch.setattr("sobolev_batch.surfaces.contents._LARGEST_BYTES", len(PLY_BOX) - 1)
     with pytest.raises(MeshError, match=re.escape(f"{path}: larger than {len(PLY_BOX) - 1} bytes")):
         read_mesh(path)
 
