@@ -50,8 +50,8 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
-                # Of what workers say when they are ended in the middle of a task, nothing helps.
-                "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "error",
+                # What goes wrong in a task is told by its record; of a cluster's end they say much that helps nobody.
+                "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
                 "distributed.deploy.lost-worker-timeout": _LOST_WORKER_SECONDS,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,

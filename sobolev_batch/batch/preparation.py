@@ -64,6 +64,7 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
         _replace_everything(store, plan)
         return store
     _check_same_study(store, plan)
+    store.location.sweep()
     with store.location.access("written"):
         if _lattice(store) != _lattice_entry(plan):
             _replace_everything(store, plan)
