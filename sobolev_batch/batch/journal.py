@@ -11,7 +11,7 @@ from typing import Self
 from sobolev_batch.batch.claim import Claim, this_process
 from sobolev_batch.batch.records import RunRecord, RunState, utc_now
 from sobolev_batch.batch.store import Store
-from sobolev_batch.errors import ClaimError
+from sobolev_batch.errors import ClaimError, StoreError
 
 _log = logging.getLogger(__name__)
 
@@ -54,10 +54,15 @@ class Journal:
         self._thread.join()
         if error is None:
             self.write("done")
-        # Another driver may have taken over, as when this one's worker was retired: how that ends counts.
-        elif self._claim.is_on(self._store.location):
-            ended = isinstance(error, KeyboardInterrupt | SystemExit)
-            self.write("failed", "interrupted" if ended else str(error) or repr(error))
+            return
+        try:
+            # Another driver may have taken over, as when this one's worker was retired: how that ends counts.
+            if self._claim.is_on(self._store.location):
+                ended = isinstance(error, KeyboardInterrupt | SystemExit)
+                self.write("failed", "interrupted" if ended else str(error) or repr(error))
+        except StoreError as failure:
+            # It may be what ended the run, and must not hide that.
+            _log.warning("how the run ended could not be written: %s", failure)
 
     def require_claim(self) -> None:
         """Check that the store was still this run's at the latest beat.
