@@ -37,6 +37,7 @@ _SIZED_SCHEMES = ("s3", "s3a")
 _PART_BYTES = 50 << 20
 # How zarr, too, names a file until it is whole.
 _PARTIAL = ".partial"
+_STRAY = re.compile(r"\.[0-9a-f]{32}\.partial")
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,7 @@ class Location:
             with self.access("written"):
                 for folder, _, names in os.walk(self.name):
                     for name in names:
-                        if name.endswith(_PARTIAL):
+                        if _STRAY.search(name):
                             (Path(folder) / name).unlink()
 
     def remove(self, prefix: str) -> None:
@@ -276,7 +277,8 @@ class Location:
         path = Path(self.name)
         if not self.scheme and path.exists() and not path.is_dir():
             raise StoreError(f"{self}: a file is there; name a folder that is new or holds a store")
-        if self.names() - {besides}:
+        # Of a driver that was killed while it wrote the first key, only its stray is there.
+        if any(name != besides and not _STRAY.search(name) for name in self.names()):
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
         if not self.scheme and not path.absolute().parent.is_dir():
             raise StoreError(f"{self}: there is no folder {path.absolute().parent} to hold the store; make it first")

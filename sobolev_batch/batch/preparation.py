@@ -79,6 +79,7 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
 def _replace_everything(store: Store, plan: Plan) -> None:
     """Remove everything that was computed and lay out the arrays for another lattice."""
     _mark_unfinished(store, plan)
+    store.location.sweep()
     for name in sorted(store.location.names() - {CLAIM, ROOT}):
         store.location.remove(name)
     _lay_out(store, plan)

@@ -9,8 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import fsspec
 import numpy as np
@@ -20,7 +22,8 @@ import xarray as xr
 from distributed import Client
 from zarr.storage import FsspecStore
 
-from sobolev_batch import Lattice, StoreError, Study, open_store, run
+from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
+from sobolev_batch.batch.claim import CLAIM, Claim, take
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import make_plan
@@ -425,3 +428,38 @@ def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str)
     assert location.read("a/b") == b"2"
     server.client().delete_object(Bucket=BUCKET, Key=key)
     assert location.names() == set()
+
+
+def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> None:
+    location = Location.of(url)
+    together = Barrier(6)
+
+    def attempt(number: int) -> bool:
+        together.wait()
+        try:
+            take(location, Claim.of_this_process())
+        except ClaimError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(6) as pool:
+        for _ in range(5):
+            assert sum(pool.map(attempt, range(6))) == 1
+            location.discard(CLAIM)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "gone"])
+def test_damage_is_found_and_repaired(server: Server, s3_client: Client, url: str, damage: str, stored: str) -> None:
+    study, there = Study.from_table(small_table()), server.client()
+    run(study, url, s3_client)
+    key = url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c/2/0/0/0"
+    data = bytearray(there.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+    if damage == "gone":
+        there.delete_object(Bucket=BUCKET, Key=key)
+    else:
+        data[100] ^= damage == "flipped"
+        there.put_object(Bucket=BUCKET, Key=key, Body=bytes(data[: -10 if damage == "cut" else None]))
+    assert list(verify(url).fields) == ["ico/2"]
+    assert run(study, url, s3_client).computed == ("ico/2",)
+    assert verify(url).is_sound
+    assert_same(open_store(url), open_store(stored))

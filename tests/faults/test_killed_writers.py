@@ -41,6 +41,8 @@ plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64}))
 store = prepare_store(path, plan)
 (place,) = store.places()
 shape = [part.stop for part in place]
+chunk = path / "fourier/fourier/c/0/0/0/0"
+chunk.parent.mkdir(parents=True)
 rng = np.random.default_rng(7)
 found = {"torn": 0, "strays": 0, "unfounded": 0, "values": 0, "swept": True}
 for kill in range(%d):
@@ -54,8 +56,8 @@ for kill in range(%d):
         os._exit(1)
     for _ in range(int(rng.integers(1, 12))):
         os.read(reader, 1)
-    # Where in the write it is by now is up to chance.
-    for _ in range(int(rng.integers(0, 20_000))):
+    # Where in the write it is by now is up to chance; every other time, there is a file without its name yet.
+    while kill %% 2 and not any(name.endswith(".partial") for name in os.listdir(chunk.parent)):
         pass
     os.kill(child, signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
