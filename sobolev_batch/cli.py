@@ -126,7 +126,7 @@ def plan_command(study: Path, store: Location | None, scheduler: str | None) -> 
     plan = make_plan(parsed, stored_choice(place))
     if scheduler:
         with remote_client(scheduler) as client:
-            crew = enlist(client)
+            crew = enlist(client, parsed.libraries)
     else:
         crew = Crew.of_this_machine(available_cores())
     for name, value in _plan_lines(plan, place, crew):

@@ -137,7 +137,7 @@ def run(
                 journal.cluster = active.scheduler.address
                 journal.write("running")
                 notify(Progress("cluster", 0, 0, active.dashboard_link))
-                crew = enlist(active)
+                crew = enlist(active, study.libraries)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
                 journal.worry = lambda: worry_about(active, study.backend)

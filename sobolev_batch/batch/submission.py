@@ -62,7 +62,7 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
     known = stored_choice(location)
     require_reach(client, location)
     plan = make_plan(study, known)
-    enlist(client).with_backend(study.backend)
+    enlist(client, study.libraries).with_backend(study.backend)
     place = Store.prepare(location, plan)
     missing = rows_without_field(place.records(), rows_of(place, plan))
     journal = Journal(place)
