@@ -16,6 +16,7 @@ from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submission import Submission, submit
 from sobolev_batch.errors import (
     AccuracyError,
+    AddressError,
     BackendError,
     ClusterError,
     InputError,
@@ -38,6 +39,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 
 __all__ = [
     "AccuracyError",
+    "AddressError",
     "BackendError",
     "ClusterError",
     "InputError",
