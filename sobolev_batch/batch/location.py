@@ -111,16 +111,23 @@ class Location:
         self._filesystem()
         return FsspecStore.from_url(self.name, storage_options=self._options(largest_bytes))
 
-    def read(self, key: str) -> bytes | None:
+    def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """The bytes of a key, or None where there are none.
 
+        Args:
+            key: below this location.
+            most_bytes: that it may have.
+
         Raises:
-            StoreError: the location cannot be reached, within seconds, or not be read.
+            StoreError: the location cannot be reached, within seconds, or not be read; or it has more bytes.
         """
         with self.access("read"):
             try:
                 if not self.scheme:
-                    return (Path(self.name) / key).read_bytes()
+                    path = Path(self.name) / key
+                    if most_bytes is not None and path.stat().st_size > most_bytes:
+                        raise StoreError(f"{self}: {key} has more than {most_bytes} bytes")
+                    return path.read_bytes()
                 files, root = self._filesystem()
                 found: bytes = files.cat_file(f"{root}/{key}", **_patience(files))
                 return found

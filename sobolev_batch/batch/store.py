@@ -30,6 +30,7 @@ from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore, StorePath
 
 from sobolev_batch.batch.choice import Choice
+from sobolev_batch.batch.documents import MOST_BYTES, Document, check_documents
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.records import Record, RunRecord
@@ -41,7 +42,6 @@ from sobolev_batch.surfaces.similarity import Similarity
 SCHEMA_VERSION = 2
 
 Place = tuple[slice, slice, slice]
-Document = dict[str, Any]
 
 _ROOT = "zarr.json"
 _FIELD = "fourier/fourier"
@@ -120,7 +120,7 @@ class Store:
             if root is None:
                 return False
             # What the root repeats of groups, these repeat of what is in them.
-            for name, document in root.pop("consolidated_metadata", {}).get("metadata", {}).items():
+            for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
                 document.pop("consolidated_metadata", None)
                 self._documents.setdefault(name, document)
             self._documents[""] = root
@@ -268,15 +268,17 @@ class Store:
         return self._documents[name]
 
     def _read_document(self, name: str) -> Document | None:
-        text = self.location.read(f"{name}/{_ROOT}".lstrip("/"))
+        text = self.location.read(f"{name}/{_ROOT}".lstrip("/"), MOST_BYTES)
         if text is None:
             return None
         try:
-            return dict(json.loads(text))
-        except (ValueError, TypeError) as error:
+            document = dict(json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
             raise StoreError(
                 f"{self.path}: no store of a study is there: {name}/{_ROOT} is damaged ({error})"
             ) from error
+        check_documents(self.path, {name: document})
+        return document
 
     def _array(self, name: str) -> zarr.Array[Any]:
         place = StorePath(self.keys(name), name)

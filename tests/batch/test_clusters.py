@@ -70,7 +70,7 @@ def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: P
     write_study(tmp_path)
     with tcp_cluster([]) as (address, _):
         beyond = address.replace("127.0.0.1", "0.0.0.0")
-        arguments = ["plan", tmp_path / "study.toml", "--scheduler", beyond]
+        arguments: list[str | Path] = ["plan", tmp_path / "study.toml", "--scheduler", beyond]
         refused, trusted = cli(*arguments), cli(*arguments, "--trust-network")
     assert refused.returncode == 2
     assert refused.stderr.startswith(f"error: the scheduler at {beyond} is neither encrypted nor on loopback (0.0.0.0)")
