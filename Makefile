@@ -29,7 +29,8 @@ bench: $(READY)  ## time it against the paper's pipeline, print the table of rat
 
 audit: $(READY)  ## look the installed packages up among known vulnerabilities; asks a service on the internet
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[audit]'
-	$(BIN)/pip-audit --local --skip-editable --progress-spinner off
+	$(BIN)/python -m pip freeze --quiet --disable-pip-version-check --exclude-editable > .venv/installed.txt
+	$(BIN)/pip-audit --strict --no-deps --disable-pip --progress-spinner off --requirement .venv/installed.txt
 
 format: $(READY)  ## put the sources into shape
 	$(BIN)/ruff check --fix .

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 from sobolev_batch.errors import StoreError
 
@@ -104,7 +104,7 @@ def _problem_of_array(node: str, document: Document) -> str:
     return ""
 
 
-def _is_shape(shape: Any, least: int) -> bool:
+def _is_shape(shape: Any, least: int) -> TypeGuard[list[int]]:
     return isinstance(shape, list) and all(type(length) is int and length >= least for length in shape)
 
 

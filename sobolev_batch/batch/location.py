@@ -21,8 +21,9 @@ from fsspec import AbstractFileSystem, available_protocols
 from fsspec.asyn import sync
 from fsspec.core import url_to_fs
 from zarr.abc.store import Store as ZarrStore
-from zarr.storage import FsspecStore, LocalStore
+from zarr.storage import FsspecStore
 
+from sobolev_batch.batch.containment import ContainedStore, place_of
 from sobolev_batch.errors import SobolevBatchError, StoreError
 
 # Drivers repeat what fails for minutes. That helps a run that is under way; who asks whether a store is
@@ -107,7 +108,7 @@ class Location:
             StoreError: the scheme is unknown, or its driver is not installed.
         """
         if not self.scheme:
-            return LocalStore(self.name)
+            return ContainedStore(self.name)
         self._filesystem()
         return FsspecStore.from_url(self.name, storage_options=self._options(largest_bytes))
 
@@ -124,7 +125,7 @@ class Location:
         with self.access("read"):
             try:
                 if not self.scheme:
-                    path = Path(self.name) / key
+                    path = place_of(self.name, key)
                     if most_bytes is not None and path.stat().st_size > most_bytes:
                         raise StoreError(f"{self}: {key} has more than {most_bytes} bytes")
                     return path.read_bytes()
@@ -152,7 +153,7 @@ class Location:
                     files.pipe(named)
                 return
             for key, document in documents.items():
-                path = Path(self.name) / key
+                path = place_of(self.name, key)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # A reader finds the old document or the new one, never a part of it.
                 partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
@@ -171,7 +172,7 @@ class Location:
                     files, root = self._filesystem()
                     files.rm(f"{root}/{prefix}", recursive=True)
                 else:
-                    shutil.rmtree(Path(self.name) / prefix)
+                    shutil.rmtree(place_of(self.name, prefix))
             except FileNotFoundError as error:
                 if _lacks_bucket(error):
                     raise
