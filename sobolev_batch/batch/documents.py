@@ -14,6 +14,9 @@ from typing import Any, TypeGuard
 
 from sobolev_batch.errors import StoreError
 
+# Of the layout that docs/store.md describes.
+SCHEMA_VERSION = 2
+
 Document = dict[str, Any]
 
 # Of one metadata document. That of the root repeats all others, and holds about 1 kB for each.

@@ -30,7 +30,7 @@ from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore, StorePath
 
 from sobolev_batch.batch.choice import Choice
-from sobolev_batch.batch.documents import MOST_BYTES, Document, check_documents
+from sobolev_batch.batch.documents import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.records import Record, RunRecord
@@ -38,8 +38,6 @@ from sobolev_batch.batch.scratch import Scratch
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity
-
-SCHEMA_VERSION = 2
 
 Place = tuple[slice, slice, slice]
 
