@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test coverage soak check bench format clean
+.PHONY: study icosphere test coverage soak check bench audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -29,6 +29,11 @@ check: $(READY)  ## lint, formatting, types
 bench: $(READY)  ## time it against the paper's pipeline, print the table of ratios
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m benchmarks
+
+audit: $(READY)  ## look the installed packages up among known vulnerabilities; asks a service on the internet
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[audit]'
+	$(BIN)/python -m pip freeze --quiet --disable-pip-version-check --exclude-editable > .venv/installed.txt
+	$(BIN)/pip-audit --strict --no-deps --disable-pip --progress-spinner off --requirement .venv/installed.txt
 
 format: $(READY)  ## put the sources into shape
 	$(BIN)/ruff check --fix .

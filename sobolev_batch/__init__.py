@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sobolev_batch.batch.verification import Verification, verify
     from sobolev_batch.errors import (
         AccuracyError,
+        AddressError,
         BackendError,
         ClaimError,
         ClusterError,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AccuracyError",
+    "AddressError",
     "BackendError",
     "ClaimError",
     "ClusterError",
@@ -83,6 +85,7 @@ __all__ = [
 # the command line could not answer.
 _MODULES = {
     "AccuracyError": "errors",
+    "AddressError": "errors",
     "BackendError": "errors",
     "ClaimError": "errors",
     "ClusterError": "errors",

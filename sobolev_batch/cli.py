@@ -70,10 +70,19 @@ def cli(context: click.Context, debug: bool) -> None:
         logging.getLogger("distributed").setLevel(logging.ERROR)
 
 
+_trust_option = click.option(
+    "--trust-network",
+    is_flag=True,
+    help="Use a scheduler that is neither encrypted (tls://) nor on loopback: everybody who reaches its ports or "
+    "those of its workers can run programs on these machines and read the meshes.",
+)
+
+
 @cli.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--store", type=Location.of, metavar="PATH|URL", help="Where results go. [default: storage/NAME.zarr]")
-@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
+@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tls://host:8786.")
+@_trust_option
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
 @click.option("--worker-memory", metavar="SIZE", help="Of each of them, such as 4GB. [default: an equal part]")
 @click.pass_context
@@ -82,6 +91,7 @@ def run_command(
     study: Path,
     store: Location | None,
     scheduler: str | None,
+    trust_network: bool,
     workers: int | None,
     worker_memory: str | None,
 ) -> None:
@@ -94,7 +104,7 @@ def run_command(
     place = store or _default_place(parsed)
     with _Reporter() as reporter:
         if scheduler:
-            with remote_client(scheduler) as client:
+            with remote_client(scheduler, trust_network) as client:
                 summary = run(parsed, place, client, on_progress=reporter)
         else:
             summary = run(parsed, place, workers=workers, memory=worker_memory, on_progress=reporter)
@@ -106,12 +116,13 @@ def run_command(
 
 @cli.command("submit")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--scheduler", metavar="ADDRESS", required=True, help="A Dask scheduler, such as tcp://host:8786.")
+@click.option("--scheduler", metavar="ADDRESS", required=True, help="A Dask scheduler, such as tls://host:8786.")
+@_trust_option
 @click.option("--store", type=Location.of, metavar="PATH|URL", help="Where results go. [default: storage/NAME.zarr]")
-def submit_command(study: Path, scheduler: str, store: Location | None) -> None:
+def submit_command(study: Path, scheduler: str, trust_network: bool, store: Location | None) -> None:
     """Hand STUDY over to a cluster and return; it goes on without this process."""
     parsed = Study.from_toml(study)
-    with remote_client(scheduler) as client:
+    with remote_client(scheduler, trust_network) as client:
         submission = submit(parsed, store or _default_place(parsed), client)
     click.echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
     click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
@@ -123,14 +134,15 @@ def submit_command(study: Path, scheduler: str, store: Location | None) -> None:
     "--store", type=Location.of, metavar="PATH|URL", help="Where results would go. [default: storage/NAME.zarr]"
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Plan for its workers. [default: for processes on this machine]")
-def plan_command(study: Path, store: Location | None, scheduler: str | None) -> None:
+@_trust_option
+def plan_command(study: Path, store: Location | None, scheduler: str | None, trust_network: bool) -> None:
     """Show what running STUDY would do: tasks, lattice, bytes, memory, what is already there."""
     parsed = Study.from_toml(study)
     place = store or Location.of(_DEFAULT_FOLDER / f"{parsed.name}.zarr")
     plan = make_plan(parsed, stored_choice(place))
     if scheduler:
-        with remote_client(scheduler) as client:
-            crew = enlist(client)
+        with remote_client(scheduler, trust_network) as client:
+            crew = enlist(client, parsed.libraries)
     else:
         crew = Crew.of_this_machine(available_cores())
     for name, value in _plan_lines(plan, place, crew):

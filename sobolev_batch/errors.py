@@ -77,3 +77,7 @@ class BackendError(SobolevBatchError):
 
 class ClusterError(SobolevBatchError):
     """The Dask cluster cannot be reached or stopped serving."""
+
+
+class AddressError(ClusterError, InputError):
+    """The address of a scheduler is malformed, or its network is not to be trusted."""

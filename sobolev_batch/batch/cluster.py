@@ -12,6 +12,7 @@ import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
+from sobolev_batch.batch.address import Address
 from sobolev_batch.batch.connection import check_connection
 from sobolev_batch.errors import ClusterError, InputError
 
@@ -125,12 +126,21 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 
 @contextmanager
-def remote_client(address: str) -> Iterator[Client]:
-    """A client of the scheduler at an address such as tcp://host:8786.
+def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
+    """A client of the scheduler at an address such as tls://host:8786.
+
+    Args:
+        address: of the scheduler.
+        trust_network: go on where scheduler or workers are neither encrypted nor on loopback: whoever reaches
+            their ports can run programs there and read the meshes.
 
     Raises:
+        AddressError: it is malformed, or its network would have to be trusted.
         ClusterError: nothing answers there, or it is not to be reached with Dask's configuration.
     """
+    place = Address.of(address)
+    if not trust_network:
+        place.require_private("the scheduler")
     check_connection(address, _CONNECT_SECONDS)
     try:
         client = Client(address, timeout=_CONNECT_SECONDS)
@@ -140,8 +150,13 @@ def remote_client(address: str) -> Iterator[Client]:
             "start one with: dask scheduler"
         ) from error
     with client:
-        if not client.scheduler_info()["workers"]:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
             raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
+        if not trust_network:
+            # What is reached on loopback may be one end of a tunnel.
+            for worker in workers:
+                Address.of(worker).require_private("a worker")
         yield client
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Iterable
 from typing import Any
 
 from distributed import Client, Worker, WorkerPlugin, get_worker
@@ -11,12 +12,14 @@ from distributed.core import Status
 
 from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember, spare_bytes
 from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
+from sobolev_batch.batch.versions import guarded, require_same_versions
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
 
 _log = logging.getLogger(__name__)
 
 _NAME = "sobolev-batch"
+_GUARD = "sobolev-batch-versions"
 _SETUP_SECONDS = 0.05
 
 
@@ -87,13 +90,18 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
                 claim.release()
 
 
-def enlist(client: Client) -> Crew:
+def enlist(client: Client, needed: Iterable[str] = ()) -> Crew:
     """Equip the workers of a cluster, those that join later too, and tell what they offer.
 
+    Args:
+        client: of the cluster.
+        needed: names of distributions that the study takes besides what this package requires.
+
     Raises:
-        ClusterError: there are no workers.
+        ClusterError: there are no workers, or versions there and here differ.
     """
-    client.register_plugin(Equipment(), name=_NAME)
+    require_same_versions(client, needed)
+    client.register_plugin(guarded(Equipment(), _NAME), name=_GUARD)
     answers = client.run(_describe, on_error="return")
     # One that is just leaving, or joining, counts as not there.
     found = {address: parts for address, parts in answers.items() if isinstance(parts, tuple)}

@@ -20,8 +20,8 @@ from fsspec import AbstractFileSystem, available_protocols
 from fsspec.asyn import sync
 from fsspec.core import url_to_fs
 from zarr.abc.store import Store as ZarrStore
-from zarr.storage import LocalStore
 
+from sobolev_batch.batch.containment import ContainedStore, place_of
 from sobolev_batch.batch.patience import PatientKeys, put_all, remove_all
 from sobolev_batch.errors import SobolevBatchError, StoreError
 
@@ -110,20 +110,27 @@ class Location:
             StoreError: the scheme is unknown, or its driver is not installed.
         """
         if not self.scheme:
-            return LocalStore(self.name)
+            return ContainedStore(self.name)
         self._filesystem()
         return PatientKeys.at(self.name, self._options(largest_bytes), largest_bytes)
 
-    def read(self, key: str) -> bytes | None:
+    def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """The bytes of a key, or None where there are none.
 
+        Args:
+            key: below this location.
+            most_bytes: that it may have.
+
         Raises:
-            StoreError: the location cannot be reached, within seconds, or not be read.
+            StoreError: the location cannot be reached, within seconds, or not be read; or it has more bytes.
         """
         with self.access("read"):
             try:
                 if not self.scheme:
-                    return (Path(self.name) / key).read_bytes()
+                    path = place_of(self.name, key)
+                    if most_bytes is not None and path.stat().st_size > most_bytes:
+                        raise StoreError(f"{self}: {key} has more than {most_bytes} bytes")
+                    return path.read_bytes()
                 files, root = self._filesystem()
                 found: bytes = files.cat_file(f"{root}/{key}", **_patience(files))
                 return found
@@ -148,7 +155,7 @@ class Location:
                     files.pipe(named)
                 return
             for key, document in documents.items():
-                path = Path(self.name) / key
+                path = place_of(self.name, key)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # A reader finds the old document or the new one, never a part of it.
                 partial = path.with_name(f"{path.name}.{uuid4().hex}{_PARTIAL}")
@@ -172,7 +179,7 @@ class Location:
                     files, root = self._filesystem()
                     files.pipe_file(f"{root}/{key}", document, mode="create", **_patience(files))
                     return True
-                path = Path(self.name) / key
+                path = place_of(self.name, key)
                 path.parent.mkdir(exist_ok=True)
                 with path.open("xb") as file:
                     file.write(document)
@@ -192,7 +199,7 @@ class Location:
                     files, root = self._filesystem()
                     files.rm_file(f"{root}/{key}")
                     return
-                (Path(self.name) / key).unlink()
+                place_of(self.name, key).unlink()
             except FileNotFoundError as error:
                 if _lacks_bucket(error):
                     raise
@@ -245,7 +252,7 @@ class Location:
                     else:
                         files.rm(f"{root}/{prefix}", recursive=True)
                 else:
-                    shutil.rmtree(Path(self.name) / prefix)
+                    shutil.rmtree(place_of(self.name, prefix))
             except FileNotFoundError as error:
                 if _lacks_bucket(error):
                     raise

@@ -15,6 +15,7 @@ from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
 from sobolev_batch.batch.claim import CLAIM
+from sobolev_batch.batch.documents import SCHEMA_VERSION
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.store import (
@@ -23,7 +24,6 @@ from sobolev_batch.batch.store import (
     QUALITY,
     RECORD,
     ROOT,
-    SCHEMA_VERSION,
     UNFINISHED,
     Store,
     table_encoding,

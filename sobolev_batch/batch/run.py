@@ -127,7 +127,7 @@ def carry_out(
                 journal.cluster = client.scheduler.address
                 journal.write("running")
                 notify(Progress("cluster", 0, 0, client.dashboard_link))
-                crew = enlist(client)
+                crew = enlist(client, study.libraries)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
                 journal.worry = lambda: worry_about(client, study.backend)

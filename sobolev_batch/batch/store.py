@@ -32,6 +32,7 @@ from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore, StorePath
 
 from sobolev_batch.batch.choice import Choice
+from sobolev_batch.batch.documents import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import Record, RunRecord
 from sobolev_batch.batch.scratch import Scratch
@@ -40,10 +41,7 @@ from sobolev_batch.spectral.lattice import AXES
 
 _log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 3
-
 Place = tuple[slice, slice, slice]
-Document = dict[str, Any]
 
 ROOT = "zarr.json"
 # The attribute of the root of a store that is being laid out.
@@ -108,7 +106,7 @@ class Store:
             if root is None:
                 return False
             # What the root repeats of groups, these repeat of what is in them.
-            for name, document in root.pop("consolidated_metadata", {}).get("metadata", {}).items():
+            for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
             self.documents[""] = root
@@ -402,15 +400,17 @@ class Store:
         return self.documents[name]
 
     def _read_document(self, name: str) -> Document | None:
-        text = self.location.read(f"{name}/{ROOT}".lstrip("/"))
+        text = self.location.read(f"{name}/{ROOT}".lstrip("/"), MOST_BYTES)
         if text is None:
             return None
         try:
-            return dict(json.loads(text))
-        except (ValueError, TypeError) as error:
+            document = dict(json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
             raise StoreError(
                 f"{self.path}: no store of a study is there: {name}/{ROOT} is damaged ({error})"
             ) from error
+        check_documents(self.path, {name: document})
+        return document
 
     def array(self, name: str) -> zarr.Array[Any]:
         """An array by the path of its node, for reading and writing."""

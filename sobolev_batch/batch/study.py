@@ -131,6 +131,14 @@ class Study:
     folder: Path
     table: Mapping[str, Any]
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions that its surfaces take, besides those that this package requires."""
+        sources = [family.source for family in self.families]
+        if isinstance(self.reference, Source):
+            sources.append(self.reference)
+        return tuple(sorted({library for source in sources for library in source.libraries}))
+
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
         """Read a study file; relative paths in it start from its folder.

@@ -75,7 +75,7 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
 def _hand_over(study: Study, location: Location, claim: Claim, client: Client) -> Submission:
     require_reach(client, location, claim)
     plan = make_plan(study, stored_choice(location))
-    enlist(client).with_backend(study.backend)
+    enlist(client, study.libraries).with_backend(study.backend)
     place = prepare_store(location, plan)
     missing = rows_without_field(place.records(), rows_of(place, plan))
     journal = Journal(place, claim)

@@ -19,7 +19,7 @@ def open_store(place: str | Path | Location) -> xr.DataTree:
     Fields stay where they are until values of them are asked for.
 
     Raises:
-        StoreError: no store of a study is there, or it cannot be reached.
+        StoreError: no store of a study is there, it cannot be reached, or it is not as this package writes it.
         DamageError: data of a table are not there. (Those that are damaged raise when they are read.)
     """
     store = Store.open(place)
@@ -30,9 +30,7 @@ def open_store(place: str | Path | Location) -> xr.DataTree:
             f"{store.path}: the table {lost[0]} is not there, or not all of it; run the study again to make it anew",
             "it is not there",
         )
-    if not store.location.scheme:
-        return xr.open_datatree(store.path, engine="zarr")
-    # Left to itself, xarray looks for older formats and lists what it knows already: 35 requests, not 14.
+    # Left to itself, xarray looks for older formats, which nobody has checked, and lists what it knows already.
     keys: Any = store.keys()
     with store.location.access("read"):
         return xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)

@@ -33,6 +33,11 @@ class Remesh(NestedSource):
 
     triangles: TriangleCounts
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """What clusters, and what the other source needs."""
+        return "pyacvd", *super().libraries
+
     def members(self, folder: Path) -> tuple[Member, ...]:
         """One member per triangle count, coarse to fine."""
         original = sole_member(self.mesh, folder)

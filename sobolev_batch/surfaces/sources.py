@@ -37,6 +37,11 @@ class Source(BaseModel, ABC):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions that making its surfaces takes, besides those that this package requires."""
+        return ()
+
     @abstractmethod
     def members(self, folder: Path) -> tuple[Member, ...]:
         """The surfaces of the family, from coarse to fine where that has a meaning.
@@ -151,6 +156,11 @@ class NestedSource(Source):
     """
 
     mesh: SerializeAsAny[Source]
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Those of the other source."""
+        return self.mesh.libraries
 
     @field_validator("mesh", mode="before")
     @classmethod

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from distributed import Client
 
@@ -15,8 +17,13 @@ SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-add
 WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
 
 
-def dask(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
+def dask(*arguments: str, found_first: Path | None = None) -> subprocess.Popen[str]:
+    """Start one; it imports what lies in a folder before what is installed."""
+    environment = {**os.environ}
+    if found_first is not None:
+        environment["PYTHONPATH"] = os.pathsep.join([str(found_first), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "dask", *arguments]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=found_first)
 
 
 def stop(process: subprocess.Popen[str]) -> None:

@@ -123,6 +123,7 @@ def test_the_parts_of_the_manifest_name_each_other() -> None:
     ]
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert f"tcp://{name}-scheduler:8786" in container["args"]
+    assert "--trust-network" in container["args"]
     (secret,) = (words for words in documented("kubectl") if "secret" in words)
     assert container["envFrom"][0]["secretRef"]["name"] == secret[secret.index("generic") + 1]
     assert study["metadata"]["name"] in str(job)

@@ -1,0 +1,116 @@
+"""Metadata documents of a store: only what this package writes is taken from one.
+
+zarr finds codecs, data types and storage transformers by the names in these documents, among them some that
+unpickle what they read, and any that an installed distribution offers. A store may come from somebody else:
+nothing of it is handed to zarr or xarray before its documents were checked here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, TypeGuard
+
+from sobolev_batch.errors import StoreError
+
+# Of the layout that docs/store.md describes.
+SCHEMA_VERSION = 3
+
+Document = dict[str, Any]
+
+# Of one metadata document. That of the root repeats all others, and holds about 1 kB for each.
+MOST_BYTES = 64_000_000
+
+_NODE = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)?")  # a group, or an array in one
+_GROUP_KEYS = {"attributes", "consolidated_metadata", "node_type", "zarr_format"}
+_ARRAY_KEYS = {
+    *("attributes", "chunk_grid", "chunk_key_encoding", "codecs", "data_type", "dimension_names", "fill_value"),
+    *("node_type", "shape", "storage_transformers", "zarr_format"),
+}
+_DATA_TYPES = ("bool", "int64", "float32", "float64", "complex64", "complex128", "string")
+_CODECS = ("bytes", "crc32c", "vlen-utf8")
+# An array without a single chunk takes no room in a store, and any amount of memory once it is read. Arrays with
+# one axis are read when a store is opened, tables with two for a report; all others on demand.
+_MOST_ELEMENTS = {0: 1, 1: 10**7, 2: 10**8}
+_LONGEST_AXIS = 2**40
+
+
+def check_documents(store: str, documents: Mapping[str, Any]) -> None:
+    """Check the metadata documents of a store, by the paths of their nodes; the root's path is empty.
+
+    Raises:
+        StoreError: one has what this package does not write; the message names the node and what was found.
+    """
+    for name, document in documents.items():
+        problem = _problem(name, document)
+        if problem:
+            raise StoreError(f"{store}: the store is not used: {problem}; this program did not write that")
+        if document["node_type"] == "group":
+            prefix = f"{name}/" if name else ""
+            inner = _consolidated(document)
+            check_documents(store, {f"{prefix}{path}": inner[path] for path in inner})
+
+
+def _consolidated(document: Document) -> Document:
+    """What a group repeats of the nodes in it."""
+    found: Document = (document.get("consolidated_metadata") or {}).get("metadata") or {}
+    return found
+
+
+def _problem(name: str, document: Any) -> str:
+    if name and not _NODE.fullmatch(name):
+        return f"a node is named {_shown(name)}"
+    node = name or "the root"
+    if not isinstance(document, dict):
+        return f"the metadata of {node} are no table"
+    kind = document.get("node_type")
+    if document.get("zarr_format") != 3 or kind != ("array" if "/" in name else "group"):
+        return f"{node} is {_shown(kind)} of zarr format {_shown(document.get('zarr_format'))}"
+    unknown = set(document) - (_GROUP_KEYS if kind == "group" else _ARRAY_KEYS)
+    if unknown:
+        return f"{node} has metadata {_shown(min(unknown))}"
+    if not isinstance(document.get("attributes", {}), dict):
+        return f"the attributes of {node} are no table"
+    return _problem_of_group(node, document) if kind == "group" else _problem_of_array(node, document)
+
+
+def _problem_of_group(node: str, document: Document) -> str:
+    consolidated = document.get("consolidated_metadata")
+    if consolidated is None:
+        return ""
+    known = isinstance(consolidated, dict) and consolidated.get("kind") == "inline"
+    if not known or not isinstance(consolidated.get("metadata"), dict):
+        return f"the consolidated metadata of {node} are {_shown(consolidated)}"
+    return ""
+
+
+def _problem_of_array(node: str, document: Document) -> str:
+    if document.get("data_type") not in _DATA_TYPES:
+        return f"the data type of {node} is {_shown(document.get('data_type'))}"
+    codecs = document.get("codecs")
+    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in codecs] if codecs else [None]
+    for codec in names:
+        if codec not in _CODECS:
+            return f"the codec of {node} is {_shown(codec)}"
+    if document.get("storage_transformers"):
+        return f"{node} has the storage transformers {_shown(document['storage_transformers'])}"
+    for key, expected in (("chunk_grid", "regular"), ("chunk_key_encoding", "default")):
+        found = document.get(key)
+        if not isinstance(found, dict) or found.get("name") != expected:
+            return f"the {key} of {node} is {_shown(found)}"
+    shape, chunk = document.get("shape"), (document["chunk_grid"].get("configuration") or {}).get("chunk_shape")
+    if not _is_shape(shape, 0) or not _is_shape(chunk, 1) or len(shape) != len(chunk):
+        return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
+    if math.prod(shape) > _MOST_ELEMENTS.get(len(shape), math.inf) or max(shape, default=0) > _LONGEST_AXIS:
+        return f"{node} has the shape {_shown(shape)}"
+    return ""
+
+
+def _is_shape(shape: Any, least: int) -> TypeGuard[list[int]]:
+    return isinstance(shape, list) and all(type(length) is int and length >= least for length in shape)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

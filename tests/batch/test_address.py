@@ -1,0 +1,67 @@
+"""Addresses of schedulers: malformed ones, and networks that would have to be trusted."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+from typing import Any
+
+import pytest
+
+from sobolev_batch import AddressError, ClusterError, InputError
+from sobolev_batch.batch.address import Address
+from sobolev_batch.batch.cluster import remote_client
+
+MALFORMED = ["", "tcp://", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
+MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "tcp://a b:1", "tcp://me@host:1", "a://b://c:1"]
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed(name: str) -> None:
+    with pytest.raises(AddressError, match="is not the address of a scheduler"), remote_client(name, True):
+        pass
+
+
+def test_parts() -> None:
+    assert Address.of("host:8786") == Address("host:8786", "tcp", "host", 8786)
+    assert Address.of("tls://[::1]:1") == Address("tls://[::1]:1", "tls", "::1", 1)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("tls://example.invalid:1", "wss://192.0.2.1:1", "inproc://192.0.2.1/1/2", "tcp://127.0.0.1:1"),
+        *("127.9.9.9:1", "tcp://[::1]:1", "ws://localhost:1", "tcp://[::ffff:127.0.0.1]:1"),
+    ],
+)
+def test_private(name: str) -> None:
+    Address.of(name).require_private("the scheduler")
+
+
+@pytest.mark.parametrize("name", ["tcp://192.0.2.1:1", "192.0.2.1:1", "ws://[2001:db8::1]:1", "tcp://0.0.0.0:1"])
+def test_open_to_others(name: str) -> None:
+    with pytest.raises(AddressError, match="is neither encrypted nor on loopback") as caught, remote_client(name):
+        pass
+    assert isinstance(caught.value, ClusterError)
+    assert isinstance(caught.value, InputError)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+@pytest.mark.parametrize(("places", "private"), [(["127.0.0.1", "::1"], True), (["127.0.0.1", "192.0.2.1"], False)])
+def test_all_that_a_name_stands_for_counts(places: list[str], private: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(host: str, port: int, **options: Any) -> list[tuple[Any, ...]]:
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (place, port)) for place in places]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    address = Address.of("tcp://scheduler:8786")
+    if private:
+        address.require_private("the scheduler")
+    else:
+        with pytest.raises(AddressError, match=r"\(192\.0\.2\.1\)"):
+            address.require_private("the scheduler")
+
+
+def test_a_host_that_is_not_there_is_no_wrong_input() -> None:
+    with pytest.raises(ClusterError, match=r"there is no host 'example\.invalid'") as caught:
+        Address.of("tcp://example.invalid:1").require_private("the scheduler")
+    assert not isinstance(caught.value, InputError)

@@ -1,0 +1,96 @@
+"""Nothing that is read is unpickled, evaluated or imported: what could do so does not occur in the sources."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import sobolev_batch
+from sobolev_batch import Study, StudyError
+from tests.batch.conftest import small_table
+
+PACKAGE = Path(sobolev_batch.__file__).parent
+FORBIDDEN_MODULES = {"dill", "joblib", "marshal", "runpy", "shelve", "subprocess", "yaml"}
+FORBIDDEN = {
+    *("eval", "exec", "compile", "__import__", "import_module", "system", "popen", "Unpickler"),
+    *("read_pickle", "load_source", "spawnl", "spawnv", "execv", "execvp"),
+}
+# pickle.dumps sends a plugin to workers; what arrives there Dask unpickles.
+ALLOWED_OF_PICKLE = {"dumps"}
+# Of CUDA's libraries, by names that stand in that module.
+ALLOWED_IMPORTS = {("spectral/cuda.py", "import_module")}
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[str, str, ast.Call]]:
+    """What is called: the name before the last dot, the name after it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            if isinstance(node.func, ast.Attribute):
+                value = node.func.value
+                yield (value.id if isinstance(value, ast.Name) else ""), node.func.attr, node
+            elif isinstance(node.func, ast.Name):
+                yield "", node.func.id, node
+
+
+def offences(source: str, name: str = "") -> list[str]:
+    """What a source has that could run what it reads."""
+    tree = ast.parse(source)
+    found = []
+    for node in ast.walk(tree):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [node.module or ""]
+            if node.module in ("pickle", "cloudpickle"):
+                found.append(f"from {node.module} import")
+        found += [top for top in (name.split(".")[0] for name in names) if top in FORBIDDEN_MODULES]
+    for module, attribute, call in calls(tree):
+        constant = bool(call.args) and isinstance(call.args[0], ast.Constant)
+        if module == "re" and attribute == "compile":
+            continue
+        if attribute == "import_module" and constant:
+            continue
+        if attribute in FORBIDDEN and (name, attribute) not in ALLOWED_IMPORTS:
+            found.append(attribute)
+        if module in ("pickle", "cloudpickle") and attribute not in ALLOWED_OF_PICKLE:
+            found.append(f"{module}.{attribute}")
+        for keyword in call.keywords:
+            true = not (isinstance(keyword.value, ast.Constant) and not keyword.value.value)
+            if keyword.arg in ("allow_pickle", "shell") and true:
+                found.append(f"{keyword.arg}=")
+        if (module, attribute) == ("np", "load") and "allow_pickle" not in {word.arg for word in call.keywords}:
+            found.append("np.load without allow_pickle=False")
+    return found
+
+
+def test_no_source_can_run_what_it_reads() -> None:
+    paths = sorted(PACKAGE.rglob("*.py"))
+    assert len(paths) > 50
+    found = {path: offences(path.read_text(encoding="utf-8"), path.relative_to(PACKAGE).as_posix()) for path in paths}
+    assert {path: offence for path, offence in found.items() if offence} == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        *("import pickle\npickle.loads(b'')", "from pickle import loads", "import pickle\npickle.Unpickler(f)"),
+        *("eval('1')", "exec(text)", "__import__(name)", "importlib.import_module(name)", "import_module(name)"),
+        *("np.load(f, allow_pickle=True)", "np.load(f, allow_pickle=flag)", "np.load(f)", "import yaml"),
+        *("os.system('ls')", "import subprocess", "run(line, shell=True)", "from dill import loads"),
+    ],
+)
+def test_what_is_looked_for_is_found(source: str) -> None:
+    assert offences(source)
+
+
+@pytest.mark.parametrize(
+    "name", ["os:system", "os.system", "sobolev_batch.surfaces.files:Files", "../files", "builtins"]
+)
+def test_sources_are_looked_up_among_entry_points_alone(name: str) -> None:
+    with pytest.raises(StudyError, match="no source is named"):
+        Study.from_table(small_table(reference={"source": name}))
+    nested = {"name": "a", "source": "decimate", "triangles": [4], "mesh": {"source": name}}
+    with pytest.raises(StudyError, match="no source is named"):
+        Study.from_table(small_table(family=[nested]))
