@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from sobolev_batch.batch.store import (
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity
+
+_log = logging.getLogger(__name__)
 
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
@@ -67,6 +70,10 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
     store.location.sweep()
     with store.location.access("written"):
         if _lattice(store) != _lattice_entry(plan):
+            done = sum(record is not None for record in store.records())
+            _log.warning(
+                "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
+            )
             _replace_everything(store, plan)
         _extend(store, plan)
         _mend_axes(store, plan)
