@@ -13,7 +13,7 @@ icosphere: $(READY)  ## run the paper's study
 	$(BIN)/sobolev-batch run workflows/icosphere.toml
 
 test: $(READY)  ## the tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage
