@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.norms import distance, inner_product, norm
+    from sobolev_batch.spectral.witness import witness
     from sobolev_batch.surfaces.icosphere import icosphere
     from sobolev_batch.surfaces.mesh import Mesh
     from sobolev_batch.surfaces.readers import read_mesh
@@ -76,6 +77,7 @@ __all__ = [
     "run",
     "submit",
     "verify",
+    "witness",
 ]
 
 
@@ -113,6 +115,7 @@ _MODULES = {
     "run": "batch.run",
     "submit": "batch.submission",
     "verify": "batch.verification",
+    "witness": "spectral.witness",
 }
 
 

@@ -17,7 +17,15 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.operands import check_surface, field_of, over_orders, pair_of, quality_of, read_blocks
+from sobolev_batch.spectral.operands import (
+    check_surface,
+    field_of,
+    over_orders,
+    pair_of,
+    quality_of,
+    read_blocks,
+    shells_of,
+)
 from sobolev_batch.spectral.pursuit import pursue
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
@@ -66,7 +74,7 @@ def norm(
         return _dataset("norm", order, _closed_form(values, values**2))
     field = field_of(a, lattice, orders)
     known = Lattice.of(field)
-    return _dataset("norm", order, _assessed(_shells_of(field, None, known), known, orders, [field]))
+    return _dataset("norm", order, _assessed(shells_of(field, None, known), known, orders, [field]))
 
 
 def inner_product(
@@ -132,7 +140,7 @@ def distance(
         return _dataset("distance", order, _closed_form(values, squares))
     first, second = pair_of(a, b, lattice, orders)
     known = Lattice.of(first)
-    return _dataset("distance", order, _assessed(_shells_of(first, second, known), known, orders, [first, second]))
+    return _dataset("distance", order, _assessed(shells_of(first, second, known), known, orders, [first, second]))
 
 
 def _accuracy(rtol: float, memory: float | None) -> Accuracy:
@@ -162,14 +170,6 @@ def _pursued(
         tolerance=[setting.rule_tolerance for setting in settings],
         points=[field.points for field in found.fields],
     )
-
-
-def _shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
-    """Shell sums of |a|², or of |a - b|²."""
-    sums = np.zeros(lattice.shell_count)
-    for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
-        sums += shell_sums(values - others[0] if others else values, None, lattice, block)
-    return sums
 
 
 def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> Assessed:

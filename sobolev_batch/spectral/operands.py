@@ -11,7 +11,7 @@ from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.shells import Complexes, Orders, Reals
+from sobolev_batch.spectral.shells import Complexes, Orders, Reals, shell_sums
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
@@ -19,7 +19,7 @@ from sobolev_batch.surfaces.sphere import Sphere
 Operand = Surface | xr.DataArray
 
 # Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
-_BLOCK_SAMPLES = 1 << 22
+BLOCK_SAMPLES = 1 << 22
 
 
 def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
@@ -76,11 +76,21 @@ def quality_of(field: xr.DataArray) -> Quality | None:
     return Quality.from_json(text) if text else None
 
 
-def read_blocks(lattice: Lattice, *fields: xr.DataArray) -> Iterator[tuple[Block, list[Complexes]]]:
+def read_blocks(
+    lattice: Lattice, *fields: xr.DataArray, largest: int = BLOCK_SAMPLES
+) -> Iterator[tuple[Block, list[Complexes]]]:
     """The values of fields, one block of their half lattice after the other, so that they need not fit into memory."""
-    for block in lattice.split(_BLOCK_SAMPLES):
+    for block in lattice.split(largest):
         places = dict(zip(AXES, lattice.place(block), strict=True))
         yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
+
+
+def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
+    """Shell sums of |a|², or of |a - b|²."""
+    sums = np.zeros(lattice.shell_count)
+    for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
+        sums += shell_sums(values - others[0] if others else values, None, lattice, block)
+    return sums
 
 
 def over_orders(order: Orders, values: dict[str, Reals]) -> xr.Dataset:
