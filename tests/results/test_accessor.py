@@ -113,7 +113,7 @@ def test_refusals(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
     with pytest.raises(sb.InputError, match="no fields along mesh"):
         stack.isel(mesh=slice(0)).sobolev.norm(-2)
     with pytest.raises(sb.LatticeError, match="needs the coordinates"):
-        print(xr.DataArray(np.zeros(3)).sobolev.lattice)
+        repr(xr.DataArray(np.zeros(3)).sobolev.lattice)
     with pytest.raises(sb.LatticeError, match="different lattices"):
         a.sobolev.distance(sb.fourier_transform(sb.Sphere(), sb.Lattice(4.0, 30)), -2)
     # Without labels, the dimension alone.
