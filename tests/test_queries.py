@@ -39,12 +39,13 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     assert found["rates"].index.tolist() == levels
     assert found["at_level"]["mesh"].values.tolist() == levels[3:]
     assert found["nearest"].is_monotonic_increasing
-    field = sb.fourier_transform(sb.icosphere(3), study.lattice)
-    reference = sb.fourier_transform(sb.Sphere(), study.lattice)
+    assert found["part"].shape == (4, 4)
+    lattice = found["fields"].sobolev.lattice
+    field, reference = (sb.fourier_transform(surface, lattice) for surface in (sb.icosphere(3), sb.Sphere()))
     expected = sb.distance(field, reference, [-3.5, -2.25])["distance"].values
     assert found["another"]["distance"].values == pytest.approx(expected, rel=1e-6)
     assert found["norms"]["icosphere/1"] == pytest.approx(
-        sb.norm(sb.icosphere(1), -4, lattice=study.lattice)["norm"].item(), rel=1e-6
+        sb.norm(sb.icosphere(1), -4, lattice=lattice)["norm"].item(), rel=1e-6
     )
     assert set(found["pair"]) == {levels[0], levels[3]}
     assert found["along_axis"].loc[0.0].real == pytest.approx(sb.icosphere(3).area, rel=1e-6)
