@@ -35,10 +35,14 @@ if TYPE_CHECKING:
         StoreError,
         StudyError,
     )
+    from sobolev_batch.results.accessor import SobolevAccessor
     from sobolev_batch.results.opening import open_store
+    from sobolev_batch.spectral.bands import spectrum
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.norms import distance, inner_product, norm
+    from sobolev_batch.spectral.proportion import proportion
+    from sobolev_batch.spectral.witness import witness
     from sobolev_batch.surfaces.icosphere import icosphere
     from sobolev_batch.surfaces.mesh import Mesh
     from sobolev_batch.surfaces.readers import read_mesh
@@ -59,6 +63,7 @@ __all__ = [
     "MeshError",
     "OrderError",
     "Similarity",
+    "SobolevAccessor",
     "SobolevBatchError",
     "Sphere",
     "StoreError",
@@ -73,11 +78,14 @@ __all__ = [
     "inner_product",
     "norm",
     "open_store",
+    "proportion",
     "read_mesh",
     "release",
     "run",
+    "spectrum",
     "submit",
     "verify",
+    "witness",
 ]
 
 
@@ -97,6 +105,7 @@ _MODULES = {
     "MeshError": "errors",
     "OrderError": "errors",
     "Similarity": "surfaces.similarity",
+    "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
     "Sphere": "surfaces.sphere",
     "StoreError": "errors",
@@ -111,17 +120,25 @@ _MODULES = {
     "inner_product": "spectral.norms",
     "norm": "spectral.norms",
     "open_store": "results.opening",
+    "proportion": "spectral.proportion",
     "read_mesh": "surfaces.readers",
     "release": "batch.release",
     "run": "batch.run",
+    "spectrum": "spectral.bands",
     "submit": "batch.submission",
     "verify": "batch.verification",
+    "witness": "spectral.witness",
 }
+# What makes or opens fields registers their accessor `field.sobolev` with xarray, which would be too much
+# for the import of the package.
+_FIELD_MAKERS = ("fourier_transform", "open_store")
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _FIELD_MAKERS:
+        import_module(f"{__name__}.{_MODULES['SobolevAccessor']}")
     value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
