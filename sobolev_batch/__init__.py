@@ -38,11 +38,15 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.norms import distance, inner_product, norm
+    from sobolev_batch.surfaces.ellipsoid import Ellipsoid
     from sobolev_batch.surfaces.icosphere import icosphere
+    from sobolev_batch.surfaces.interval import Interval
     from sobolev_batch.surfaces.mesh import Mesh
+    from sobolev_batch.surfaces.parametrised import ParametrisedSurface
     from sobolev_batch.surfaces.readers import read_mesh
     from sobolev_batch.surfaces.similarity import Similarity
     from sobolev_batch.surfaces.sphere import Sphere
+    from sobolev_batch.surfaces.torus import Torus
 
 __all__ = [
     "AccuracyError",
@@ -50,12 +54,15 @@ __all__ = [
     "ClaimError",
     "ClusterError",
     "DamageError",
+    "Ellipsoid",
     "InputError",
+    "Interval",
     "Lattice",
     "LatticeError",
     "Mesh",
     "MeshError",
     "OrderError",
+    "ParametrisedSurface",
     "Similarity",
     "SobolevBatchError",
     "Sphere",
@@ -64,6 +71,7 @@ __all__ = [
     "StudyError",
     "Submission",
     "Summary",
+    "Torus",
     "Verification",
     "distance",
     "fourier_transform",
@@ -87,12 +95,15 @@ _MODULES = {
     "ClaimError": "errors",
     "ClusterError": "errors",
     "DamageError": "errors",
+    "Ellipsoid": "surfaces.ellipsoid",
     "InputError": "errors",
+    "Interval": "surfaces.interval",
     "Lattice": "spectral.lattice",
     "LatticeError": "errors",
     "Mesh": "surfaces.mesh",
     "MeshError": "errors",
     "OrderError": "errors",
+    "ParametrisedSurface": "surfaces.parametrised",
     "Similarity": "surfaces.similarity",
     "SobolevBatchError": "errors",
     "Sphere": "surfaces.sphere",
@@ -101,6 +112,7 @@ _MODULES = {
     "StudyError": "errors",
     "Submission": "batch.submission",
     "Summary": "batch.run",
+    "Torus": "surfaces.torus",
     "Verification": "batch.verification",
     "distance": "spectral.norms",
     "fourier_transform": "spectral.fields",

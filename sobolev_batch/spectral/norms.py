@@ -24,6 +24,7 @@ from sobolev_batch.spectral.shells import Complexes, Orders, Reals, check_orders
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 # Relative accuracy of the closed forms of spheres.
@@ -242,7 +243,7 @@ def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[
 
 
 def _check_surface(a: object) -> None:
-    if not isinstance(a, Mesh | Sphere):
+    if not isinstance(a, Mesh | Sphere | Smooth):
         raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
 
 

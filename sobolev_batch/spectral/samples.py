@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes
 from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
+from sobolev_batch.spectral.resolution import exact_values
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
@@ -38,6 +40,8 @@ class Sample:
         """The sample of a surface."""
         if isinstance(surface, Sphere):
             return cls(draws, sphere_transform(surface, draws.frequencies))
+        if isinstance(surface, Smooth):
+            return cls(draws, exact_values(surface, draws.frequencies))
         return cls(draws, exact_transform(surface, draws.frequencies))
 
 
@@ -76,7 +80,7 @@ def probe_block(
 
 def needs_probe(surface: Surface, settings: Transform) -> bool:
     """Whether a field computed with these settings can have an error worth the name."""
-    return isinstance(surface, Mesh) or settings.precision == "complex64"
+    return not isinstance(surface, Sphere) or settings.precision == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:
