@@ -84,9 +84,12 @@ class Interval:
 
 @lru_cache(maxsize=64)
 def _gauss(count: int) -> tuple[Reals, Reals]:
-    nodes, weights = roots_legendre(count)
-    # Of a thousand nodes the weights are all too large by the same 1e-13.
-    return np.asarray(nodes), np.asarray(weights * (2 / weights.sum()))
+    nodes = np.asarray(roots_legendre(count)[0], dtype=np.float64)
+    # The weights that come with them lack four digits near the ends, which derivatives there would show.
+    before, current = np.ones(count), nodes.copy()
+    for degree in range(2, count + 1):
+        before, current = current, ((2 * degree - 1) * nodes * current - (degree - 1) * before) / degree
+    return nodes, 2 * (1 - nodes) * (1 + nodes) / (count * (before - nodes * current)) ** 2
 
 
 @lru_cache(maxsize=4)

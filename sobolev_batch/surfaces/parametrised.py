@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.interval import Interval
@@ -16,6 +16,8 @@ from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import is_finite_number
 
 Reals = NDArray[np.float64]
+# x, y and z at each of some parameters; numbers stand for constant ones.
+Vectors = Reals | Sequence[Reals | float]
 
 # How far the ends of a periodic parameter may be apart, relative to the surface's extent.
 _CLOSED = 1e-9
@@ -51,10 +53,10 @@ class ParametrisedSurface(Smooth):
             ends are apart; derivatives that are not those of the positions; no area.
     """
 
-    position: Callable[[Reals, Reals], Sequence[ArrayLike]]
+    position: Callable[[Reals, Reals], Vectors]
     u: Interval
     v: Interval
-    derivatives: Callable[[Reals, Reals], tuple[Sequence[ArrayLike], Sequence[ArrayLike]]] | None = None
+    derivatives: Callable[[Reals, Reals], tuple[Vectors, Vectors]] | None = None
     scale: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

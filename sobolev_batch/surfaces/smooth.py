@@ -161,7 +161,7 @@ class Smooth(ABC):
         best = np.unravel_index(found.reshape(count, -1).argmax(axis=1), (_GRID, _GRID))
         centers = [grid[index] for grid, index in zip(grids, best, strict=True)]
         widths = [interval.length / (_GRID - 1) for interval in self.intervals]
-        greatest = found.reshape(count, -1).max(axis=1)
+        greatest: Reals = found.reshape(count, -1).max(axis=1)
         steps = np.linspace(-1, 1, _ZOOM_GRID)
         for _ in range(_ZOOMS):
             lines = [
