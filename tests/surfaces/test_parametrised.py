@@ -116,8 +116,9 @@ def test_positions_must_be_three_arrays(position: Any, found: str) -> None:
 
 
 def test_positions_must_be_finite() -> None:
+    side = Interval(0.0, 1.0)
     with pytest.raises(InputError, match="position is not finite everywhere"):
-        ParametrisedSurface(lambda u, v: (np.where(u < 0.5, u, np.nan), v, 0.0), *2 * [Interval(0.0, 1.0)])
+        ParametrisedSurface(lambda u, v: (np.where(u < 0.5, u, np.nan), v, 0.0), side, side)
     with np.errstate(divide="ignore"), pytest.raises(InputError, match=r"not finite everywhere|not smooth"):
         ParametrisedSurface(lambda u, v: (1 / u, v, 0.0), Interval(0.0, 1.0), Interval(0.0, 1.0))
 
