@@ -26,6 +26,8 @@ Complexes = NDArray[np.complex128]
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 # The estimate comes from few draws: it is raised by this over the root of their number.
 _CAUTION = 3.0
+# Ranges of |ξ| that an error of the same size everywhere is told by.
+_BANDS = 8
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,13 @@ def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact
     sums = draws.scales * np.abs(computed - exact) ** 2
     shells = np.sum(draws.indices**2, axis=1)
     return Probe(tuple(shells.tolist()), tuple(sums.tolist()))
+
+
+def even_probe(lattice: Lattice, error: float) -> Probe:
+    """The probe of a field that errs by as much at every frequency, a little raised towards the lower ones."""
+    masses = _shell_masses(lattice)
+    edges = np.unique((np.linspace(0, 1, _BANDS + 1)[:-1] ** 2 * len(masses)).astype(np.int64))
+    return Probe(tuple(edges.tolist()), tuple((error**2 * np.add.reduceat(masses, edges)).tolist()))
 
 
 def join(probes: Sequence[Probe]) -> Probe:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes
-from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
-from sobolev_batch.spectral.resolution import exact_values
+from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, even_probe, join, measure
+from sobolev_batch.spectral.resolution import exact_values, resolve
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.spectral.triangles import exact_transform
@@ -69,13 +69,19 @@ def probe_block(
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
-    Closed forms in double precision are exact, and have an empty probe.
+    Closed forms in double precision are exact, and have an empty probe. That of a parametrised surface, whose
+    exact values come from twice its nodes, also carries how much doubling them changed when they were chosen.
     """
     if not needs_probe(surface, settings):
         return Probe()
     draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice)).within(block)
     sample = Sample.of(surface, draws)
-    return measure(draws, values[draws.places(block)], sample.exact)
+    probe = measure(draws, values[draws.places(block)], sample.exact)
+    # Once for the whole field.
+    if isinstance(surface, Smooth) and block.start == lattice.half.start:
+        change = resolve(surface, lattice.highest_frequency, settings.rule_tolerance).change
+        return join([probe, even_probe(lattice, change * surface.area)])
+    return probe
 
 
 def needs_probe(surface: Surface, settings: Transform) -> bool:

@@ -15,6 +15,7 @@ from sobolev_batch import (
     Interval,
     Lattice,
     LatticeError,
+    Mesh,
     ParametrisedSurface,
     Similarity,
     Sphere,
@@ -252,6 +253,23 @@ def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (reported < 30 * truth).all()
 
 
+def test_what_doubling_the_nodes_changes_is_reported() -> None:
+    side = Interval(-0.9, 1.0)
+    surface = ParametrisedSurface(roof, side, side, roof_derivatives)
+    corners = [[u, v, -abs(u)] for u in (-0.9, 0.0, 1.0) for v in (-0.9, 1.0)]
+    mesh = Mesh(corners, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    assert mesh.area == pytest.approx(surface.area, rel=1e-12)
+    orders = [-2.0, -5.0]
+    exact = fourier_transform(mesh, LATTICE, 1e-13, threads=1)
+    field = fourier_transform(surface, LATTICE, 1e-4, threads=1)
+    truth = distance(field, exact, orders)["distance"].values
+    reported = norm(field, orders)["discretisation"].values
+    assert (truth <= reported).all()
+    assert (truth > 1e-6).all()
+    change = resolve(surface, LATTICE.highest_frequency, 1e-4).change
+    assert (reported > change * surface.area).all()
+
+
 @pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
 def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
     found = Quality.from_json(fourier_transform(surface, LATTICE, threads=1).attrs["quality"])
@@ -259,7 +277,7 @@ def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
     assert found.area == surface.area
     assert np.array(found.highest) == pytest.approx((DIRECTIONS @ points).max(axis=1), abs=1e-3)
     assert np.array(found.lowest) == pytest.approx((DIRECTIONS @ points).min(axis=1), abs=1e-3)
-    assert len(found.probe.shells) == 32
+    assert len(found.probe.shells) == 32 + 8
 
 
 @pytest.mark.parametrize("rtol", [1e-2, 1e-5])
