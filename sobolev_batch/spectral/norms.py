@@ -238,13 +238,18 @@ def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[
         return a
     _check_surface(a)
     if lattice is None:
-        raise InputError("a mesh needs a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=...")
+        raise InputError(
+            "only spheres do without a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
+        )
     return fourier_transform(a, lattice, orders=orders)
 
 
 def _check_surface(a: object) -> None:
     if not isinstance(a, Mesh | Sphere | Smooth):
-        raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
+        raise InputError(
+            "expected a Mesh, a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a Fourier "
+            f"field, found {type(a).__name__}"
+        )
 
 
 def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:
