@@ -41,10 +41,10 @@ class ParametrisedSurface(Smooth):
             in the user's unit of length.
         u: what u runs over.
         v: likewise.
-        derivatives: takes the same to x_u and x_v, three arrays or numbers each. Without it they are
-            those of the interpolant through the nodes, which costs few digits: a rounding error times
-            the number of nodes. With it, x_u may grow without bound towards a pole, as long as |x_u × x_v|
-            stays smooth there: where u is the cosine of the polar angle, for example.
+        derivatives: takes the same to x_u and x_v, three arrays or numbers each. Without it they are those
+            of the interpolant through the nodes, which costs no more than 1e-13 of the area. With it, x_u
+            may grow without bound towards a pole, as long as |x_u × x_v| stays smooth there: where u is
+            the cosine of the polar angle, for example.
         scale: of the similarity x -> scale * (x - origin) that is applied to positions.
         origin: of the same, in the unit of ``position``.
 

@@ -26,12 +26,14 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral import quadrature, resolution
+from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.budget import DIRECTIONS
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.resolution import Resolution, direct_transform, exact_values, resolve
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.smooth import Smooth
+from tests.spectral.fake_device import Device
 from tests.spectral.smooth_oracles import ellipsoid_value_along_c, spheroid_value, torus_value
 from tests.surfaces.smooth_shapes import (
     HALF_TURN,
@@ -320,3 +322,41 @@ def test_nodes_of_a_surface_are_its_points() -> None:
     assert points.shape == (3, 15 * 31)
     assert np.linalg.norm(points, axis=0) == pytest.approx(np.ones(15 * 31), rel=1e-14)
     assert sum(weights.sum() for _, weights in parts) == pytest.approx(4 * math.pi, rel=1e-13)
+
+
+def test_a_gpu_gets_the_same_nodes() -> None:
+    device = Device()
+    for surface in SMOOTH:
+        found, expected = (
+            transform_block(surface, LATTICE, LATTICE.half, Transform(1e-13), backend=backend, batch=1 << 13)
+            for backend in (device.backend(), CPU)
+        )
+        assert (found.backend, expected.backend) == ("cufinufft", "finufft")
+        assert found.points == expected.points > 1 << 12
+        assert np.abs(found.values - expected.values).max() < 1e-12 * surface.area
+
+
+def test_little_memory_makes_parts_and_not_other_numbers() -> None:
+    surface, lattice = SMOOTH[1], Lattice(4.0, 64)
+    whole, parts = (
+        transform_block(surface, lattice, lattice.half, Transform(1e-9), memory=memory) for memory in (None, 1.5e7)
+    )
+    assert whole.points == parts.points
+    assert 0 < np.abs(whole.values - parts.values).max() < 1e-8 * surface.area
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reported_errors_hold_true_ones(seed: int) -> None:
+    rng = np.random.default_rng([11, seed])
+    axes, radii = rng.uniform(0.3, 0.9, 3), np.sort(rng.uniform(0.1, 0.5, 2))
+    torus = Torus(float(radii[1]) + 0.2, float(radii[0]), (0.0, 0.0, float(rng.uniform(-0.3, 0.3))))
+    ellipsoid = Ellipsoid((float(axes[0]), float(axes[1]), float(axes[2])))
+    mesh = torus.mesh(int(rng.integers(8, 40)), int(rng.integers(5, 20)))
+    orders = [-5.0, -8.0]
+    for other in (ellipsoid, mesh):
+        truth = distance(torus, other, orders, rtol=1e-5)
+        found = distance(torus, other, orders, rtol=float(10 ** rng.uniform(-3.5, -1)))
+        assert truth["within"].all()
+        assert found["within"].all()
+        error = np.abs(found["distance"].values - truth["distance"].values)
+        assert (error <= found["error"].values + truth["error"].values).all()
