@@ -239,7 +239,8 @@ def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[
     _check_surface(a)
     if lattice is None:
         raise InputError(
-            "only spheres do without a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
+            f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
+            "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
         )
     return fourier_transform(a, lattice, orders=orders)
 

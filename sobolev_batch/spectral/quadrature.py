@@ -32,6 +32,8 @@ _Corners = tuple[Array, Array, Array]
 
 # Triangles per slice: keeps the temporaries of a slice with a mid-sized rule near 50 MB.
 _SLICE = 1 << 17
+# Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
+_NODES = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,7 @@ def _smooth_batches(
     counts = resolve(surface, highest_frequency, tolerance).counts
     made: list[WeightedPoints] = []
     gathered = 0
-    for coordinates, weights in surface.nodes(counts, min(capacity, _SLICE)):
+    for coordinates, weights in surface.nodes(counts, min(capacity, _NODES)):
         if gathered + len(weights) > capacity:
             yield _join(made)
             made, gathered = [], 0

@@ -42,9 +42,9 @@ class ParametrisedSurface(Smooth):
         u: what u runs over.
         v: likewise.
         derivatives: takes the same to x_u and x_v, three arrays or numbers each. Without it they are those
-            of the interpolant through the nodes, which costs no more than 1e-13 of the area. With it, x_u
-            may grow without bound towards a pole, as long as |x_u × x_v| stays smooth there: where u is
-            the cosine of the polar angle, for example.
+            of the interpolant through the nodes, which costs no more than 1e-13 of the area, and 120 bytes
+            of memory for each of the nodes. With it, x_u may grow without bound towards a pole, as long as
+            |x_u × x_v| stays smooth there: where u is the cosine of the polar angle, for example.
         scale: of the similarity x -> scale * (x - origin) that is applied to positions.
         origin: of the same, in the unit of ``position``.
 
