@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.budget import DIRECTIONS
 from sobolev_batch.spectral.phases import cosine_and_sine
-from sobolev_batch.surfaces.smooth import MOST_NODES, Counts, Smooth, doubled
+from sobolev_batch.surfaces.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -67,8 +67,8 @@ def resolve(surface: Smooth, highest_frequency: float, tolerance: float) -> Reso
         tolerance: largest change when the nodes are doubled, relative to the area, held between 1e-13 and 1e-4.
 
     Raises:
-        InputError: more than 4,194,304 nodes would be needed: the parametrisation is not smooth, or the surface
-            large or thin beside the wavelength.
+        InputError: more than 4,194,304 nodes would be needed, or 2,048 along a parameter that is not
+            periodic: the parametrisation is not smooth, or the surface large or thin beside the wavelength.
     """
     allowed = min(max(tolerance, FINEST_CHANGE), COARSEST_CHANGE)
     found = _refined(surface, highest_frequency, allowed, MOST_NODES)
@@ -78,9 +78,10 @@ def resolve(surface: Smooth, highest_frequency: float, tolerance: float) -> Reso
             so_far = f"with {found.counts[0]} x {found.counts[1]} it still changes by {found.change:.2g} of the area"
         raise InputError(
             f"the transform of the parametrised surface up to |xi| = {highest_frequency:.4g} is not settled to "
-            f"{allowed:.2g} of its area with {MOST_NODES} nodes, the most that are tried; {so_far}. Its "
-            "parametrisation is not smooth (a kink, a corner, an unmarked period), or the surface is large or thin "
-            "beside the shortest wavelength; lower xi_max, or allow a larger eps"
+            f"{allowed:.2g} of its area with {MOST_NODES} nodes, the most that are tried ({MOST_GAUSS_NODES} along a "
+            f"parameter that is not periodic); {so_far}. Its parametrisation is not smooth (a kink, a corner, an "
+            "unmarked period), or the surface is large or thin beside the shortest wavelength; lower xi_max, or allow "
+            "a larger eps"
         )
     return found
 
@@ -128,7 +129,7 @@ def _exact_counts(surface: Smooth, highest: float) -> Counts:
 def _refined(surface: Smooth, highest: float, allowed: float, most: int) -> Resolution:
     """Nodes that are doubled along whichever parameter needs it, until the change is small or there are too many."""
     counts = _first_counts(surface, highest)
-    if math.prod(counts) > most:
+    if _too_many(surface, counts, most):
         return Resolution(counts, math.inf, False)
     frequencies = _probe_frequencies(highest)
     values = direct_transform(surface, counts, frequencies)
@@ -140,10 +141,15 @@ def _refined(surface: Smooth, highest: float, allowed: float, most: int) -> Reso
         short = [change > allowed / 2 for change in changes]
         wanted = doubled(counts)
         larger = (wanted[0] if short[0] else counts[0], wanted[1] if short[1] else counts[1])
-        if math.prod(larger) > most:
+        if _too_many(surface, larger, most):
             return Resolution(counts, sum(changes), False)
         counts = larger
         values = finer[short.index(True)] if sum(short) == 1 else direct_transform(surface, counts, frequencies)
+
+
+def _too_many(surface: Smooth, counts: Counts, most: int) -> bool:
+    along = zip(surface.intervals, counts, strict=True)
+    return math.prod(counts) > most or any(n > MOST_GAUSS_NODES and not interval.periodic for interval, n in along)
 
 
 def _finer(counts: Counts) -> Iterator[Counts]:

@@ -23,6 +23,8 @@ Counts = tuple[int, int]
 
 # Nodes of any one rule: about 1,000 by 4,000.
 MOST_NODES = 1 << 22
+# Along a parameter that is not periodic: making a Gauss rule takes the square of its nodes, and so do derivatives.
+MOST_GAUSS_NODES = 1 << 11
 # Nodes that are made at a time, where the area element is known at each.
 _BATCH = 1 << 16
 # An area that changes by no more, relatively, when the nodes are doubled is settled; one that still

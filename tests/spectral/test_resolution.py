@@ -360,3 +360,10 @@ def test_reported_errors_hold_true_ones(seed: int) -> None:
         assert found["within"].all()
         error = np.abs(found["distance"].values - truth["distance"].values)
         assert (error <= found["error"].values + truth["error"].values).all()
+
+
+def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
+    fewer, more = (resolve(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9).counts[0] for thickness in (0.04, 0.01))
+    assert 2 * fewer < more < 8 * fewer
+    with pytest.raises(InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"):
+        resolve(Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)
