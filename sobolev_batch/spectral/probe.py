@@ -3,7 +3,8 @@
 The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the
 squared norm of a field's error without bias (importance sampling). The exact side is the closed
 form of the triangles, which shares neither the quadrature nor the NUFFT with the computed one, so
-every field is checked end to end.
+every field is checked end to end. Of a parametrised surface it is a sum over twice the nodes, without
+the NUFFT.
 """
 
 from __future__ import annotations
