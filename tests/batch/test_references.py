@@ -220,3 +220,10 @@ def test_ellipsoids_and_their_levels_are_the_library_s() -> None:
     assert [row.label for row in plan.rows] == [f"ico/{level}" for level in range(5)] + ["reference"]
     assert plan.rows[-1].member.load() == Ellipsoid((2.0, 1.4, 0.8))
     assert len({row.key for row in plan.rows}) == 6
+
+
+def test_the_study_of_a_torus_that_is_ready_to_run() -> None:
+    study = Study.from_toml(Path(__file__).parents[2] / "workflows" / "torus.toml")
+    plan = make_plan(study)
+    assert [row.label for row in plan.rows] == [*(f"grid/{level}" for level in range(6)), "reference"]
+    assert plan.rows[-1].member.load() == Torus(1.0, 0.4)
