@@ -43,11 +43,15 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.norms import distance, inner_product, norm
     from sobolev_batch.spectral.proportion import proportion
     from sobolev_batch.spectral.witness import witness
+    from sobolev_batch.surfaces.ellipsoid import Ellipsoid
     from sobolev_batch.surfaces.icosphere import icosphere
+    from sobolev_batch.surfaces.interval import Interval
     from sobolev_batch.surfaces.mesh import Mesh
+    from sobolev_batch.surfaces.parametrised import ParametrisedSurface
     from sobolev_batch.surfaces.readers import read_mesh
     from sobolev_batch.surfaces.similarity import Similarity
     from sobolev_batch.surfaces.sphere import Sphere
+    from sobolev_batch.surfaces.torus import Torus
 
 __all__ = [
     "AccuracyError",
@@ -56,12 +60,15 @@ __all__ = [
     "ClaimError",
     "ClusterError",
     "DamageError",
+    "Ellipsoid",
     "InputError",
+    "Interval",
     "Lattice",
     "LatticeError",
     "Mesh",
     "MeshError",
     "OrderError",
+    "ParametrisedSurface",
     "Similarity",
     "SobolevAccessor",
     "SobolevBatchError",
@@ -71,6 +78,7 @@ __all__ = [
     "StudyError",
     "Submission",
     "Summary",
+    "Torus",
     "Verification",
     "distance",
     "fourier_transform",
@@ -98,12 +106,15 @@ _MODULES = {
     "ClaimError": "errors",
     "ClusterError": "errors",
     "DamageError": "errors",
+    "Ellipsoid": "surfaces.ellipsoid",
     "InputError": "errors",
+    "Interval": "surfaces.interval",
     "Lattice": "spectral.lattice",
     "LatticeError": "errors",
     "Mesh": "surfaces.mesh",
     "MeshError": "errors",
     "OrderError": "errors",
+    "ParametrisedSurface": "surfaces.parametrised",
     "Similarity": "surfaces.similarity",
     "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
@@ -113,6 +124,7 @@ _MODULES = {
     "StudyError": "errors",
     "Submission": "batch.submission",
     "Summary": "batch.run",
+    "Torus": "surfaces.torus",
     "Verification": "batch.verification",
     "distance": "spectral.norms",
     "fourier_transform": "spectral.fields",

@@ -18,10 +18,10 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
 from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
-from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member, sole_member
+from sobolev_batch.surfaces.sphere import Sphere
 
 _log = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ def make_plan(study: Study, known: Choice | None = None) -> Plan:
     similarity = Similarity.to_unit_ball(surface) if study.scaling.mode == "reference" else study.scaling.fixed
     scaled = similarity.apply(surface)
     choice = _choice(study, similarity, members, reference, scaled, known)
-    if isinstance(scaled, Mesh):
+    if not isinstance(scaled, Sphere):
         require_inside(scaled, choice.lattice)
     rows = tuple(
         Row(label, family, member, _key(study, similarity, choice, member, label))

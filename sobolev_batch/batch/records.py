@@ -22,7 +22,7 @@ class Facts:
     """What was found out about a surface when it was transformed.
 
     Attributes:
-        vertices, triangles: counts; zero for a closed-form surface.
+        vertices, triangles: counts; zero for a surface that is no mesh.
         area: total area in the study's unit of length, squared.
         edge_length_mean, edge_length_max: over triangle sides, in the study's unit; NaN without.
         zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: see `MeshCounts`.

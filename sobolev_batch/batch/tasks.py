@@ -29,6 +29,7 @@ from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sphere import Sphere
 
 _log = logging.getLogger(__name__)
 
@@ -115,7 +116,7 @@ def reason_of(job: Job, error: Exception) -> str:
 
 def settings_of(job: Job, surface: Surface) -> Transform:
     """The settings of a field that is computed block by block: as forecast, not measured and mended."""
-    if job.aim is None or not isinstance(surface, Mesh):
+    if job.aim is None or isinstance(surface, Sphere):
         return job.transform
     return settle(surface, job.lattice, job.aim.goal(surface), job.transform)
 
@@ -124,7 +125,7 @@ def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
     """Compute and store some blocks; what there is to tell of the surface itself is left out."""
     backend = backend_of(job.backend)
     if tuple(blocks) == (job.lattice.half,):
-        if job.aim is not None and isinstance(surface, Mesh):
+        if job.aim is not None and not isinstance(surface, Sphere):
             goal = job.aim.goal(surface)
             field = field_for(surface, job.lattice, goal, job.transform, backend=backend, memory=job.memory)
         else:
@@ -171,7 +172,7 @@ def _whole(qualities: Sequence[Quality]) -> Quality:
 def facts_of(surface: Surface, points: int) -> Facts:
     """What is recorded of a surface and its points."""
     if not isinstance(surface, Mesh):
-        return Facts(area=surface.area)
+        return Facts(area=surface.area, points=points)
     (mean_length, longest), counts = surface.edge_length_range, surface.counts
     return Facts(
         vertices=len(surface.vertices),

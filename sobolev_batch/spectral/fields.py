@@ -20,8 +20,8 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform, transform_block
-from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.sphere import Sphere
 
 # Where nobody says which orders a field is for.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
@@ -63,12 +63,12 @@ def fourier_transform(
     """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
 
     Args:
-        surface: a `Mesh` or `Sphere`, in units of length.
+        surface: a `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length.
         lattice: the frequencies.
         eps: accuracy relative to the surface's area; the error reached is a small multiple of it.
             Default 1e-9, or 1e-6 in single precision.
         dtype: "complex128" or "complex64".
-        quadrature: "auto", a degree from 1 to 50, or "gauss8".
+        quadrature: of meshes: "auto", a degree from 1 to 50, or "gauss8".
         backend: "cpu"; "gpu"; or "auto", which is the GPU if there is one that can be used. What a GPU
             fails to do is done on the processor, with a warning in the log.
         threads: of the NUFFT on the processor; default one per core.
@@ -82,8 +82,8 @@ def fourier_transform(
         names the library that computed it.
 
     Raises:
-        LatticeError: a mesh reaches beyond the lattice's half period 1/(2h).
-        InputError: settings out of range.
+        LatticeError: a surface reaches beyond the lattice's half period 1/(2h).
+        InputError: settings out of range; a parametrised surface that is not smooth.
         BackendError: "gpu", and there is none that can be used.
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
@@ -176,7 +176,7 @@ def field_for(
     Returns:
         The first of a few attempts that keeps the goal, or the last.
     """
-    if not isinstance(surface, Mesh):
+    if isinstance(surface, Sphere):
         return compute_field(surface, lattice, transform, goal.orders, sample=sample, extent=extent)
     for _ in range(_ATTEMPTS):
         settings = settle(surface, lattice, goal, transform)

@@ -20,6 +20,7 @@ from sobolev_batch.spectral.rules import FINEST_TOLERANCE, TriangleRule, reaches
 from sobolev_batch.spectral.transform import COARSEST_EPS, FINEST_EPS, Transform
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ _NUFFT_ERROR = 0.005
 _SINGLE_ROUNDING = 3e-7
 # Between neighbouring triangles about this much of the odd errors was seen to remain.
 _ODD_REMAINDER = 0.2
+# A parametrised surface has at least so many nodes.
+_FEWEST_NODES = 500
 _BINS = 48
 _RADII = 32
 _LOOSEST_TOLERANCE = 0.1
@@ -62,11 +65,11 @@ def permits_single(surface: Surface, lattice: Lattice, goal: Goal) -> bool:
     return bool(np.all(rounding <= _NUFFT_SHARE * np.array(goal.norms)))
 
 
-def settle(mesh: Mesh, lattice: Lattice, goal: Goal, transform: Transform) -> Transform:
+def settle(surface: Mesh | Smooth, lattice: Lattice, goal: Goal, transform: Transform) -> Transform:
     """The cheapest settings that are forecast to meet a goal, or the finest there are.
 
     Args:
-        mesh: whose field is to be computed.
+        surface: whose field is to be computed.
         lattice: where.
         goal: what its error may be.
         transform: whose precision and quadrature are kept.
@@ -76,10 +79,15 @@ def settle(mesh: Mesh, lattice: Lattice, goal: Goal, transform: Transform) -> Tr
     """
     norms = np.array(goal.norms)
     masses = _weight_masses(lattice, goal.orders)
-    spread = _NUFFT_ERROR + 1 / math.sqrt(len(mesh.triangles))
-    eps = float(np.min(_NUFFT_SHARE * norms / (mesh.area * spread * np.sqrt(masses))))
+    spread = _NUFFT_ERROR + 1 / math.sqrt(len(surface.triangles) if isinstance(surface, Mesh) else _FEWEST_NODES)
+    eps = float(np.min(_NUFFT_SHARE * norms / (surface.area * spread * np.sqrt(masses))))
     eps = min(max(eps, FINEST_EPS[transform.precision]), COARSEST_EPS)
-    tolerance = loosest_tolerance(mesh, lattice, Goal(goal.orders, tuple((1 - _NUFFT_SHARE) * norms)))
+    rest = (1 - _NUFFT_SHARE) * norms
+    if isinstance(surface, Smooth):
+        # What it promises at every frequency, at all of them.
+        tolerance = float(np.min(rest / (surface.area * np.sqrt(masses))))
+    else:
+        tolerance = loosest_tolerance(surface, lattice, Goal(goal.orders, tuple(rest)))
     return replace(transform, eps=eps, tolerance=tolerance)
 
 

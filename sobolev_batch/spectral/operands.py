@@ -14,6 +14,7 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Complexes, Orders, Reals, shell_sums
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 Operand = Surface | xr.DataArray
@@ -37,7 +38,10 @@ def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr
         return a
     check_surface(a)
     if lattice is None:
-        raise InputError("a mesh needs a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=...")
+        raise InputError(
+            f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
+            "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
+        )
     return fourier_transform(a, lattice, orders=orders)
 
 
@@ -64,10 +68,13 @@ def check_surface(a: object) -> None:
     """Refuse what is no surface.
 
     Raises:
-        InputError: it is neither a mesh nor a sphere.
+        InputError: it is no mesh, no sphere and not given by a parametrisation.
     """
-    if not isinstance(a, Mesh | Sphere):
-        raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
+    if not isinstance(a, Mesh | Sphere | Smooth):
+        raise InputError(
+            "expected a Mesh, a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a Fourier "
+            f"field, found {type(a).__name__}"
+        )
 
 
 def quality_of(field: xr.DataArray) -> Quality | None:

@@ -3,7 +3,8 @@
 The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the
 squared norm of a field's error without bias (importance sampling). The exact side is the closed
 form of the triangles, which shares neither the quadrature nor the NUFFT with the computed one, so
-every field is checked end to end.
+every field is checked end to end. Of a parametrised surface it is a sum over twice the nodes, without
+the NUFFT.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ Complexes = NDArray[np.complex128]
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 # The estimate comes from few draws: it is raised by this over the root of their number.
 _CAUTION = 3.0
+# Ranges of |ξ| that an error of the same size everywhere is told by.
+_BANDS = 8
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,13 @@ def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact
     sums = draws.scales * np.abs(computed - exact) ** 2
     shells = np.sum(draws.indices**2, axis=1)
     return Probe(tuple(shells.tolist()), tuple(sums.tolist()))
+
+
+def even_probe(lattice: Lattice, error: float) -> Probe:
+    """The probe of a field that errs by as much at every frequency, a little raised towards the lower ones."""
+    masses = _shell_masses(lattice)
+    edges = np.unique((np.linspace(0, 1, _BANDS + 1)[:-1] ** 2 * len(masses)).astype(np.int64))
+    return Probe(tuple(edges.tolist()), tuple((error**2 * np.add.reduceat(masses, edges)).tolist()))
 
 
 def join(probes: Sequence[Probe]) -> Probe:

@@ -20,8 +20,8 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform import Transform
-from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity, Surface
+from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
 
@@ -82,14 +82,14 @@ def pursue(
     widths = support_widths(extents)
     areas = np.array(sum(extent.area for extent in extents))
     lattice, pilot = first_lattice(widths, reach_of(extents), orders, accuracy)
-    meshes = max(1, sum(isinstance(surface, Mesh) for surface in surfaces))
+    inexact = max(1, sum(not isinstance(surface, Sphere) for surface in surfaces))
     values: Reals | None = None
     for remaining in reversed(range(_ROUNDS)):
         samples = _samples(surfaces, lattice, orders)
         if values is None:
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
         _refuse_below_rounding(values, orders, accuracy, float(areas), what)
-        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(meshes)
+        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(inexact)
         precision = _precision(surfaces, lattice, goal)
         fields = tuple(
             field_for(

@@ -1,4 +1,4 @@
-"""From a mesh to weighted points: which rule each triangle gets, in batches of bounded size."""
+"""From a surface to weighted points: which rule each triangle gets, in batches of bounded size."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.arrays import Array, combine
 from sobolev_batch.spectral.backends import CPU, Backend
+from sobolev_batch.spectral.resolution import resolve
 from sobolev_batch.spectral.rules import (
     HIGHEST_DEGREE,
     TriangleRule,
@@ -24,12 +25,15 @@ from sobolev_batch.spectral.rules import (
 )
 from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
 from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.smooth import Smooth
 
 Reals = NDArray[np.float64]
 _Corners = tuple[Array, Array, Array]
 
 # Triangles per slice: keeps the temporaries of a slice with a mid-sized rule near 50 MB.
 _SLICE = 1 << 17
+# Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
+_NODES = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ class Quadrature:
         method: "auto" gives every triangle the cheapest rule that keeps the tolerance at all
             frequencies of the lattice, and subdivides those too large for any; an integer is the
             degree of one symmetric rule with interior nodes for all (1 to 50); "gauss8" is the
-            64-point product rule of K. Koga's paper.
+            64-point product rule of K. Koga's paper. A parametrised surface has a rule of its own,
+            with as many nodes as the tolerance takes, whatever the method.
 
     Raises:
         InputError: any other method.
@@ -73,20 +78,26 @@ class Quadrature:
             )
 
     def batches(
-        self, mesh: Mesh, highest_frequency: float, tolerance: float, capacity: int, backend: Backend = CPU
+        self, surface: Mesh | Smooth, highest_frequency: float, tolerance: float, capacity: int, backend: Backend = CPU
     ) -> Iterator[WeightedPoints]:
-        """The points of a mesh, in batches of at most ``capacity`` points, nearly equal in size.
+        """The points of a surface, in batches of at most ``capacity`` points, for a mesh nearly equal in size.
 
         Args:
-            mesh: the surface.
+            surface: a mesh or a parametrised surface.
             highest_frequency: the largest |ξ| at which the points must stand for the mesh, in
                 cycles per unit length.
             tolerance: largest quadrature error at any such frequency, relative to the area; "auto"
                 keeps it, the others ignore it.
             capacity: bound on the points of one batch, 8 times the largest rule (3,624) or more.
             backend: where to make the points; the rules are chosen on the processor.
+
+        Raises:
+            InputError: a parametrised surface whose quadrature does not settle.
         """
-        groups = self._groups(mesh, highest_frequency, tolerance)
+        if isinstance(surface, Smooth):
+            yield from _smooth_batches(surface, highest_frequency, tolerance, capacity, backend)
+            return
+        groups = self._groups(surface, highest_frequency, tolerance)
         # Nodes are merged within a piece, hence large pieces where they are shared.
         pieces = [piece for group in groups for piece in group.cut(capacity // (2 if group.rule.sharing > 1 else 8))]
         ends = np.cumsum([piece.most_points for piece in pieces])
@@ -94,7 +105,7 @@ class Quadrature:
         count = -(-total // (capacity - max(piece.most_points for piece in pieces)))
         # A piece goes where it starts, so a batch ends at most one piece after its share of the points.
         batch_of = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
-        faces = _Faces.of(mesh, backend)
+        faces = _Faces.of(surface, backend)
         for _, batch in groupby(zip(batch_of, pieces, strict=True), key=itemgetter(0)):
             yield _join([piece.points(faces, backend) for _, piece in batch])
 
@@ -108,9 +119,12 @@ class Quadrature:
         slices = (mesh.centroid_radii[first : first + _SLICE] for first in range(0, len(mesh.triangles), _SLICE))
         return min(int(degrees[choose_rules(2 * np.pi * highest_frequency * part, reach)[1]].min()) for part in slices)
 
-    def sizes(self, mesh: Mesh, highest_frequency: float, tolerance: float) -> tuple[float, int]:
-        """The expected number of points of a mesh, and a bound that holds before shared ones are merged."""
-        groups = self._groups(mesh, highest_frequency, tolerance)
+    def sizes(self, surface: Mesh | Smooth, highest_frequency: float, tolerance: float) -> tuple[float, int]:
+        """The expected number of points of a surface, and a bound that holds before shared ones are merged."""
+        if isinstance(surface, Smooth):
+            size = resolve(surface, highest_frequency, tolerance).size
+            return float(size), size
+        groups = self._groups(surface, highest_frequency, tolerance)
         expected = sum((group.most_points / (1 if group.splits else group.rule.sharing) for group in groups), 0.0)
         return expected, sum(group.most_points for group in groups)
 
@@ -216,6 +230,22 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+
+
+def _smooth_batches(
+    surface: Smooth, highest_frequency: float, tolerance: float, capacity: int, backend: Backend
+) -> Iterator[WeightedPoints]:
+    """The nodes of a parametrised surface, gathered into batches."""
+    counts = resolve(surface, highest_frequency, tolerance).counts
+    made: list[WeightedPoints] = []
+    gathered = 0
+    for coordinates, weights in surface.nodes(counts, min(capacity, _NODES)):
+        if gathered + len(weights) > capacity:
+            yield _join(made)
+            made, gathered = [], 0
+        made.append(WeightedPoints(backend.upload(coordinates), backend.upload(weights)))
+        gathered += len(weights)
+    yield _join(made)
 
 
 def _join(made: list[WeightedPoints]) -> WeightedPoints:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.budget import DIRECTIONS
 from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
@@ -42,6 +43,8 @@ class Quality:
         if isinstance(surface, Sphere):
             along = DIRECTIONS @ np.asarray(surface.center)
             low, high = along - surface.radius, along + surface.radius
+        elif isinstance(surface, Smooth):
+            low, high = -surface.highest_along(-DIRECTIONS), surface.highest_along(DIRECTIONS)
         else:
             coordinates = surface.used_coordinates
             low, high = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)

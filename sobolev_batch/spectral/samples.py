@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes
-from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, measure
+from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, even_probe, join, measure
+from sobolev_batch.spectral.resolution import exact_values, resolve
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 Reals = NDArray[np.float64]
@@ -38,6 +40,8 @@ class Sample:
         """The sample of a surface."""
         if isinstance(surface, Sphere):
             return cls(draws, sphere_transform(surface, draws.frequencies))
+        if isinstance(surface, Smooth):
+            return cls(draws, exact_values(surface, draws.frequencies))
         return cls(draws, exact_transform(surface, draws.frequencies))
 
 
@@ -65,18 +69,24 @@ def probe_block(
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
-    Closed forms in double precision are exact, and have an empty probe.
+    Closed forms in double precision are exact, and have an empty probe. That of a parametrised surface, whose
+    exact values come from twice its nodes, also carries how much doubling them changed when they were chosen.
     """
     if not needs_probe(surface, settings):
         return Probe()
     draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice)).within(block)
     sample = Sample.of(surface, draws)
-    return measure(draws, values[draws.places(block)], sample.exact)
+    probe = measure(draws, values[draws.places(block)], sample.exact)
+    # Once for the whole field.
+    if isinstance(surface, Smooth) and block.start == lattice.half.start:
+        change = resolve(surface, lattice.highest_frequency, settings.rule_tolerance).change
+        return join([probe, even_probe(lattice, change * surface.area)])
+    return probe
 
 
 def needs_probe(surface: Surface, settings: Transform) -> bool:
     """Whether a field computed with these settings can have an error worth the name."""
-    return isinstance(surface, Mesh) or settings.precision == "complex64"
+    return not isinstance(surface, Sphere) or settings.precision == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:

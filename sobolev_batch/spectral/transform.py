@@ -20,6 +20,7 @@ from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.spheres import sphere_block
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
 # Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
@@ -33,6 +34,9 @@ DEFAULT_BATCH = 1 << 21
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
 FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
+# The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of
+# degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that found most of it.
+_SMOOTH_DEGREE = 16
 # Samples of a closed form at a time.
 _SLAB = 1 << 18
 # Of a GPU's free memory, what a transform plans with; and how often it is tried, each time with half as much.
@@ -51,8 +55,8 @@ class Transform:
             and 1e-6 in complex64.
         precision: "complex128" or "complex64".
         quadrature: see `Quadrature`.
-        tolerance: largest error of the triangle rules on any one triangle, relative to its area;
-            None stands for eps.
+        tolerance: largest error of the triangle rules on any one triangle, relative to its area, and of
+            the nodes of a parametrised surface, relative to the whole area; None stands for eps.
 
     Raises:
         InputError: a precision that does not exist, or an eps beyond what it can hold.
@@ -86,8 +90,10 @@ class Transform:
 
     def lowest_degree(self, surface: Surface, lattice: Lattice) -> int:
         """The lowest degree among the rules that triangles get, whose error shows first; 0 for a closed form."""
-        if not isinstance(surface, Mesh):
+        if isinstance(surface, Sphere):
             return 0
+        if isinstance(surface, Smooth):
+            return _SMOOTH_DEGREE
         return self.quadrature.lowest_degree(surface, lattice.highest_frequency, self.rule_tolerance)
 
 
@@ -135,8 +141,9 @@ def transform_block(
             is free there is the bound, and this one holds for the processor that may have to step in.
 
     Raises:
-        LatticeError: a mesh reaches beyond the lattice's half period.
-        InputError: the memory is too little for any way of computing it.
+        LatticeError: a surface reaches beyond the lattice's half period.
+        InputError: the memory is too little for any way of computing it, or the quadrature of a
+            parametrised surface does not settle.
     """
     if isinstance(surface, Sphere):
         return Transformed(_closed_form(surface, lattice, block, settings.precision), 0, "closed form")
@@ -156,9 +163,9 @@ def transform_block(
 
 
 def _on_gpu(
-    mesh: Mesh, lattice: Lattice, block: Block, settings: Transform, batch: int, backend: Gpu
+    surface: Mesh | Smooth, lattice: Lattice, block: Block, settings: Transform, batch: int, backend: Gpu
 ) -> Transformed | str:
-    """The transform of a mesh by a GPU, or why it failed.
+    """The transform of a surface by a GPU, or why it failed.
 
     Where memory is too little after all, it is tried again in smaller batches and parts.
     """
@@ -166,10 +173,10 @@ def _on_gpu(
         with backend.work():
             room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.precision)
             for _ in range(_ATTEMPTS):
-                division, taken = _division(mesh, lattice, block, settings, backend.costs, memory=room, batch=batch)
+                division, taken = _division(surface, lattice, block, settings, backend.costs, memory=room, batch=batch)
                 backend.make_room(taken)
                 try:
-                    values, points = _computed(mesh, lattice, block, settings, division, backend, 1)
+                    values, points = _computed(surface, lattice, block, settings, division, backend, 1)
                     return Transformed(values, points, backend.library)
                 except Exception as error:
                     # cuFINUFFT says of a failure only where it happened; cuFFT's want of memory is not even known.
@@ -187,7 +194,7 @@ def _on_gpu(
 
 
 def _computed(
-    mesh: Mesh,
+    surface: Mesh | Smooth,
     lattice: Lattice,
     block: Block,
     settings: Transform,
@@ -195,9 +202,9 @@ def _computed(
     backend: Backend,
     threads: int,
 ) -> tuple[Complexes, int]:
-    """The transform of a mesh on one backend, divided in one way, and the number of points."""
+    """The transform of a surface on one backend, divided in one way, and the number of points."""
     batches = settings.quadrature.batches(
-        mesh, lattice.highest_frequency, settings.rule_tolerance, division.batch, backend
+        surface, lattice.highest_frequency, settings.rule_tolerance, division.batch, backend
     )
     values, points = transform_points(
         batches,
@@ -243,20 +250,28 @@ def memory_bytes(
 
 
 def _division(
-    mesh: Mesh, lattice: Lattice, block: Block, settings: Transform, costs: Costs, *, memory: float, batch: int
+    surface: Mesh | Smooth,
+    lattice: Lattice,
+    block: Block,
+    settings: Transform,
+    costs: Costs,
+    *,
+    memory: float,
+    batch: int,
 ) -> tuple[Division, int]:
-    """How the transform of a mesh is divided to fit into memory, and what it then takes, in bytes.
+    """How the transform of a surface is divided to fit into memory, and what it then takes, in bytes.
 
     Raises:
         InputError: the memory is too little.
     """
     shape, eps, precision = block.shape, settings.accuracy, settings.precision
-    low, high = mesh.bounds
+    low, high = surface.bounds
     fill = float(np.prod((high - low) / (2 * lattice.half_period)))
-    load = Load(math.inf, triangles=len(mesh.triangles), fill=fill)
+    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
+    load = Load(math.inf, triangles=triangles, fill=fill)
     if transform_bytes(shape, eps, precision, load, Division(batch), costs) > memory:
         # Only now do the points need counting.
-        points, most = settings.quadrature.sizes(mesh, lattice.highest_frequency, settings.rule_tolerance)
+        points, most = settings.quadrature.sizes(surface, lattice.highest_frequency, settings.rule_tolerance)
         load = replace(load, points=points, most_points=most)
     division = divide(shape, eps, precision, load, costs, memory=memory, batch=batch)
     return division, transform_bytes(shape, eps, precision, load, division, costs)
@@ -273,13 +288,14 @@ def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, precision: Prec
     return values
 
 
-def require_inside(mesh: Mesh, lattice: Lattice) -> None:
-    """Refuse a mesh that does not fit into the lattice's period, where its points would fold.
+def require_inside(surface: Mesh | Smooth, lattice: Lattice) -> None:
+    """Refuse a surface that does not fit into the lattice's period, where its points would fold.
 
     Raises:
         LatticeError: some |coordinate| is not below 1/(2h).
     """
-    _require_reach(max(float(np.abs(bound).max()) for bound in mesh.bounds), lattice, "the mesh reaches", "mesh")
+    kind = "mesh" if isinstance(surface, Mesh) else "surface"
+    _require_reach(max(float(np.abs(bound).max()) for bound in surface.bounds), lattice, f"the {kind} reaches", "it")
 
 
 def require_points_inside(coordinates: NDArray[np.float64], lattice: Lattice) -> None:
@@ -288,7 +304,7 @@ def require_points_inside(coordinates: NDArray[np.float64], lattice: Lattice) ->
     Raises:
         LatticeError: some |coordinate| is not below 1/(2h).
     """
-    _require_reach(float(np.abs(coordinates).max(initial=0.0)), lattice, "the points reach", "points")
+    _require_reach(float(np.abs(coordinates).max(initial=0.0)), lattice, "the points reach", "them")
 
 
 def _require_reach(reach: float, lattice: Lattice, subject: str, what: str) -> None:
@@ -297,5 +313,5 @@ def _require_reach(reach: float, lattice: Lattice, subject: str, what: str) -> N
         raise LatticeError(
             f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take M >= {needed}, a smaller xi_max, or scale the {what} down"
+            f"take M >= {needed}, a smaller xi_max, or scale {what} down"
         )

@@ -99,7 +99,7 @@ def whole_mesh(original: Member, triangles: int) -> Mesh:
     """
     mesh = original.load()
     if not isinstance(mesh, Mesh):
-        raise MeshError(f"{original.name} is a closed-form surface; only a mesh can be reduced to triangles")
+        raise MeshError(f"{original.name} is not a mesh; only a mesh can be reduced to triangles")
     if triangles >= len(mesh.triangles):
         raise MeshError(
             f"{original.name} has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: ask for fewer"

@@ -9,9 +9,10 @@ import numpy as np
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.smooth import Smooth
 from sobolev_batch.surfaces.sphere import Sphere
 
-Surface = Mesh | Sphere
+Surface = Mesh | Sphere | Smooth
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,14 @@ class Similarity:
         """The similarity that takes a surface's bounding sphere to the unit sphere at the origin.
 
         A mesh's bounding sphere is the one around the centre of its bounding box that reaches its
-        farthest vertex: it exists for flat meshes too and depends on nothing but the vertices.
+        farthest vertex: it exists for flat meshes too and depends on nothing but the vertices. That of a
+        parametrised surface likewise reaches its farthest point.
         """
         if isinstance(surface, Sphere):
             return cls(1 / surface.radius, surface.center)
+        if isinstance(surface, Smooth):
+            middle, reach = surface.bounding_sphere
+            return cls(1 / reach, middle)
         lower, upper = surface.bounds
         center = lower + (upper - lower) / 2
         radius = float(np.linalg.norm(surface.vertices[surface.used_vertices] - center, axis=1).max())
@@ -58,6 +63,8 @@ class Similarity:
         if isinstance(surface, Sphere):
             moved = [self.scale * (c - o) for c, o in zip(surface.center, self.origin, strict=True)]
             return Sphere(self.scale * surface.radius, (moved[0], moved[1], moved[2]))
+        if isinstance(surface, Smooth):
+            return surface.moved(self.scale, self.origin)
         moved_vertices = surface.vertices - np.asarray(self.origin)
         moved_vertices *= self.scale
         # Read-only, so that the mesh takes it over: of huge meshes a copy would count.

@@ -55,7 +55,7 @@ class LevelMember(Member):
         """Take the level's vertices from the surface and its triangles from the sphere's hull."""
         surface, sphere = self.surface.load(), self.sphere.load()
         if not (isinstance(surface, Mesh) and isinstance(sphere, Mesh)):
-            raise MeshError("levels can be taken from two meshes only, not from closed-form surfaces")
+            raise MeshError("levels can be taken from two meshes only, not from smooth surfaces")
         count = 10 * 4**self.level + 2
         if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
             raise MeshError(

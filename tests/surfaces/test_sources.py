@@ -57,7 +57,8 @@ def test_all_sources_are_registered() -> None:
     with pytest.raises(StudyError) as caught:
         parse_source({"source": "nothing"})
     assert str(caught.value) == (
-        "no source is named 'nothing'; known are decimate, files, icosphere, remesh, sphere, spherical-levels"
+        "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, icosphere, "
+        "remesh, sphere, spherical-levels, torus, torus-grid"
     )
 
 
@@ -132,6 +133,23 @@ PATHS = {"source": "files", "paths": ["a.ply"]}
         ({"source": "sphere", "center": [0.0, False, 0.0]}, "center.1"),
         ({"source": "sphere", "center": [float("nan"), 0.0, 0.0]}, "center.0"),
         ({"source": "sphere", "centre": [0.0, 0.0, 0.0]}, "centre"),
+        ({"source": "ellipsoid"}, "axes"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 0.0]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, float("inf")]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e200]}, ""),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 1.0], "levels": [1]}, "levels"),
+        ({"source": "ellipsoid-levels", "axes": [1.0, 1.0, 1.0]}, "levels"),
+        ({"source": "ellipsoid-levels", "axes": [1.0, 1.0, 1.0], "levels": [13]}, "levels.0"),
+        ({"source": "torus", "R": 1.0}, "r"),
+        ({"source": "torus", "R": 1.0, "r": "0.4"}, "r"),
+        ({"source": "torus", "R": 1.0, "r": 0.0}, "r"),
+        ({"source": "torus", "R": 1.0, "r": 1.0}, ""),
+        ({"source": "torus", "R": 1.0, "r": 0.4, "radius": 1.0}, "radius"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4}, "levels"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "around": 2}, "around"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "across": 6.0}, "across"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [0, 12]}, ""),
         ({"source": "files"}, "paths"),
         ({"source": "files", "paths": []}, "paths"),
         ({"source": "files", "paths": "a.ply"}, "paths"),
@@ -210,6 +228,10 @@ def test_a_sole_member_is_the_only_one() -> None:
 KINDS: dict[str, dict[str, Any]] = {
     "icosphere": {"source": "icosphere", "levels": [1, 0]},
     "sphere": {"source": "sphere", "radius": 2.0, "center": [1, 2, 3]},
+    "ellipsoid": {"source": "ellipsoid", "axes": [3, 2, 1], "center": [1, 2, 3]},
+    "ellipsoid-levels": {"source": "ellipsoid-levels", "axes": [3, 2, 1], "levels": [1, 0]},
+    "torus": {"source": "torus", "R": 2, "r": 0.5, "center": [1, 2, 3]},
+    "torus-grid": {"source": "torus-grid", "R": 2, "r": 0.5, "levels": [1, 0]},
     "files": {"source": "files", "paths": ["box.off"]},
     "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
     "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
@@ -246,7 +268,7 @@ def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
-    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 7
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 13
 
 
 @pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])
