@@ -11,17 +11,18 @@ from types import FrameType
 def main() -> None:
     """Run the command line; the process ends with its exit status."""
     # The command line takes a second to import, in which some library may catch what an interrupt raises.
-    before = signal.signal(signal.SIGINT, _leave)
+    before = {number: signal.signal(number, _leave) for number in (signal.SIGINT, signal.SIGTERM)}
     from sobolev_batch import cli
 
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
     cli.main()
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
     sys.stderr.write("interrupted before anything was begun\n")
     sys.stderr.flush()
-    os._exit(130)
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

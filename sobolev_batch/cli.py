@@ -278,9 +278,11 @@ def main() -> None:
         error.show()
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, click.Abort):
+        _ignore_signals()
         click.echo("interrupted; the same command goes on from what is stored", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except _Terminated:
+        _ignore_signals()
         click.echo("terminated; the same command goes on from what is stored", err=True)
         sys.exit(EXIT_TERMINATED)
     except Exception as error:
@@ -291,6 +293,12 @@ def main() -> None:
         click.echo(f"error: {what}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
     sys.exit(status or 0)
+
+
+def _ignore_signals() -> None:
+    """What asks a process to end that is ending must not change how it ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 class _Terminated(SystemExit):

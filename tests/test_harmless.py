@@ -20,8 +20,8 @@ FORBIDDEN = {
 }
 # pickle.dumps sends a plugin to workers; what arrives there Dask unpickles.
 ALLOWED_OF_PICKLE = {"dumps"}
-# Of CUDA's libraries, by names that stand in that module.
-ALLOWED_IMPORTS = {("spectral/cuda.py", "import_module")}
+# Of CUDA's libraries, and of the package's own modules, by names that stand in these modules.
+ALLOWED_IMPORTS = {("spectral/cuda.py", "import_module"), ("__init__.py", "import_module")}
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[str, str, ast.Call]]:

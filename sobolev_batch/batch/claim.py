@@ -14,7 +14,7 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Self
 from uuid import uuid4
@@ -25,7 +25,13 @@ from sobolev_batch.errors import ClaimError, StoreError
 
 _log = logging.getLogger(__name__)
 
+# States of a process that only waits for its parent to take notice.
+_ENDED = ("Z", "X")
+
 CLAIM = "claim.json"
+# There while somebody takes over from the dead: several may try.
+_SUCCESSION = "claim.succession.json"
+CLAIM_KEYS = frozenset({CLAIM, _SUCCESSION})
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class Claim:
         driver: the holder in words: the process and its host.
         since: when it was taken, in UTC.
         process: the holder's process, as `_process_mark` tells it; empty where its end must not end the claim.
+        folder: "made" where the store's folder was made for the claim.
     """
 
     run: str
@@ -46,6 +53,7 @@ class Claim:
     driver: str
     since: str
     process: str = ""
+    folder: str = ""
 
     @classmethod
     def of_this_process(cls, run: str = "", *, outlives_process: bool = False) -> Self:
@@ -79,11 +87,27 @@ class Claim:
     @property
     def is_of_the_dead(self) -> bool:
         """Whether it is certain that the holder's process is gone."""
-        machine, _, process = self.process.rpartition("/")
-        number = process.partition("@")[0]
-        if not machine or machine != _machine() or not number.isdecimal():
-            return False
-        return _process_mark(int(number)) != self.process
+        return self._is_of_this_machine and not self.is_of_the_living
+
+    @property
+    def is_of_the_living(self) -> bool:
+        """Whether it is certain that the holder's process is there."""
+        number = self.process.rpartition("/")[2].partition("@")[0]
+        return self._is_of_this_machine and number.isdecimal() and _process_mark(int(number)) == self.process
+
+    @property
+    def _is_of_this_machine(self) -> bool:
+        machine = self.process.rpartition("/")[0]
+        return bool(machine) and machine == _machine()
+
+    def require(self, location: Location) -> None:
+        """Check that its holder still has the store.
+
+        Raises:
+            ClaimError: it was released, or somebody else has it.
+        """
+        if not self.is_on(location):
+            raise ClaimError(f"{location}: the store was released, or removed, and is no longer that of this process")
 
     def is_on(self, location: Location) -> bool:
         """Whether its holder still has the store.
@@ -117,26 +141,56 @@ def take(location: Location, claim: Claim) -> None:
         ClaimError: another run has it; the message names its driver.
         StoreError: the store cannot be reached or written.
     """
-    if location.create(CLAIM, claim.to_json()):
-        return
+    claim = replace(claim, folder="" if location.is_folder() else "made")
+    there = None
+    # What is there may be given up between two looks at it.
+    while there is None:
+        if location.create(CLAIM, claim.to_json()):
+            return
+        there = Claim.read(location)
     # Of a request whose answer was lost, a driver hears that the key is there.
-    there = Claim.read(location)
-    if there is not None and there.run != claim.run:
-        if not there.is_of_the_dead:
-            raise ClaimError(
-                f"{location}: another run has this store to itself: {there.driver}, since {there.since}. "
-                "Wait for it or stop it; if it is gone without having been able to say so, "
-                f"release the store with: sobolev-batch release {location}"
-            )
-        _log.warning("%s: taken over from %s, which was ended in the middle of its run", location, there.driver)
-    location.write({CLAIM: claim.to_json()})
+    claim = replace(claim, folder=there.folder)
+    if there.run == claim.run:
+        location.write({CLAIM: claim.to_json()})
+    else:
+        _succeed(location, claim, there)
+
+
+def _succeed(location: Location, claim: Claim, dead: Claim) -> None:
+    """Take a store over from a process that is gone."""
+    taken = (
+        f"{location}: another run has this store to itself: {dead.driver}, since {dead.since}. "
+        "Wait for it or stop it; if it is gone without having been able to say so, "
+        f"release the store with: sobolev-batch release {location}"
+    )
+    if not dead.is_of_the_dead or not location.create(_SUCCESSION, claim.to_json()):
+        raise ClaimError(taken)
+    try:
+        # Another one may have succeeded since.
+        if not dead.is_on(location):
+            raise ClaimError(taken)
+        location.write({CLAIM: claim.to_json()})
+    finally:
+        location.discard(_SUCCESSION)
+    _log.warning("%s: taken over from %s, which was ended in the middle of its run", location, dead.driver)
+
+
+def remove_claim(location: Location) -> None:
+    """Take any claim away.
+
+    Raises:
+        StoreError: it cannot be removed.
+    """
+    for key in CLAIM_KEYS:
+        location.discard(key)
 
 
 def give_up(location: Location, claim: Claim) -> None:
     """Take a claim away, unless somebody else has taken it over; what cannot be removed is only reported."""
     try:
-        if claim.is_on(location):
-            location.discard(CLAIM)
+        there = Claim.read(location)
+        if there is not None and there.holder == claim.holder:
+            location.discard(CLAIM, with_folder=there.folder == "made")
     except StoreError as error:
         _log.warning("the store stays claimed, release it with: sobolev-batch release %s (%s)", location, error)
 
@@ -155,7 +209,9 @@ def _process_mark(number: int) -> str:
         return ""
     # The name in brackets may hold anything. The start is counted from that of the machine: unlike a time of day,
     # it does not move when the clock is set.
-    started = fields.rpartition(")")[2].split()[19]
+    state, started = (fields.rpartition(")")[2].split()[place] for place in (0, 19))
+    if state in _ENDED:
+        return ""
     return machine and f"{machine}/{number}@{started}"
 
 

@@ -149,5 +149,6 @@ class _Dealer:
             plan.aim(row),
             layout.transform_bytes,
             plan.study.backend,
+            row.fingerprint,
         )
         return self.submitter.field(job, layout, rank)

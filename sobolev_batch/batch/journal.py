@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from threading import Event, Thread
+from contextlib import AbstractContextManager
+from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Self
 
@@ -38,6 +39,7 @@ class Journal:
         self._store = store
         self._claim = claim
         self._is_lost = False
+        self._lock = Lock()
         self._started = utc_now()
         self._ended = Event()
         self._thread = Thread(target=self._beat, name="sobolev-batch-journal", daemon=True)
@@ -53,6 +55,7 @@ class Journal:
         self._ended.set()
         self._thread.join()
         if error is None:
+            self._claim.require(self._store.location)
             self.write("done")
             return
         try:
@@ -63,6 +66,17 @@ class Journal:
         except StoreError as failure:
             # It may be what ended the run, and must not hide that.
             _log.warning("how the run ended could not be written: %s", failure)
+
+    def paused(self) -> AbstractContextManager[object]:
+        """Keep it from writing for a while."""
+        return self._lock
+
+    def _worry(self) -> str:
+        try:
+            return self.worry()
+        except Exception as error:  # a cluster that is closing does not answer; the run is alive all the same
+            _log.debug("the cluster could not be asked: %r", error)
+            return ""
 
     def require_claim(self) -> None:
         """Check that the store was still this run's at the latest beat.
@@ -90,9 +104,10 @@ class Journal:
                 if not self._claim.is_on(self._store.location):
                     self._is_lost = True
                     return
-                worry = self.worry()
-                if worry:
-                    _log.warning("%s: %s", self._store.path, worry)
-                self.write("running", worry)
+                with self._lock:
+                    worry = self._worry()
+                    if worry:
+                        _log.warning("%s: %s", self._store.path, worry)
+                    self.write("running", worry)
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+import stat
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,10 @@ class Location:
                     f"this begins with {first}/ and a URL with {first}//; a Path cannot hold a URL, give it as a string"
                 )
             # Once, here: libraries underneath would expand it in some places and not in others.
-            return cls(str(Path(place).expanduser()))
+            try:
+                return cls(str(Path(place).expanduser()))
+            except RuntimeError as error:
+                raise StoreError(f"{place}: {error}; name a folder, or ./~... for one of that name") from error
         scheme, separator, rest = found.groups()
         if separator == "::" or "::" in rest:
             raise StoreError(f"{scheme}::...: a chain of URLs cannot hold a store; name the last of them alone")
@@ -158,9 +162,8 @@ class Location:
                 path = place_of(self.name, key)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # A reader finds the old document or the new one, never a part of it.
-                partial = path.with_name(f"{path.name}.{uuid4().hex}{_PARTIAL}")
-                partial.write_bytes(document)
-                partial.replace(path)
+                with _written(path, document) as partial:
+                    partial.replace(path)
 
     def create(self, key: str, document: bytes) -> bool:
         """Write a small document unless its key is there; of several who try, one succeeds.
@@ -181,14 +184,19 @@ class Location:
                     return True
                 path = place_of(self.name, key)
                 path.parent.mkdir(exist_ok=True)
-                with path.open("xb") as file:
-                    file.write(document)
+                with _written(path, document) as partial:
+                    # Unlike a new file that is written, it is never there without its content.
+                    os.link(partial, path)
             except FileExistsError:
                 return False
         return True
 
-    def discard(self, key: str) -> None:
-        """Remove one key, if it is there, and the location itself if that leaves it empty.
+    def is_folder(self) -> bool:
+        """Whether a local folder is there."""
+        return not self.scheme and Path(self.name).is_dir()
+
+    def discard(self, key: str, *, with_folder: bool = False) -> None:
+        """Remove one key, if it is there, and on request the location's folder if that leaves it empty.
 
         Raises:
             StoreError: it cannot be removed.
@@ -204,8 +212,9 @@ class Location:
                 if _lacks_bucket(error):
                     raise
                 return
-            with suppress(OSError):  # it holds a store
-                Path(self.name).rmdir()
+            if with_folder:
+                with suppress(OSError):  # it holds a store
+                    Path(self.name).rmdir()
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """The bytes of every key below a prefix; empty where there is none.
@@ -218,11 +227,15 @@ class Location:
                 files, root = self._filesystem()
                 found = files.find(f"{root}/{prefix}", detail=True, **_patience(files))
                 return {path.removeprefix(f"{root}/"): entry["size"] for path, entry in found.items()}
-            return {
-                os.path.relpath(path, self.name).replace(os.sep, "/"): os.stat(path).st_size
-                for folder, _, names in os.walk(os.path.join(self.name, prefix))
-                for path in (os.path.join(folder, name) for name in names)
-            }
+            sizes = {}
+            for folder, _, names in os.walk(os.path.join(self.name, prefix)):
+                for name in names:
+                    path = os.path.join(folder, name)
+                    with suppress(FileNotFoundError):  # gone since
+                        found = os.lstat(path)
+                        if stat.S_ISREG(found.st_mode):
+                            sizes[os.path.relpath(path, self.name).replace(os.sep, "/")] = found.st_size
+            return sizes
 
     def sweep(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key; nobody else may be writing.
@@ -235,7 +248,8 @@ class Location:
                 for folder, _, names in os.walk(self.name):
                     for name in names:
                         if _STRAY.search(name):
-                            (Path(folder) / name).unlink()
+                            # It may have got its name since, from a task that outlived its run.
+                            (Path(folder) / name).unlink(missing_ok=True)
 
     def remove(self, prefix: str) -> None:
         """Remove everything below a prefix, if anything is there.
@@ -272,11 +286,11 @@ class Location:
                 return set()
             return {path.rstrip("/").rpartition("/")[2] for path in files.ls(root, detail=False, **_patience(files))}
 
-    def require_free(self, besides: str = "") -> None:
+    def require_free(self, besides: Collection[str] = ()) -> None:
         """Check that a store may be laid out here, as far as can be told without writing.
 
         Args:
-            besides: the name of what may lie here already.
+            besides: the names of what may lie here already.
 
         Raises:
             StoreError: something is there, it cannot be reached, or there is no folder to hold it.
@@ -285,7 +299,7 @@ class Location:
         if not self.scheme and path.exists() and not path.is_dir():
             raise StoreError(f"{self}: a file is there; name a folder that is new or holds a store")
         # Of a driver that was killed while it wrote the first key, only its stray is there.
-        if any(name != besides and not _STRAY.search(name) for name in self.names()):
+        if any(name not in besides and not _STRAY.search(name) for name in self.names()):
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
         if not self.scheme and not path.absolute().parent.is_dir():
             raise StoreError(f"{self}: there is no folder {path.absolute().parent} to hold the store; make it first")
@@ -339,6 +353,17 @@ class Location:
         if isinstance(error, PermissionError):
             return f"access is denied ({text}); check the credentials in the environment and what they allow"
         return text
+
+
+@contextmanager
+def _written(path: Path, document: bytes) -> Iterator[Path]:
+    """A file beside a path, for its content to be put in place at once; nothing of it is left where that fails."""
+    partial = path.with_name(f"{path.name}.{uuid4().hex}{_PARTIAL}")
+    try:
+        partial.write_bytes(document)
+        yield partial
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _require_no_credentials(scheme: str, rest: str) -> None:

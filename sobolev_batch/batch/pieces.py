@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.equipment import backend_of
 from sobolev_batch.batch.records import Facts
-from sobolev_batch.batch.tasks import Job, Part, facts_of, reason_of, settings_of
+from sobolev_batch.batch.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
 from sobolev_batch.errors import MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.probe import Draws, Probe, measure
@@ -84,7 +84,7 @@ def cut_mesh(job: Job, count: int) -> Cut:
     """Make a mesh, describe it, and store it as at most ``count`` pieces of equally many triangles."""
     started = time.perf_counter()
     try:
-        mesh = job.similarity.apply(job.member.load())
+        mesh = load_surface(job)
         if not isinstance(mesh, Mesh):
             raise MeshError("a closed-form surface cannot be cut into pieces")
         require_inside(mesh, job.lattice)

@@ -8,7 +8,6 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 from sobolev_batch.batch.choice import Choice, basis_of, choose
 from sobolev_batch.batch.study import REFERENCE_LABEL, FamilyReference, Study
@@ -37,13 +36,15 @@ class Row:
         label: family/name, or "reference"; unique in the study.
         family: name of the family, or "reference".
         member: the surface to be made.
-        key: SHA-256 of all that its field depends on; empty where that cannot be told because a
+        fingerprint: of the member, see `Member.fingerprint_digest`; empty where that cannot be told because a
             file of it cannot be read.
+        key: SHA-256 of all that its field depends on; empty likewise.
     """
 
     label: str
     family: str
     member: Member
+    fingerprint: str
     key: str
 
 
@@ -89,9 +90,7 @@ class Plan:
 
     def on(self, choice: Choice) -> Plan:
         """The same study with its fields on another lattice."""
-        rows = tuple(
-            replace(row, key=_key(self.study, self.similarity, choice, row.member, row.label)) for row in self.rows
-        )
+        rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
         return replace(self, rows=rows, choice=choice, blocks=_blocks(choice))
 
     @cached_property
@@ -129,15 +128,15 @@ def make_plan(study: Study, known: Choice | None = None) -> Plan:
     choice = _choice(study, similarity, members, reference, scaled, known)
     if not isinstance(scaled, Sphere):
         require_inside(scaled, choice.lattice)
-    rows = tuple(
-        Row(label, family, member, _key(study, similarity, choice, member, label))
-        for label, (family, member) in members.items()
-    )
+    rows = []
+    for label, (family, member) in members.items():
+        fingerprint = _fingerprint(label, member)
+        rows.append(Row(label, family, member, fingerprint, _key(study, similarity, choice, fingerprint)))
     sample = None
     if study.accuracy is not None:
         draws = draws_for([scaled], choice.lattice, study.orders, USUAL_DEGREE)
         sample = Sample.of(scaled, draws)
-    return Plan(study, similarity, rows, reference, _blocks(choice), choice, sample)
+    return Plan(study, similarity, tuple(rows), reference, _blocks(choice), choice, sample)
 
 
 def _choice(
@@ -209,11 +208,16 @@ def _load_reference(member: Member) -> Surface:
         raise MeshError(f"the reference cannot be made: {error}") from error
 
 
-def _key(study: Study, similarity: Similarity, choice: Choice, member: Member, label: str) -> str:
+def _fingerprint(label: str, member: Member) -> str:
     try:
-        fingerprint: Mapping[str, Any] = member.fingerprint()
+        return member.fingerprint_digest()
     except InputError as error:
         _log.warning("%s: %s", label, error)
+        return ""
+
+
+def _key(study: Study, similarity: Similarity, choice: Choice, fingerprint: str) -> str:
+    if not fingerprint:
         return ""
     parts = {
         "surface": fingerprint,

@@ -15,7 +15,7 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.claim import CLAIM
+from sobolev_batch.batch.claim import CLAIM_KEYS
 from sobolev_batch.batch.documents import SCHEMA_VERSION
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.plan import Plan
@@ -46,7 +46,7 @@ def require_place(location: Location) -> None:
     """
     store = Store(location)
     if not store.is_there():
-        location.require_free(besides=CLAIM)
+        location.require_free(besides=CLAIM_KEYS)
     elif not store.is_unfinished:
         store.attributes()
 
@@ -60,7 +60,7 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
     """
     store = Store(place)
     if not store.is_there():
-        store.location.require_free(besides=CLAIM)
+        store.location.require_free(besides=CLAIM_KEYS)
         _lay_out(store, plan)
         return store
     if store.is_unfinished:
@@ -75,6 +75,7 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
             )
             _replace_everything(store, plan)
+        store.mend_labels()
         _extend(store, plan)
         _mend_axes(store, plan)
         store.documents[""]["attributes"].update(_attributes(plan))
@@ -87,7 +88,7 @@ def _replace_everything(store: Store, plan: Plan) -> None:
     """Remove everything that was computed and lay out the arrays for another lattice."""
     _mark_unfinished(store, plan)
     store.location.sweep()
-    for name in sorted(store.location.names() - {CLAIM, ROOT}):
+    for name in sorted(store.location.names() - {*CLAIM_KEYS, ROOT}):
         store.location.remove(name)
     _lay_out(store, plan)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from pathlib import Path
 
-from sobolev_batch.batch.claim import CLAIM, Claim
+from sobolev_batch.batch.claim import Claim, remove_claim
 from sobolev_batch.batch.journal import PATIENCE_SECONDS
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import age_seconds
 from sobolev_batch.batch.store import Store
-from sobolev_batch.errors import ClaimError
+from sobolev_batch.errors import ClaimError, StoreError
 
 
 def release(place: str | Path | Location, *, force: bool = False) -> Claim | None:
@@ -32,20 +34,29 @@ def release(place: str | Path | Location, *, force: bool = False) -> Claim | Non
     claim = Claim.read(location)
     if claim is None:
         return None
-    silence = _silence_seconds(location, claim)
-    if not force and not claim.is_of_the_dead and silence is not None and silence < PATIENCE_SECONDS:
+    if not force and claim.is_of_the_living:
+        raise ClaimError(f"{location}: {claim.driver} is alive; stop it, or release the store all the same by --force")
+    silence = math.inf if force or claim.is_of_the_dead else _silence_seconds(location, claim)
+    if silence < PATIENCE_SECONDS:
         raise ClaimError(
             f"{location}: {claim.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
             f"silent for {PATIENCE_SECONDS:.0f} s; --force releases the store all the same"
         )
-    location.discard(CLAIM)
+    remove_claim(location)
     return claim
 
 
-def _silence_seconds(location: Location, claim: Claim) -> float | None:
-    """Since the latest sign of life of a claim's holder; None where it has given none."""
-    store = Store(location)
-    run = store.read_run() if store.is_there() else None
-    if run is None or not run.driver.startswith(claim.driver) or run.state not in ("submitted", "running"):
-        return None
-    return age_seconds(run.seen)
+def _silence_seconds(location: Location, claim: Claim) -> float:
+    """Since the latest sign of life of a claim's holder."""
+    signs = [claim.since]
+    # Of a store that cannot be read, the claim itself is all that is known.
+    with suppress(StoreError):
+        store = Store(location)
+        run = store.read_run() if store.is_there() else None
+        if run is not None and run.driver.startswith(claim.driver):
+            signs.append(run.seen)
+    ages = []
+    for moment in signs:
+        with suppress(ValueError):  # not a time that this program writes
+            ages.append(age_seconds(moment))
+    return min(ages, default=math.inf)

@@ -118,7 +118,10 @@ def carry_out(
         cluster: gives the client, if anything is to be computed.
         notify: called at each step.
     """
-    work = _Work.of(location, make_plan(study, stored_choice(location)))
+    plan = make_plan(study, stored_choice(location))
+    # Planning may take minutes.
+    claim.require(location)
+    work = _Work.of(location, plan)
     computed: set[int] = set()
     with Journal(work.store, claim) as journal:
         missing = work.missing()
@@ -138,14 +141,16 @@ def carry_out(
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                     notify(progress)
 
+                work.withdraw_what_follows_from(missing)
                 for rounds_left in reversed(range(_MOST_ROUNDS)):
                     repaired, found = work.settle(client, crew, missing, note)
                     computed.update(missing, repaired)
                     choice = _grown(work.plan, found) if rounds_left else None
                     if choice is None:
                         break
-                    work = _Work.of(location, work.plan.on(choice))
-                    # It has laid out the records anew, that of the run with them.
+                    # The records are laid out anew, that of the run with them.
+                    with journal.paused():
+                        work = _Work.of(location, work.plan.on(choice))
                     journal.write("running")
                     missing = work.missing()
     return work.summary(computed)
@@ -188,6 +193,15 @@ class _Work:
                 "it is not there, or not all of it",
             )
         return rows_without_field(self.records, self.rows)
+
+    def withdraw_what_follows_from(self, rows: Sequence[int]) -> None:
+        """Withdraw what readers would take for facts about fields that are going to be replaced."""
+        replaced = {i for i in rows if self.records[i] is not None}
+        if replaced:
+            self.store.withdraw_tables()
+            self.store.write_qualities(
+                [record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)]
+            )
 
     def settle(
         self, client: Client, crew: Crew, missing: Sequence[int], notify: Notify

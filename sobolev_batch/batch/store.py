@@ -50,6 +50,7 @@ FIELD = "fourier/fourier"
 LABELS = "fourier/mesh"
 QUALITY = "fourier/quality"
 RECORD = "records/record"
+_MESHES = "meshes/mesh"
 _RECORDS, _RUN = "records", "run"
 # All other groups are tables, which the reduction makes.
 _GROUPS_OF_TASKS = ("fourier", _RECORDS)
@@ -147,10 +148,30 @@ class Store:
     def labels(self) -> tuple[str, ...]:
         """The label of each row.
 
+        Where they are damaged, those of the table of meshes serve, in the same order.
+
         Raises:
-            StoreError: the store cannot be reached or read.
+            DamageError: neither can be read.
+            StoreError: the store cannot be reached.
         """
-        return self._read_texts(LABELS)
+        labels = self._labels_of(LABELS)
+        if not labels and _MESHES in self.documents and self.array(_MESHES).shape == self.array(LABELS).shape:
+            labels = self._labels_of(_MESHES)
+        if not labels:
+            raise DamageError(
+                f"{self.path}: {LABELS} is damaged, and nothing else says which field is whose; remove the store and "
+                "run the study again",
+                "the labels are damaged",
+            )
+        return labels
+
+    def mend_labels(self) -> None:
+        """Write the labels again where they are damaged and the table of meshes has them."""
+        if not self._labels_of(LABELS):
+            labels = self.labels()
+            array = self.array(LABELS)
+            with self.location.access("written"):
+                array[:] = np.array(labels, dtype=object)
 
     def records(self) -> tuple[Record | None, ...]:
         """The completion record of each row, None where there is none that can be read."""
@@ -306,14 +327,16 @@ class Store:
 
     def lost_tables(self) -> tuple[str, ...]:
         """The arrays of tables that are not all there; nothing is read of them."""
-        return self._lost(self._tables(), self._table_groups())
+        lost = self._lost(self._tables(), self._table_groups())
+        # Errors of norms hang on it, and it is written with them.
+        return (*lost, *self._lost([QUALITY], [QUALITY])) if self._tables() else lost
 
     def damaged_arrays(self) -> dict[str, str]:
         """What is wrong with each small array, of tables and coordinates, that cannot be read."""
         coordinates = [LABELS, *(f"fourier/{name}" for name in AXES)]
         lost = {*self.lost_tables(), *self._lost(coordinates, coordinates)}
         damaged = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
-        for name in [*coordinates, *self._tables()]:
+        for name in [*coordinates, QUALITY, *self._tables()]:
             if name not in damaged and self.document(name).get("node_type") == "array":
                 try:
                     self._read(name, ...)
@@ -322,19 +345,22 @@ class Store:
         return damaged
 
     def _lost(self, names: Sequence[str], prefixes: Sequence[str]) -> tuple[str, ...]:
-        """Which of some arrays of one chunk are not there as long as they should be, by the sizes of keys."""
+        """Which of some arrays are not there as long as they should be, by the sizes of keys."""
         sizes = {key: size for prefix in prefixes for key, size in self.location.sizes(prefix).items()}
         lost = []
         for name in names:
             if self.document(name).get("node_type") != "array":
                 continue
             array = self.array(name)
-            found = sizes.get(f"{name}/{array.metadata.encode_chunk_key((0,) * array.ndim)}", 0)
             # Texts have no size that could be foretold.
             fixed = array.dtype.kind in "biufc"
-            expected = array.nbytes + _CHECKSUM_BYTES * bool(array.ndim)
-            if array.size and (found != expected if fixed else not found):
-                lost.append(name)
+            expected = math.prod(array.chunks) * array.dtype.itemsize + _CHECKSUM_BYTES * bool(array.ndim)
+            counts = (-(-n // m) for n, m in zip(array.shape, array.chunks, strict=True))
+            for number in np.ndindex(*counts):
+                found = sizes.get(f"{name}/{array.metadata.encode_chunk_key(number)}", 0)
+                if found != expected if fixed else not found:
+                    lost.append(name)
+                    break
         return tuple(lost)
 
     def table_attributes(self, group: str) -> dict[str, Any] | None:
@@ -354,6 +380,14 @@ class Store:
         return DamageError(
             f"{self.path}: the field of {self.labels()[row]} is damaged ({what}); run the study again", what, row
         )
+
+    def _labels_of(self, name: str) -> tuple[str, ...]:
+        """The labels that an array holds; none where it is damaged, or a part of it not there."""
+        try:
+            labels = self._read_texts(name)
+        except DamageError:
+            return ()
+        return labels if all(labels) else ()
 
     def _examine_records(self) -> tuple[tuple[Record | None, ...], dict[int, str]]:
         lines: list[str | DamageError]

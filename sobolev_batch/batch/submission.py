@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.errors import ClusterError, StoreError
 
 _log = logging.getLogger(__name__)
 
@@ -98,12 +98,12 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
     """
     location = Location.of(store)
     claim = Claim.of_this_process(run, outlives_process=True)
-    there = Claim.read(location)
-    if there is None or there.run != run:
-        _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
-        return
-    take(location, claim)
     try:
+        there = Claim.read(location)
+        if there is None or there.run != run:
+            _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
+            return
+        take(location, claim)
         with worker_client() as client:
             study = Study.from_table(table, folder=folder)
             carry_out(study, location, claim, nullcontext(client), lambda progress: None)
@@ -115,8 +115,9 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         _log.error("%s: the study could not be carried out: %s", store, error)
         # Most of what goes wrong is known by now to the run's own journal, but not that a file of the
         # study is missing on this machine.
-        if claim.is_on(location):
-            Journal(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
+        with suppress(StoreError):  # it may be what failed
+            if claim.is_on(location):
+                Journal(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
     give_up(location, claim)
 
 

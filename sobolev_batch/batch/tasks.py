@@ -17,7 +17,7 @@ from sobolev_batch.batch.equipment import backend_of
 from sobolev_batch.batch.records import Facts, Record, utc_now
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study import Backends
-from sobolev_batch.errors import InputError, LatticeError, StoreError
+from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.forecast import settle
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -44,6 +44,7 @@ class Job:
         key: of the row.
         member, similarity: the surface.
         lattice, transform, orders, aim: the field; see `Plan`.
+        fingerprint: of the member when the study was planned; empty if that is not to be checked.
         memory: what one transform may take besides its mesh and its block, in bytes.
         backend: "auto", "cpu" or "gpu".
     """
@@ -60,6 +61,7 @@ class Job:
     aim: Aim | None = None
     memory: float | None = None
     backend: Backends = "auto"
+    fingerprint: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,13 +96,26 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
     """
     started = time.perf_counter()
     try:
-        surface = job.similarity.apply(job.member.load())
+        surface = load_surface(job)
         part = _compute(job, surface, blocks)
         return replace(part, facts=facts_of(surface, part.facts.points), seconds=time.perf_counter() - started)
     except StoreError:
         raise
     except Exception as error:
         return Part(Facts(), time.perf_counter() - started, reason_of(job, error))
+
+
+def load_surface(job: Job) -> Surface:
+    """The surface of a job, in the study's unit.
+
+    Raises:
+        MeshError: it cannot be made, or is not the one that the study was planned with: its field would be
+            recorded under the key of another.
+    """
+    surface = job.similarity.apply(job.member.load())
+    if job.fingerprint and job.member.fingerprint_digest() != job.fingerprint:
+        raise MeshError("a file of it was changed while the study was going on; run the study again")
+    return surface
 
 
 def reason_of(job: Job, error: Exception) -> str:

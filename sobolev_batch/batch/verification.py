@@ -70,10 +70,10 @@ def verify(place: str | Path | Location, on_progress: Callable[[int, int], None]
         raise
     except StoreError as error:
         _log.info("%s: read without the right to write (%s)", store.path, error)
-        return _verify(store, on_progress, withdraw=False)
+        return _verify(store, on_progress, None)
     try:
         # Anew: the last run may have ended since.
-        return _verify(Store.open(place), on_progress, withdraw=True)
+        return _verify(Store.open(place), on_progress, claim)
     finally:
         give_up(store.location, claim)
 
@@ -90,24 +90,34 @@ def damaged_rows(client: Client, store: Store, records: Sequence[Record | None])
     return [row for row, what in zip(rows, found, strict=True) if what]
 
 
-def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, withdraw: bool) -> Verification:
+def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim: Claim | None) -> Verification:
     labels, records = store.labels(), store.records()
     complete = _complete(records)
     damaged = {row: f"its completion record is damaged ({what})" for row, what in store.damaged_records().items()}
+    whole = store.rows_with_whole_fields() if complete else set()
+
+    def damage_of(row: int) -> str:
+        return _damage_of(store, row, complete[row]) if row in whole else "it is not there, or of another length"
+
     with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
-        found = pool.map(lambda item: _damage_of(store, *item), complete.items())
+        found = pool.map(damage_of, complete)
         for done, (row, what) in enumerate(zip(complete, found, strict=True), 1):
             if what:
                 damaged[row] = what
             if on_progress is not None:
                 on_progress(done, len(complete))
     tables = store.damaged_arrays()
-    if withdraw and (damaged or tables):
+    withdraw = claim is not None and bool(damaged or tables)
+    if claim is not None and withdraw:
+        # Whoever has released the store may have changed it since.
+        claim.require(store.location)
+        # From a table, as long as there are some.
+        store.mend_labels()
         store.withdraw_tables()
         for row in damaged:
             store.write_record(row, None)
     fields = {labels[row]: damaged[row] for row in sorted(damaged)}
-    return Verification(store.path, len(complete), len(labels), fields, tables, withdraw and bool(damaged or tables))
+    return Verification(store.path, len(complete), len(labels), fields, tables, withdraw)
 
 
 def _complete(records: Sequence[Record | None]) -> dict[int, Record]:

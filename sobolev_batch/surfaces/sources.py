@@ -9,6 +9,7 @@ into a surface there. Other packages add sources through the entry point group
 from __future__ import annotations
 
 import hashlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -96,6 +97,14 @@ class Member(ABC):
         Raises:
             MeshError: a file that it depends on cannot be read.
         """
+
+    def fingerprint_digest(self) -> str:
+        """SHA-256 of the fingerprint.
+
+        Raises:
+            MeshError: as for `fingerprint`.
+        """
+        return hashlib.sha256(json.dumps(self.fingerprint(), sort_keys=True).encode()).hexdigest()
 
     def expected_size(self) -> Size:
         """What the surface and its making are going to take; what cannot be told counts as nothing.

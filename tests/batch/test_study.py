@@ -105,7 +105,7 @@ BROKEN = [
     ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
     ("scaling.mode", "fixed", "scale and origin belong to mode = 'fixed'"),
     ("reference", {}, "reference: no source is named None"),
-    ("reference", {"source": "spere"}, "reference: no source is named 'spere'; known are decimate, files, icosphere"),
+    ("reference", {"source": "spere"}, "reference: no source is named 'spere'; known are decimate, ellipsoid, "),
     ("reference", {"source": "os.system"}, "reference: no source is named 'os.system'"),
     ("reference", {"source": "sphere", "radius": 0}, "reference: radius: input should be greater than 0"),
     ("reference", {"source": "sphere", "radius": "1"}, "reference: radius: input should be a valid number"),

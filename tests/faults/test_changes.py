@@ -13,6 +13,7 @@ from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch import plan as plan_module
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table, variable
 
@@ -89,3 +90,20 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(
         with pytest.raises(StoreError, match=f"its schema has version {version}, this program reads 3; name another"):
             use(store_path)
     assert before == {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
+
+
+def test_a_file_that_changes_while_the_study_goes_on(folder: Path, store_path: Path, client: Client) -> None:
+    original = (folder / "b.off").read_bytes()
+
+    def change(progress: Progress) -> None:
+        if progress.stage == "cluster":
+            trimesh.creation.box((1.0, 1.0, 0.5)).export(folder / "b.off")
+
+    summary = run(study_of(folder), store_path, client, on_progress=change)
+    assert list(summary.failed) == ["f/b"]
+    assert "was changed while the study was going on" in summary.failed["f/b"]
+    (folder / "b.off").write_bytes(original)
+    assert run(study_of(folder), store_path, client).computed == ("f/b",)
+    tree = open_store(store_path)
+    distances = variable(tree, "convergence", "distance")
+    assert np.array_equal(distances.sel(mesh="f/a").values, distances.sel(mesh="f/b").values)

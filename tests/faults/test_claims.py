@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
 
@@ -15,6 +17,8 @@ import pytest
 from sobolev_batch import ClaimError, Study, release, run
 from sobolev_batch.batch.claim import CLAIM, Claim, claimed, take
 from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.records import utc_now
+from sobolev_batch.batch.store import Store
 from tests.faults.commands import command, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often.
@@ -61,7 +65,7 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
         refused = command("release", store_path)
         assert refused.returncode == 2
         assert f"process {first.pid} on" in refused.stderr
-        assert "was alive" in refused.stderr
+        assert "is alive" in refused.stderr
     finally:
         _, said = first.communicate("go on\n")
     assert first.returncode == 0, said
@@ -123,15 +127,20 @@ import sys
 import threading
 from sobolev_batch.batch.claim import Claim, take
 from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.records import utc_now
+from sobolev_batch.batch.store import Store
 take(Location.of(sys.argv[1]), Claim.of_this_process())
 print("taken", flush=True)
 threading.Event().wait()
 """
 
 
+@pytest.mark.parametrize("before", [None, "dead"])
 @pytest.mark.parametrize("place", ["folder", "memory://claims/a"])
-def test_of_many_at_once_one_has_it(place: str, tmp_path: Path) -> None:
+def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Path) -> None:
     location = Location.of(place if ":" in place else tmp_path / place)
+    here = Claim.of_this_process()
+    dead = replace(here, run="r", holder="h", process=here.process + "1")
     together = Barrier(8)
 
     def attempt(number: int) -> bool:
@@ -144,6 +153,8 @@ def test_of_many_at_once_one_has_it(place: str, tmp_path: Path) -> None:
 
     with ThreadPoolExecutor(8) as pool:
         for _ in range(20):
+            if before:
+                location.create(CLAIM, dead.to_json())
             assert sum(pool.map(attempt, range(8))) == 1
             location.discard(CLAIM)
 
@@ -154,6 +165,70 @@ def test_a_claim_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None
     location.create(CLAIM, text)
     with pytest.raises(ClaimError, match="a process that has not written its name"):
         take(location, Claim.of_this_process())
+
+
+def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, store_path: Path) -> None:
+    run(study, store_path, workers=1)
+    there = Store.open(store_path)
+    latest = there.read_run()
+    assert latest is not None
+    elsewhere = Claim("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z")
+    Location.of(store_path).create(CLAIM, elsewhere.to_json())
+    there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
+    with pytest.raises(ClaimError, match=r"process 12 on far\.example was alive \d s ago"):
+        release(store_path)
+    assert release(store_path, force=True) == elsewhere
+    # A claim that was just taken, before any sign of life; a store that cannot be read.
+    (store_path / "zarr.json").write_text("")
+    Location.of(store_path).create(CLAIM, replace(elsewhere, since=utc_now()).to_json())
+    with pytest.raises(ClaimError, match="was alive"):
+        release(store_path)
+    assert release(store_path, force=True) is not None
+
+
+def test_the_undead_count_as_gone(tmp_path: Path) -> None:
+    """A process that has ended and whose parent has not asked how."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", CLAIMING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    child.stdout.readline()
+    child.kill()
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    left = Claim.read(Location.of(tmp_path / "store"))
+    assert left is not None
+    assert left.is_of_the_dead
+    child.communicate()
+
+
+def test_a_full_disk_leaves_no_claim(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path / "store")], check=False)
+    assert done.returncode == 0
+    assert Claim.read(Location.of(tmp_path / "store")) is None
+
+
+FULL = """
+import resource, signal, sys
+from sobolev_batch import StoreError
+from sobolev_batch.batch.claim import Claim, take
+from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.records import utc_now
+from sobolev_batch.batch.store import Store
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
+try:
+    take(Location.of(sys.argv[1]), Claim.of_this_process())
+except StoreError:
+    sys.exit(0)
+sys.exit(1)
+"""
+
+
+def test_a_folder_of_the_users_stays(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with claimed(Location.of(tmp_path / "mine"), Claim.of_this_process()):
+        pass
+    assert (tmp_path / "mine").is_dir()
 
 
 def test_nothing_is_left_where_nothing_was_begun(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import DamageError, StoreError, Study, open_store, run, verify
+from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
+from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import small_table, variable
 from tests.faults.commands import command, write_toml
@@ -145,10 +147,66 @@ def test_a_damaged_record_counts_as_none(damage: Damage, store: Path, study: Stu
     assert verify(store).is_sound
 
 
-def test_damaged_labels_are_said(store: Path, study: Study, client: Client) -> None:
-    flip(store / "fourier/mesh/c/0")
-    with pytest.raises(StoreError, match="fourier/mesh is damaged"):
-        run(study, store, client)
+@pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
+def test_labels_come_from_the_table_of_meshes(
+    damage: Damage, store: Path, study: Study, finished_store: Path, client: Client
+) -> None:
+    damage(store / "fourier/mesh/c/0")
+    assert list(verify(store).tables) == ["fourier/mesh"]
+    assert run(study, store, client).computed == ()
+    assert verify(store).is_sound
+    assert_same_fields(store, finished_store)
+    # Without that table, nothing says which field is whose.
+    damage(store / "fourier/mesh/c/0")
+    damage(store / "meshes/mesh/c/0")
+    for use in (verify, lambda place: run(study, place, client)):
+        with pytest.raises(StoreError, match="fourier/mesh is damaged, and nothing else says which field is whose"):
+            use(store)
+
+
+def test_labels_that_an_extension_has_added(store: Path, client: Client) -> None:
+    more = [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3, 4]}]
+    study = Study.from_table(small_table(family=more))
+    assert run(study, store, client).computed == ("ico/4",)
+    for name in ("fourier/mesh", "fourier/quality"):
+        delete(store / name / "c/1")
+        assert list(verify(store).tables) == [name]
+        assert run(study, store, client).computed == ()
+        assert verify(store).is_sound
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
+def test_what_errors_hang_on_is_written_again(damage: Damage, store: Path, study: Study, client: Client) -> None:
+    damage(store / "fourier/quality/c/0")
+    assert list(verify(store).tables) == ["fourier/quality"]
+    assert run(study, store, client).computed == ()
+    assert verify(store).is_sound
+    field = variable(open_store(store), "fourier", "fourier").sel(mesh="ico/2")
+    assert np.isfinite(norm(field, -3.0)["error"].item())
+
+
+def test_sparse_chunks_and_stray_links(store: Path) -> None:
+    os.truncate(store / FIELD.format(row=2), 1 << 42)
+    (store / "norms" / ".#lock").symlink_to("/nonexistent")
+    assert verify(store).fields == {"ico/2": "it is not there, or of another length"}
+
+
+def test_fields_that_are_replaced_are_not_described_any_more(store: Path, tmp_path: Path, client: Client) -> None:
+    """A driver that is killed after a field and before the tables."""
+
+    def stop(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 1:
+            raise KeyboardInterrupt
+
+    study = Study.from_table(small_table(transform={"eps": 1e-7}))
+    with pytest.raises(KeyboardInterrupt):
+        run(study, store, client, on_progress=stop)
+    tree = open_store(store)
+    assert "convergence" not in tree.children
+    qualities = tree["fourier"].to_dataset()["quality"].values.tolist()
+    assert qualities == [""] * 5
+    assert run(study, store, client).failed == {}
+    assert verify(store).is_sound
 
 
 @pytest.mark.parametrize("damage", [truncate, empty, delete])
