@@ -28,6 +28,7 @@ from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submission import submit
 from sobolev_batch.batch.verification import verify
 from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.results.matrix import format_matrix
 from sobolev_batch.results.opening import open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
@@ -210,9 +211,11 @@ def release_command(store: Location, force: bool) -> None:
 @click.argument("store", type=Location.of)
 @click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
 @click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
-def table_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
-    """Print the convergence tables of STORE."""
-    click.echo(format_table(open_store(store), style, orders or None))
+@click.option("--matrix", is_flag=True, help="The distance of every mesh to every other instead.")
+def table_command(store: Location, style: Format, orders: tuple[float, ...], matrix: bool) -> None:
+    """Print the convergence tables of STORE, or its distance matrices."""
+    form = format_matrix if matrix else format_table
+    click.echo(form(open_store(store), style, orders or None))
 
 
 @cli.command("plot")

@@ -31,7 +31,7 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate")
 _NOTE = """\
 The true distance lies within its error: truncation (beyond xi_max; it can only
@@ -60,12 +60,9 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
     Raises:
         InputError: no tables in the store yet, or an order that it was not reduced for.
     """
-    if "convergence" not in tree.children:
-        raise InputError("the store has no tables yet: run the study to its end")
-    convergence = tree["convergence"].to_dataset().load()
-    meshes = tree["meshes"].to_dataset().load()
+    convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
     lines = []
-    for order in _chosen(convergence, orders):
+    for order in chosen_orders(convergence, orders):
         for i, label in enumerate(convergence["mesh"].values.tolist()):
             if label == convergence.attrs["reference"]:
                 continue
@@ -102,7 +99,7 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
         table = tabulate(
             cells,
             headers=_HEADERS,
-            tablefmt=_TABULATE_FORMATS[style],
+            tablefmt=TABULATE_FORMATS[style],
             disable_numparse=True,
             colalign=("left", *["right"] * (len(_HEADERS) - 1)),
         )
@@ -118,8 +115,25 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     return "\n\n".join(parts)
 
 
-def _chosen(convergence: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
-    there: list[float] = convergence["order"].values.tolist()
+def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
+    """A table of an open store, in memory unless it may stay where it is.
+
+    Raises:
+        InputError: there are no tables in the store yet.
+    """
+    if name not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    found = tree[name].to_dataset()
+    return found.load() if load else found
+
+
+def chosen_orders(table: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
+    """Those of a table's orders that are asked for; all of them by default.
+
+    Raises:
+        InputError: one is not there.
+    """
+    there: list[float] = table["order"].values.tolist()
     if orders is None:
         return there
     for order in orders:
