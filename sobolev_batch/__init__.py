@@ -36,9 +36,12 @@ if TYPE_CHECKING:
         StudyError,
     )
     from sobolev_batch.results.opening import open_store
+    from sobolev_batch.spectral.bands import spectrum
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.norms import distance, inner_product, norm
+    from sobolev_batch.spectral.proportion import proportion
+    from sobolev_batch.spectral.witness import witness
     from sobolev_batch.surfaces.icosphere import icosphere
     from sobolev_batch.surfaces.mesh import Mesh
     from sobolev_batch.surfaces.readers import read_mesh
@@ -73,11 +76,14 @@ __all__ = [
     "inner_product",
     "norm",
     "open_store",
+    "proportion",
     "read_mesh",
     "release",
     "run",
+    "spectrum",
     "submit",
     "verify",
+    "witness",
 ]
 
 
@@ -111,11 +117,14 @@ _MODULES = {
     "inner_product": "spectral.norms",
     "norm": "spectral.norms",
     "open_store": "results.opening",
+    "proportion": "spectral.proportion",
     "read_mesh": "surfaces.readers",
     "release": "batch.release",
     "run": "batch.run",
+    "spectrum": "spectral.bands",
     "submit": "batch.submission",
     "verify": "batch.verification",
+    "witness": "spectral.witness",
 }
 
 

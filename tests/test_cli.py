@@ -55,11 +55,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
     output, errors = (folder / "run.out").read_text(), (folder / "run.err").read_text()
     assert "Sobolev distance of order -10 to reference" in output
-    assert re.search(r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \de-\d\d\n", output)
+    assert re.search(
+        r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \de-\d\d +(\d+\.\d %)?\n", output
+    )
     assert "3 computed, 0 reused, 0 failed; store: storage/cli.zarr" in output
     assert re.search(r"dashboard: http://127\.0\.0\.1:\d+/status", errors)
     assert re.search(r"\[3/3\] \S+: complete, \d+\.\d\d s", errors)
-    assert max(map(len, output.splitlines())) <= 80
+    assert max(map(len, output.splitlines())) <= 100
 
 
 def test_a_second_run_reuses_everything_and_starts_no_cluster(folder: Path) -> None:
@@ -205,7 +207,7 @@ def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path) -> N
     (folder / "partly.toml").write_text(study)
     done = call("run", "partly.toml", "--workers", "1", folder=folder)
     assert done.returncode == 3
-    assert re.search(r"f/bad +missing +missing +missing +missing +missing\n", done.stdout)
+    assert re.search(r"f/bad( +missing){6}\n", done.stdout)
     assert "f/bad is failed: " in done.stdout
     assert "1 of 3 vertices have NaN" in done.stdout
     assert "Traceback" not in done.stderr

@@ -15,6 +15,7 @@ from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.budget import Assessed
 from sobolev_batch.spectral.convergence import observed_rates
+from sobolev_batch.spectral.proportion import Proportion
 
 Reals = NDArray[np.float64]
 
@@ -67,17 +68,19 @@ def convergence_dataset(
     rows: Sequence[Row],
     orders: Sequence[float],
     to_reference: Assessed,
+    proportion: Proportion,
     reference_norms: Assessed,
     sizes: Reals,
     reference: str,
     accuracy: Accuracy | None,
 ) -> xr.Dataset:
-    """Distances to the reference, relative ones, and observed rates within each family, all with errors.
+    """Distances to the reference, relative ones, and observed rates within each family, all with errors; their parts.
 
     Args:
         rows: the meshes.
         orders: s, each.
         to_reference: over (orders, meshes), NaN where missing.
+        proportion: of these distances, likewise.
         reference_norms: over (orders,).
         sizes: (meshes,) mean edge lengths.
         reference: label of the reference's row.
@@ -102,6 +105,8 @@ def convergence_dataset(
             **_with_errors("distance", ("mesh", "order"), to_reference),
             "relative": (("mesh", "order"), relative.T),
             "relative_error": (("mesh", "order"), (errors / norms + relative * norm_errors / norms).T),
+            "area_part": (("mesh", "order"), proportion.area.T, {"description": "a pure change of total area"}),
+            "shape_part": (("mesh", "order"), proportion.shape.T, {"description": "the rest; squares add up"}),
             "rate": (("mesh", "order"), rates.T),
             "rate_error": (("mesh", "order"), rate_errors.T),
             "resolved": (("mesh", "order"), (errors < distances).T),

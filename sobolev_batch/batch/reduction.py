@@ -12,6 +12,7 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.spectral.budget import Assessed, Sums, add_sums, assess, sums_of_shells
 from sobolev_batch.spectral.gram import Arrangement, differences
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.proportion import Proportion
 from sobolev_batch.spectral.shells import shell_sums
 
 Reals = NDArray[np.float64]
@@ -88,27 +89,37 @@ class Reducer:
     def _read_at_once(self) -> int:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
-    def norms(self, rows: Sequence[int]) -> tuple[Assessed, Assessed]:
-        """Norms of rows and their distances to the center, each over (orders, rows); NaN without a center."""
+    def norms(self, rows: Sequence[int]) -> tuple[Assessed, Assessed, Proportion]:
+        """Norms of rows, their distances to the center and the parts of these, each over (orders, rows).
+
+        Without a center, all but the norms is NaN.
+        """
         own = np.zeros((len(rows), self.lattice.shell_count))
-        to_center = np.full_like(own, np.nan if self.center is None else 0.0)
+        to_center, products = np.zeros_like(own), np.zeros_like(own)
+        of_center = np.zeros(self.lattice.shell_count)
         for number, block in enumerate(self.blocks):
             center = None if self.center is None else self._read([self.center], number)[0]
+            if center is not None:
+                of_center += shell_sums(center, None, self.lattice, block)
             for part in _parts(len(rows), self._read_at_once):
                 values = self._read(rows[part], number)
                 own[part] += shell_sums(values, None, self.lattice, block)
                 if center is not None:
                     values -= center
                     to_center[part] += shell_sums(values, None, self.lattice, block)
+                    centers = np.broadcast_to(center, values.shape)
+                    products[part] += shell_sums(values, centers, self.lattice, block)
         of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
         norms = self._assess(sums_of_shells(own, self.lattice, self.orders), *of_rows)
         if self.center is None:
-            return norms, Assessed(*(np.full_like(norms.values, np.nan) for _ in range(4)))
+            unknown = np.full_like(norms.values, np.nan)
+            return norms, Assessed(*[unknown] * 4), Proportion(*[unknown] * 3)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.center for row in rows], dtype=np.float64)
         areas = (of_rows[0] + self.areas[self.center]) * apart
         errors = (of_rows[1] + self.errors[:, [self.center]]) * apart
-        return norms, self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
+        distances = self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
+        return norms, distances, Proportion.of_shells(to_center, products, of_center, self.lattice, self.orders)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> Assessed:
         """Distances of rows to other rows, over (orders, rows, others).

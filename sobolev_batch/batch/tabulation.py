@@ -21,7 +21,11 @@ from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
+from sobolev_batch.spectral.proportion import Proportion
 from sobolev_batch.spectral.quality import Quality
+
+# Raise it whenever tables hold something that those of older versions lack: they are then made anew.
+TABLES_VERSION = 2
 
 Reals = NDArray[np.float64]
 _Call = tuple[Callable[..., Any], tuple[Sequence[int], ...]]
@@ -51,6 +55,7 @@ def tabulate_fields(
     center = reference if reference in complete else None
     reducer = _reducer(store, plan, records, center)
     norms, to_reference = (np.full((4, len(orders), len(rows)), np.nan) for _ in range(2))
+    proportions = np.full((3, len(orders), len(rows)), np.nan)
     every_pair = plan.study.pairs == "all"
     others = range(len(rows)) if every_pair else [reference]
     distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
@@ -70,11 +75,12 @@ def tabulate_fields(
             raise outcome
         tile, *other = call[1]
         if not other:
-            norms[..., tile], to_reference[..., tile] = (np.stack(list(found)) for found in outcome)
+            for table, found in zip((norms, to_reference, proportions), outcome, strict=True):
+                table[..., tile] = np.stack(list(found))
         else:
-            found = np.stack(list(outcome))
-            distances[..., np.array(tile)[:, None], np.array(other[0])] = found
-            distances[..., np.array(other[0])[:, None], np.array(tile)] = np.swapaxes(found, -1, -2)
+            pairs = np.stack(list(outcome))
+            distances[..., np.array(tile)[:, None], np.array(other[0])] = pairs
+            distances[..., np.array(other[0])[:, None], np.array(tile)] = np.swapaxes(pairs, -1, -2)
         notify(Progress("reduction", done, len(calls)))
 
     suspects = _deal(client, calls, resources, enter)
@@ -89,7 +95,7 @@ def tabulate_fields(
         distances[..., reference] = distances[..., reference, :] = to_reference
     else:
         distances[..., 0] = to_reference
-    _write_tables(store, plan, rows, records, norms, to_reference, distances, [rows[j] for j in others])
+    _write_tables(store, plan, rows, records, norms, to_reference, proportions, distances, [rows[j] for j in others])
     return Assessed(*to_reference)
 
 
@@ -136,6 +142,7 @@ def _write_tables(
     records: Sequence[Record | None],
     norms: Reals,
     to_reference: Reals,
+    proportions: Reals,
     distances: Reals,
     others: Sequence[Row],
 ) -> None:
@@ -147,6 +154,7 @@ def _write_tables(
         rows,
         orders,
         Assessed(*to_reference),
+        Proportion(*proportions),
         Assessed(*norms[..., reference]),
         sizes,
         plan.reference,
@@ -172,6 +180,7 @@ def are_tabulated(store: Store, plan: Plan, rows: Sequence[Row], records: Sequen
 
 def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
     parts = {
+        "version": TABLES_VERSION,
         "rows": [
             [
                 row.label,

@@ -26,18 +26,21 @@ _NUMBERS = (
     "discretisation",
     "relative",
     "relative_error",
+    "area_part",
+    "shape_part",
     "rate",
     "rate_error",
     "resolved",
     "within",
 )
 TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
-_HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate")
+_HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
 _NOTE = """\
 The true distance lies within its error: truncation (beyond xi_max; it can only
 raise the distance), aliasing (spacing of the lattice) and discretisation
 (quadrature and NUFFT) together. Lengths are in the study's unit. A distance
-marked * is not larger than its error; no rate is taken from it."""
+marked * is not larger than its error; no rate is taken from it. The column area
+tells which part of the squared distance a pure change of total area explains."""
 _ACCURACY_NOTE = """\
 The study asks for an error of at most {rtol:g} of each distance; where it is
 larger, the distance is marked !."""
@@ -52,10 +55,12 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
 
     Returns:
         Columns order, mesh, family, name, level, status, reason, triangles, edge_length, distance,
-        error, truncation, aliasing, discretisation, relative, relative_error, rate, rate_error,
-        resolved (whether the distance exceeds its error), within (whether the error is as small as
-        the study asks for). Lengths are in the study's unit. A mesh
-        that failed has NaN, never a number.
+        error, truncation, aliasing, discretisation, relative, relative_error, area_part
+        and shape_part (of the distance: what a pure change of total area explains, and the rest; their
+        squares add up to its square), rate, rate_error, resolved (whether the distance exceeds its
+        error), within (whether the error is as small as the study asks for). Lengths are in the study's
+        unit. A mesh that failed has NaN, never a number; so do the parts in a store whose tables were
+        made before there were any.
 
     Raises:
         InputError: no tables in the store yet, or an order that it was not reduced for.
@@ -73,7 +78,7 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
                     "order": order,
                     "mesh": label,
                     **{key: about[key].item() for key in ("family", "name", "level", "status", "reason", "triangles")},
-                    **{key: here[key].item() for key in _NUMBERS},
+                    **{key: here[key].item() if key in here else math.nan for key in _NUMBERS},
                 }
             )
     return pd.DataFrame(lines)
@@ -145,7 +150,7 @@ def chosen_orders(table: xr.Dataset, orders: Sequence[float] | None) -> list[flo
 
 def _cells(line: dict[str, Any]) -> list[str]:
     if line["status"] != "complete":
-        return [line["mesh"], *["missing"] * 5]
+        return [line["mesh"], *["missing"] * 6]
     return [
         line["mesh"],
         f"{line['triangles']:,}" if line["triangles"] else "",
@@ -153,7 +158,15 @@ def _cells(line: dict[str, Any]) -> list[str]:
         _with_error(line["distance"], line["error"], ".6e", ".0e") + _mark(line),
         _number(line["relative"], ".5e"),
         _with_error(line["rate"], line["rate_error"], ".3f", ".0e"),
+        _area_share(line),
     ]
+
+
+def _area_share(line: dict[str, Any]) -> str:
+    """Of a distance that is larger than its error, in per cent."""
+    if not line["resolved"] or math.isnan(line["area_part"]):
+        return ""
+    return f"{100 * (line['area_part'] / line['distance']) ** 2:.1f} %"
 
 
 def _mark(line: dict[str, Any]) -> str:

@@ -61,13 +61,13 @@ _DEVICE = threading.RLock()
 
 
 class Plan(Protocol):
-    """A type-1 plan in three dimensions, as finufft and cufinufft make it."""
+    """A plan in three dimensions, as finufft and cufinufft make it: of type 1 where nothing else is said."""
 
     def setpts(self, x: Array, y: Array, z: Array) -> None:
         """Set the angles of the points; references are kept, not copies."""
 
     def execute(self, data: Array) -> Array:
-        """Transform the strengths of the points."""
+        """Transform the strengths of the points; of type 2, the coefficients of the modes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +105,7 @@ class _Cpu(Backend):
         return array
 
     def plan(self, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
-        # Its warnings speak of thread counts and of tolerances, which are checked before they get here.
-        made: Plan = finufft.Plan(
-            1,
-            shape,
-            eps=eps,
-            isign=-1,
-            dtype=precision,
-            modeord=0,
-            nthreads=threads,
-            upsampfac=oversampling,
-            showwarn=0,
-        )
-        return made
+        return _finufft_plan(1, -1, shape, eps=eps, precision=precision, oversampling=oversampling, threads=threads)
 
     def __reduce__(self) -> str:
         return "CPU"
@@ -200,6 +188,29 @@ class Gpu(Backend):
 
 
 CPU: Backend = _Cpu("cpu", "finufft", CPU_COSTS)
+
+
+def evaluation_plan(shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
+    """A type-2 plan on the processor with the sign +1, whose modes of an axis of n samples start at -(n // 2)."""
+    return _finufft_plan(2, 1, shape, eps=eps, precision=precision, oversampling=oversampling, threads=threads)
+
+
+def _finufft_plan(
+    kind: int, sign: int, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int
+) -> Plan:
+    # Its warnings speak of thread counts and of tolerances, which are checked before they get here.
+    made: Plan = finufft.Plan(
+        kind,
+        shape,
+        eps=eps,
+        isign=sign,
+        dtype=precision,
+        modeord=0,
+        nthreads=threads,
+        upsampfac=oversampling,
+        showwarn=0,
+    )
+    return made
 
 
 @cache

@@ -13,23 +13,27 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
-from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.operands import (
+    check_surface,
+    field_of,
+    over_orders,
+    pair_of,
+    quality_of,
+    read_blocks,
+    shells_of,
+)
 from sobolev_batch.spectral.pursuit import pursue
-from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.shells import Complexes, Orders, Reals, check_orders, shell_sums, shell_weights
+from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
-from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Surface
 from sobolev_batch.surfaces.sphere import Sphere
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
-# Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
-_BLOCK_SAMPLES = 1 << 22
 
 
 def norm(
@@ -68,9 +72,9 @@ def norm(
     if isinstance(a, Sphere) and lattice is None:
         values = np.array([sphere_norm(a, s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
-    field = _field(a, lattice, orders)
+    field = field_of(a, lattice, orders)
     known = Lattice.of(field)
-    return _dataset("norm", order, _assessed(_shells_of(field, None, known), known, orders, [field]))
+    return _dataset("norm", order, _assessed(shells_of(field, None, known), known, orders, [field]))
 
 
 def inner_product(
@@ -85,13 +89,13 @@ def inner_product(
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         values = np.array([sphere_inner_product(a, b, s) for s in orders])
     else:
-        first, second = _pair(a, b, lattice, orders)
+        first, second = pair_of(a, b, lattice, orders)
         known = Lattice.of(first)
         sums = np.zeros(known.shell_count)
-        for block in known.split(_BLOCK_SAMPLES):
-            sums += shell_sums(_read(first, known, block), _read(second, known, block), known, block)
+        for block, (values_a, values_b) in read_blocks(known, first, second):
+            sums += shell_sums(values_a, values_b, known, block)
         values = shell_weights(known, orders) @ sums
-    return _over_orders(order, {"inner_product": values})
+    return over_orders(order, {"inner_product": values})
 
 
 def distance(
@@ -134,9 +138,9 @@ def distance(
         values = np.array([sphere_distance(a, b, s) for s in orders])
         squares = np.array([sphere_norm(a, s) ** 2 + sphere_norm(b, s) ** 2 for s in orders])
         return _dataset("distance", order, _closed_form(values, squares))
-    first, second = _pair(a, b, lattice, orders)
+    first, second = pair_of(a, b, lattice, orders)
     known = Lattice.of(first)
-    return _dataset("distance", order, _assessed(_shells_of(first, second, known), known, orders, [first, second]))
+    return _dataset("distance", order, _assessed(shells_of(first, second, known), known, orders, [first, second]))
 
 
 def _accuracy(rtol: float, memory: float | None) -> Accuracy:
@@ -151,7 +155,7 @@ def _pursued(
     if lattice is not None or len(surfaces) < len(parts):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     for surface in surfaces:
-        _check_surface(surface)
+        check_surface(surface)
     orders = check_orders(order)
     found = pursue(surfaces, orders, accuracy, threads=os.cpu_count() or 1, what=f"the {name}")
     dataset = _dataset(name, order, found.assessed)
@@ -168,18 +172,9 @@ def _pursued(
     )
 
 
-def _shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
-    """Shell sums of |a|², or of |a - b|²."""
-    sums = np.zeros(lattice.shell_count)
-    for block in lattice.split(_BLOCK_SAMPLES):
-        values = _read(a, lattice, block)
-        sums += shell_sums(values if b is None else values - _read(b, lattice, block), None, lattice, block)
-    return sums
-
-
 def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> Assessed:
     """The norm of what the fields add up to, with the error that follows from their qualities."""
-    qualities = [_quality(field) for field in fields]
+    qualities = [quality_of(field) for field in fields]
     known = [quality for quality in qualities if quality is not None]
     complete = len(known) == len(qualities)
     found = assess(
@@ -196,54 +191,11 @@ def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Se
     return Assessed(found.values, unknown, unknown, unknown)
 
 
-def _quality(field: xr.DataArray) -> Quality | None:
-    """What a field says of its own quality: an attribute of computed fields, a coordinate of stored ones."""
-    text = field.coords["quality"].item() if "quality" in field.coords else field.attrs.get("quality")
-    return Quality.from_json(text) if text else None
-
-
 def _closed_form(values: Reals, squares: Reals) -> Assessed:
     """Values whose squares are exact up to a small part of some squared norms."""
     nothing = np.zeros_like(values)
     rounding = _CLOSED_FORM_ACCURACY * squares
     return Assessed(values, nothing, nothing, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0))
-
-
-def _read(field: xr.DataArray, lattice: Lattice, block: Block) -> Complexes:
-    places = dict(zip(AXES, lattice.place(block), strict=True))
-    return np.asarray(field.isel(places).transpose(*AXES).values)
-
-
-def _pair(
-    a: Surface | xr.DataArray, b: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[float]
-) -> tuple[xr.DataArray, xr.DataArray]:
-    """Both as fields; a surface beside a field is transformed on the field's lattice."""
-    known = [Lattice.of(x) for x in (a, b) if isinstance(x, xr.DataArray)]
-    if lattice is not None:
-        known.append(lattice)
-    for other in known[1:]:
-        if other.M != known[0].M or not np.isclose(other.xi_max, known[0].xi_max, rtol=1e-12, atol=0):
-            raise LatticeError(f"fields on different lattices cannot be compared: {known[0]} and {other}")
-    common = known[0] if known else None
-    return _field(a, common, orders), _field(b, common, orders)
-
-
-def _field(a: Surface | xr.DataArray, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
-    if isinstance(a, xr.DataArray):
-        if set(a.dims) != set(AXES):
-            raise LatticeError(
-                f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
-            )
-        return a
-    _check_surface(a)
-    if lattice is None:
-        raise InputError("a mesh needs a lattice or an accuracy: pass lattice=Lattice(xi_max=..., M=...) or rtol=...")
-    return fourier_transform(a, lattice, orders=orders)
-
-
-def _check_surface(a: object) -> None:
-    if not isinstance(a, Mesh | Sphere):
-        raise InputError(f"expected a Mesh, a Sphere or a Fourier field, found {type(a).__name__}")
 
 
 def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:
@@ -255,12 +207,4 @@ def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:
         "aliasing": found.aliasing,
         "discretisation": found.discretisation,
     }
-    return _over_orders(order, parts)
-
-
-def _over_orders(order: Orders, values: dict[str, Reals]) -> xr.Dataset:
-    """Values over the dimension `order`; a single number asked for comes back without dimensions."""
-    orders = np.asarray(order, dtype=np.float64)
-    dimensions = ("order",) * orders.ndim
-    variables = {name: (dimensions, np.asarray(value).reshape(orders.shape)) for name, value in values.items()}
-    return xr.Dataset(variables, coords={"order": (dimensions, orders)})
+    return over_orders(order, parts)

@@ -1,17 +1,18 @@
-"""The one primitive: transform weighted points onto a block of the lattice."""
+"""The one primitive: transform weighted points onto a block of the lattice; and its adjoint."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.spectral.arrays import Array, combine
-from sobolev_batch.spectral.backends import CPU, Backend, Plan
-from sobolev_batch.spectral.division import Shape, fastest_oversampling, parts
+from sobolev_batch.spectral.backends import CPU, Backend, Plan, evaluation_plan
+from sobolev_batch.spectral.division import Division, Shape, fastest_oversampling, parts
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.phases import cosine_and_sine
-from sobolev_batch.spectral.precision import Precision
+from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.quadrature import WeightedPoints
 
 
@@ -76,6 +77,59 @@ def transform_points(
     if total is None:
         total = backend.upload(np.zeros(block.shape, dtype=precision))
     return total, count
+
+
+def evaluate_at(
+    coordinates: NDArray[np.float64],
+    coefficients: Complexes,
+    lattice: Lattice,
+    block: Block,
+    *,
+    eps: float,
+    precision: Precision = "complex128",
+    threads: int = 1,
+    division: Division,
+) -> NDArray[np.float64]:
+    """Re Σ_ξ c(ξ) exp(+2πi ξ·x_j) over the frequencies ξ of a block, by a type-2 nonuniform FFT.
+
+    Args:
+        coordinates: (3, n), the points x_j in units of length; all |coordinates| below
+            ``lattice.half_period`` (not checked here: points beyond it fold silently).
+        coefficients: c, complex (m, *block.shape): m sums over the same frequencies.
+        lattice: where ξ lies.
+        block: which part of it; what several blocks give adds up.
+        eps: accuracy relative to Σ|c|; the error reached is a small multiple of it.
+        precision: of the arithmetic.
+        threads: of FINUFFT. The result changes with it by rounding.
+        division: points evaluated at a time, and parts of the block: see `Division`.
+
+    Returns:
+        float64 (m, n).
+
+    Source: see `transform_points`.
+    """
+    real = np.float32 if precision == "complex64" else np.float64
+    count = coordinates.shape[1]
+    values = np.zeros((len(coefficients), count))
+    sigma = division.oversampling or fastest_oversampling(count, block.size, eps, precision, CPU.costs)
+    shape = division.shape or block.shape
+    plan = evaluation_plan(shape, eps=eps, precision=precision, oversampling=sigma, threads=threads)
+    scale = 2 * np.pi * lattice.spacing
+    for first in range(0, count, division.batch):
+        here = slice(first, min(first + division.batch, count))
+        angles = scale * coordinates[:, here]
+        ones = np.ones(angles.shape[1])
+        plan.setpts(*(np.ascontiguousarray(row, dtype=real) for row in angles))
+        for part, (x, y, z) in parts(block, division.shape):
+            # Conjugates of the phases that move the window of modes to the part.
+            turns = _turned(ones, angles, part, precision)
+            for i, whole in enumerate(coefficients):
+                # Parts at the high ends reach beyond the block.
+                modes = np.zeros(shape, dtype=precision)
+                modes[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start] = whole[x, y, z]
+                found = plan.execute(modes)
+                values[i, here] += found.real * turns.real + found.imag * turns.imag
+    return values
 
 
 def _turned(weights: Array, angles: Array, block: Block, precision: Precision) -> Array:

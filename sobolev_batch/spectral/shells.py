@@ -16,6 +16,8 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
 _LOWEST_ORDER = -100.0
+# Samples weighed at a time.
+_BLOCK_SAMPLES = 1 << 20
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:
@@ -68,3 +70,12 @@ def shell_weights(lattice: Lattice, orders: Sequence[float]) -> Reals:
     """(1 + h²|k|²)^s for each order and each shell, float64 (orders, lattice.shell_count)."""
     squares = 1 + lattice.spacing**2 * np.arange(lattice.shell_count, dtype=np.float64)
     return np.stack([squares**s for s in orders])
+
+
+def shell_volumes(lattice: Lattice) -> Reals:
+    """The trapezoidal weights of each shell together, float64 (lattice.shell_count,): what a field of ones sums to."""
+    volumes = np.zeros(lattice.shell_count)
+    for block in lattice.split(_BLOCK_SAMPLES):
+        weights = lattice.trapezoid_weights(block).ravel()
+        volumes += np.bincount(lattice.shells(block).ravel(), weights=weights, minlength=lattice.shell_count)
+    return volumes

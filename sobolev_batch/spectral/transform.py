@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends import CPU, Backend, Gpu
@@ -278,11 +279,23 @@ def require_inside(mesh: Mesh, lattice: Lattice) -> None:
     Raises:
         LatticeError: some |coordinate| is not below 1/(2h).
     """
-    reach = max(float(np.abs(bound).max()) for bound in mesh.bounds)
+    _require_reach(max(float(np.abs(bound).max()) for bound in mesh.bounds), lattice, "the mesh reaches", "mesh")
+
+
+def require_points_inside(coordinates: NDArray[np.float64], lattice: Lattice) -> None:
+    """Refuse points (3, n) that do not lie within the lattice's period.
+
+    Raises:
+        LatticeError: some |coordinate| is not below 1/(2h).
+    """
+    _require_reach(float(np.abs(coordinates).max(initial=0.0)), lattice, "the points reach", "points")
+
+
+def _require_reach(reach: float, lattice: Lattice, subject: str, what: str) -> None:
     if not reach < lattice.half_period:
         needed = 2 * math.floor(2 * lattice.xi_max * reach) + 2
         raise LatticeError(
-            f"the mesh reaches to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
+            f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take M >= {needed}, a smaller xi_max, or scale the mesh down"
+            f"take M >= {needed}, a smaller xi_max, or scale the {what} down"
         )

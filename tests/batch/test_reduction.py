@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Study
+from sobolev_batch import Sphere, Study, fourier_transform, proportion
 from sobolev_batch.batch import plan as planning
 from sobolev_batch.batch import reduction
 from sobolev_batch.batch.plan import make_plan
@@ -118,8 +119,25 @@ def test_tiles_whose_others_are_all_other_rows(
 
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
-    norms, to_center = reducer.norms([1, 3, CENTER])
+    norms, to_center, parts = reducer.norms([1, 3, CENTER])
     weights = shell_weights(reducer.lattice, reducer.orders)
     for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
         sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
         assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)
+    # The parts of each distance are those of the library, whatever the chunks.
+    for row, area, shape in zip([1, 3], parts.area.T, parts.shape.T, strict=False):
+        known = fourier_transform(Sphere(0.1), reducer.lattice)
+        alone = proportion(known.copy(data=fields[row]), known.copy(data=fields[CENTER]), reducer.orders)
+        assert area == pytest.approx(alone["area_part"].values, rel=1e-10)
+        assert shape == pytest.approx(alone["shape_part"].values, rel=1e-12)
+    assert (parts.area**2 + parts.shape**2)[:, :2] == pytest.approx(to_center.values[:, :2] ** 2, rel=1e-12)
+    assert (parts.area[:, 2] == 0).all()
+    assert (parts.shape[:, 2] == 0).all()
+
+
+def test_without_a_center_there_are_norms_alone(reducer: Reducer) -> None:
+    norms, to_center, parts = replace(reducer, center=None).norms([1, 3])
+    assert norms.values == pytest.approx(reducer.norms([1, 3])[0].values, rel=1e-14)
+    for found in (*to_center, *parts):
+        assert found.shape == norms.values.shape
+        assert np.isnan(found).all()

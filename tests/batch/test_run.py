@@ -9,8 +9,20 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import Mesh, Sphere, StoreError, Study, distance, fourier_transform, icosphere, open_store, run
+from sobolev_batch import (
+    Mesh,
+    Sphere,
+    StoreError,
+    Study,
+    distance,
+    fourier_transform,
+    icosphere,
+    open_store,
+    proportion,
+    run,
+)
 from sobolev_batch.batch import plan as plan_module
+from sobolev_batch.batch import tabulation
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
 from tests.batch.conftest import SMALL_LATTICE, small_table, variable
@@ -26,6 +38,10 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
         assert found == pytest.approx(distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
+        split = proportion(expected, sphere, study.orders)
+        for name in ("area_part", "shape_part"):
+            stored_part = variable(tree, "convergence", name).sel(mesh=f"ico/{level}").values
+            assert stored_part == pytest.approx(split[name].values, rel=1e-8)
         # A field straight from the store serves as an argument too.
         assert distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
     matrix = variable(tree, "distances", "distance").sel(order=-10.0).values
@@ -83,6 +99,21 @@ def test_a_second_run_computes_nothing(client: Client, study: Study, store_path:
     assert second.reused == first.computed
     assert steps == []
     assert stamps == {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
+
+
+def test_tables_of_an_older_version_are_made_anew(
+    client: Client, study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(tabulation, "TABLES_VERSION", tabulation.TABLES_VERSION - 1)
+        run(study, store_path, client)
+    steps: list[Progress] = []
+    again = run(study, store_path, client, on_progress=steps.append)
+    assert again.computed == ()
+    assert {step.stage for step in steps} >= {"reduction"}
+    steps.clear()
+    run(study, store_path, client, on_progress=steps.append)
+    assert steps == []
 
 
 def test_only_what_changed_is_computed_again(client: Client, tmp_path: Path, store_path: Path) -> None:

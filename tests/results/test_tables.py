@@ -28,6 +28,8 @@ def tree() -> xr.DataTree:
             **dict.fromkeys(("aliasing", "discretisation"), (("mesh", "order"), 0 * distance)),
             "relative": (("mesh", "order"), distance / 4),
             "relative_error": (("mesh", "order"), distance / 4000),
+            "area_part": (("mesh", "order"), 0.6 * distance),
+            "shape_part": (("mesh", "order"), 0.8 * distance),
             "rate": (("mesh", "order"), rate),
             "rate_error": (("mesh", "order"), 0.01 * rate),
             "resolved": (("mesh", "order"), np.array([[True, True], [True, False], [False, False], [False, False]])),
@@ -61,10 +63,20 @@ def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
     text = format_table(tree, "text", [-2.5])
     assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
     rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
-    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "±", "8e-04!", "2.00000e-01"]
+    assert rows[0] == ["f_1/0", "20", "0.2", "8.000000e-01", "±", "8e-04!", "2.00000e-01", "36.0", "%"]
     assert rows[1] == ["f_1/1", "1,280", "0.1", "2.000000e-01", "±", "2e-04*", "5.00000e-02", "2.000", "±", "2e-02"]
-    assert rows[2] == ["f_1/2", *["missing"] * 5]
+    assert rows[2] == ["f_1/2", *["missing"] * 6]
     assert text.endswith("f_1/2 is failed: no 50% of it | is <there>")
+
+
+def test_lines_stay_readable(tree: xr.DataTree) -> None:
+    assert max(map(len, format_table(tree).splitlines())) <= 100
+
+
+def test_tables_made_before_there_were_parts(tree: xr.DataTree) -> None:
+    tree["convergence"] = xr.DataTree(tree["convergence"].to_dataset().drop_vars(["area_part", "shape_part"]))
+    assert np.isnan(convergence_frame(tree)["area_part"]).all()
+    assert "%" not in format_table(tree, "text", [-10.0]).split("f_1/2")[0]
 
 
 def test_every_order_gets_a_table(tree: xr.DataTree) -> None:

@@ -1,0 +1,131 @@
+"""The witness function: where two surfaces differ, as the norm sees it."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.backends import CPU
+from sobolev_batch.spectral.division import Division, Load, divide
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.nufft import evaluate_at
+from sobolev_batch.spectral.operands import BLOCK_SAMPLES, Operand, pair_of, read_blocks
+from sobolev_batch.spectral.precision import Precision, item_bytes
+from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
+from sobolev_batch.spectral.transform import DEFAULT_BATCH, Transform, require_points_inside
+
+# Of a given memory, what blocks of fields may take; the rest is for the NUFFT.
+_SHARE_OF_BLOCKS = 0.25
+# Samples of a block besides their coefficients: two fields, their difference, its weights and its shells.
+_SAMPLE_BYTES = 72
+
+
+def witness(
+    a: Operand,
+    b: Operand,
+    order: Orders,
+    points: ArrayLike,
+    *,
+    lattice: Lattice | None = None,
+    eps: float | None = None,
+    dtype: Precision = "complex128",
+    threads: int | None = None,
+    memory: float | None = None,
+) -> xr.DataArray:
+    """The witness function of two surfaces at points: positive where a has area that b lacks.
+
+    It is w(x) = ∫ (1 + |ξ|²)^s (a^ - b^)(ξ) exp(+2πi ξ·x) dξ, by the trapezoidal rule over the lattice
+    as in norms: the difference of the area measures, smoothed by the norm's kernel. Its integral
+    against that difference is the squared distance, ∫ w d(a - b) = ||a - b||_s².
+
+    Args:
+        a: a field from `fourier_transform` or a store, or a surface.
+        b: a field on the same lattice, or a surface.
+        order: one order s < -1/2, or several.
+        points: x, real (n, 3), in the fields' unit of length: such as ``mesh.vertices`` of a mesh that
+            the similarity of its study has been applied to.
+        lattice: where surfaces are to be transformed; a field brings its own.
+        eps: accuracy of the NUFFT, relative to the sum of the moduli of all terms; the error reached is
+            a small multiple of it. Default 1e-9, or 1e-6 in single precision.
+        dtype: "complex128" or "complex64": of the arithmetic, whatever the fields'.
+        threads: of the NUFFT; default one per core.
+        memory: bytes that this may take besides points, result and fields held in memory; default as
+            many as are fastest.
+
+    Returns:
+        `witness` over (order, point), or (point,) of a single order: float64, or float32 with complex64.
+        In 1 / unit length. NaN everywhere if a field has NaN anywhere.
+
+    Raises:
+        OrderError: an order that is not below -1/2.
+        LatticeError: fields on different lattices, or points beyond the half period 1/(2h).
+        InputError: points that are not finite or not (n, 3); a mesh, and no lattice from anywhere;
+            settings out of range; too little memory.
+
+    Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
+    """
+    orders = check_orders(order)
+    settings = Transform(eps, dtype)
+    coordinates = _coordinates(points)
+    first, second = pair_of(a, b, lattice, orders)
+    known = Lattice.of(first)
+    require_points_inside(coordinates, known)
+    weights = shell_weights(known, orders)
+    values = np.zeros((len(orders), coordinates.shape[1]))
+    largest = BLOCK_SAMPLES
+    if memory is not None:
+        each = _SAMPLE_BYTES + len(orders) * item_bytes(dtype)
+        largest = max(1, min(largest, int(_SHARE_OF_BLOCKS * memory / each)))
+    # FINUFFT refuses to evaluate nothing.
+    for block, (of_a, of_b) in read_blocks(known, first, second, largest=largest) if values.size else ():
+        difference = (of_a - of_b) * known.trapezoid_weights(block)
+        shells = known.shells(block)
+        coefficients = np.empty((len(orders), *block.shape), dtype=dtype)
+        for row, weight in zip(coefficients, weights, strict=True):
+            np.multiply(difference, weight[shells], out=row, casting="same_kind")
+        division = Division(DEFAULT_BATCH)
+        if memory is not None:
+            load = Load(coordinates.shape[1], coordinates.shape[1], fill=1.0)
+            left = (1 - _SHARE_OF_BLOCKS) * memory
+            division = divide(block.shape, settings.accuracy, dtype, load, CPU.costs, memory=left, batch=DEFAULT_BATCH)
+        values += evaluate_at(
+            coordinates,
+            coefficients,
+            known,
+            block,
+            eps=settings.accuracy,
+            precision=dtype,
+            threads=threads or os.cpu_count() or 1,
+            division=division,
+        )
+    return _labelled(values.astype(np.float32 if dtype == "complex64" else np.float64), order)
+
+
+def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
+    """Points as one contiguous row per axis (3, n)."""
+    try:
+        found = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"points must be real numbers (n, 3): {error}") from error
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise InputError(f"points must have the shape (n, 3), found {found.shape}")
+    bad = int(np.count_nonzero(~np.isfinite(found).all(axis=1)))
+    if bad:
+        raise InputError(f"{bad} of {len(found)} points have NaN or infinite coordinates")
+    return np.ascontiguousarray(found.T)
+
+
+def _labelled(values: NDArray[np.floating], order: Orders) -> xr.DataArray:
+    orders = np.asarray(order, dtype=np.float64)
+    dimensions = ("order",) * orders.ndim
+    return xr.DataArray(
+        values.reshape(*orders.shape, values.shape[1]),
+        dims=(*dimensions, "point"),
+        coords={"order": (dimensions, orders)},
+        name="witness",
+        attrs={"description": "positive where the first surface has area that the second lacks"},
+    )
