@@ -27,7 +27,8 @@ _MOST_CURVES = 5
 MOST_MESHES = 300
 _MOST_TICKS = 40
 _LONGEST_LABEL = 24
-_MOST_NAMED_PLACES = 25
+# Of the width of a map.
+_NAMES_APART = 0.08
 _LEGEND_ENTRIES = 12
 
 
@@ -137,7 +138,7 @@ def matrix_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> F
             axes.set_axis_off()
             continue
         image = axes.imshow(
-            np.ma.masked_less_equal(values, 0), norm=LogNorm(seen.min(), seen.max()), cmap="cividis", aspect="equal"
+            np.ma.masked_less_equal(values, 0), norm=LogNorm(seen.min(), seen.max()), cmap="viridis", aspect="equal"
         )
         figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit")
         labels = [_plain(_shortened(matrix.labels[i])) for i in arranged]
@@ -159,7 +160,7 @@ def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figu
     matrices = _matrices(tree, orders)
     styles, family_of = _styles(tree), _families(tree)
     reference = tree["convergence"].attrs["reference"]
-    figure = Figure(figsize=(_WIDTH_INCHES, 5.0 * len(matrices)), layout="constrained")
+    figure = Figure(figsize=(_WIDTH_INCHES, 4.4 * len(matrices)), layout="constrained")
     panels = figure.subplots(len(matrices), 1, squeeze=False)[:, 0]
     for axes, matrix in zip(panels, matrices, strict=True):
         found = Map.of(matrix.values)
@@ -172,10 +173,13 @@ def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figu
         if reference in matrix.labels:
             place = found.places[matrix.labels.index(reference)]
             axes.plot(*place, "*", color="black", markersize=12, label=_plain(reference))
-        if len(matrix.labels) <= _MOST_NAMED_PLACES:
-            for label, place in zip(matrix.labels, found.places, strict=True):
-                text = _plain(_shortened(label.partition("/")[2] or label))
-                axes.annotate(text, place, (4, 4), textcoords="offset points", fontsize=6.5, alpha=0.8)
+        for i in _spread(found.places, first=matrix.labels.index(reference) if reference in matrix.labels else 0):
+            if matrix.labels[i] == reference:
+                continue
+            name = matrix.labels[i].partition("/")[2] or matrix.labels[i]
+            axes.annotate(
+                _plain(_shortened(name)), found.places[i], (5, 4), textcoords="offset points", fontsize=7, alpha=0.8
+            )
         share = "" if np.isnan(found.share) else f", {found.share:.0%} of the variance"
         axes.set_title(f"map of the meshes at order {matrix.order:g}{share}{_cut(tree, matrix)}", fontsize="medium")
         axes.set_aspect("equal", adjustable="datalim")
@@ -192,6 +196,16 @@ def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:
     span = np.array([sizes.min(), sizes.max()])
     middle_size, middle_error = np.exp(np.log(sizes).mean()), np.exp(np.log(errors).mean())
     axes.loglog(span, middle_error * (span / middle_size) ** 2, "k:", linewidth=1, label="slope 2")
+
+
+def _spread(places: np.ndarray, first: int) -> list[int]:
+    """Points that are far enough from each other for their names to be read."""
+    kept: list[int] = []
+    apart = _NAMES_APART * np.ptp(places, axis=0).max(initial=0.0)
+    for i in sorted(range(len(places)), key=lambda i: i != first):
+        if all(np.linalg.norm(places[i] - places[j]) > apart for j in kept):
+            kept.append(i)
+    return kept
 
 
 def _reach(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
