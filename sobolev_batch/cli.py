@@ -232,6 +232,24 @@ def plot_command(store: Location, output: Path) -> None:
         click.echo(path)
 
 
+@cli.command("report")
+@click.argument("store", type=Location.of)
+@click.option("--output", type=click.Path(path_type=Path), default="report.html", show_default=True, help="The page.")
+@click.option(
+    *("--folder", "folder"),
+    type=click.Path(path_type=Path),
+    default=".",
+    help="Where relative paths in the study start: its meshes are shown if they are there. [default: here]",
+)
+@click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Show this mesh; may be repeated.")
+def report_command(store: Location, output: Path, folder: Path, witnesses: tuple[str, ...]) -> None:
+    """Write everything about STORE into one HTML page that needs nothing besides itself."""
+    # Imported here, as for plots.
+    from sobolev_batch.results.report import write_report
+
+    click.echo(write_report(store, output, folder=folder, witnesses=witnesses))
+
+
 @cli.command("compare")
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))

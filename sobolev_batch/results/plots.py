@@ -10,13 +10,18 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from sobolev_batch.errors import StoreError
 from sobolev_batch.results.arrangement import Map, alike_together
 from sobolev_batch.results.matrix import Matrix
+from sobolev_batch.results.portraits import Portrait
 from sobolev_batch.results.tables import convergence_frame
+from sobolev_batch.results.wavelengths import Wavelengths
 
 # P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
 COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#777777")
@@ -30,13 +35,16 @@ _LONGEST_LABEL = 24
 # Of the width of a map.
 _NAMES_APART = 0.08
 _LEGEND_ENTRIES = 12
+# Smaller ones are not written into their cells.
+_SMALLEST_SHARE = 0.005
+_MOST_VIEWS = 3
 
 
 def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """Draw the pictures of an open store into a folder.
 
-    convergence.png and transform.png; where the study asks for the distances of all pairs, matrix.png
-    and map.png too.
+    convergence.png, transform.png and, of the first order, spectrum.png; where the study asks for the
+    distances of all pairs, matrix.png and map.png too.
 
     Returns:
         The paths of the pictures.
@@ -49,6 +57,8 @@ def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     pictures = {"convergence.png": convergence_figure(tree), "transform.png": transform_figure(tree)}
     if "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]:
         pictures |= {"matrix.png": matrix_figure(tree), "map.png": map_figure(tree)}
+    if "similarity" in tree.attrs and (spectra := Wavelengths.of_store(tree)) is not None:
+        pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders[0])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, figure in pictures.items():
@@ -189,6 +199,63 @@ def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figu
         if matrix.labels:
             _legend(axes)
     return figure
+
+
+def spectrum_figure(spectra: Wavelengths, order: float) -> Figure:
+    """Which part of each mesh's squared distance lies at which wavelengths, at one order."""
+    shares = spectra.shares[:, spectra.orders.index(order)]
+    figure = Figure(figsize=(_WIDTH_INCHES, 1.6 + 0.24 * len(spectra.labels)), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
+    figure.colorbar(image, ax=axes, label="share of the squared distance", format=PercentFormatter(1.0, 0))
+    for (i, j), share in np.ndenumerate(shares):
+        if share >= _SMALLEST_SHARE:
+            color = "white" if share > 0.6 * np.nanmax(shares) else "black"
+            axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
+    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5)
+    axes.set_yticks(range(len(spectra.labels)), [_plain(_shortened(label)) for label in spectra.labels], fontsize=7.5)
+    axes.set_xlabel("wavelength in the study's unit")
+    axes.set_title(f"where the differences lie, order {order:g}")
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def witness_figure(portrait: Portrait) -> Figure:
+    """A mesh seen from one side, coloured by its witness function, one panel per order."""
+    shown = portrait.values[:_MOST_VIEWS]
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    seen = portrait.vertices @ _view()
+    corners = seen[portrait.triangles]
+    # Painted from the back, darker where a triangle turns away from the eye.
+    painted = np.argsort(corners[:, :, 2].mean(axis=1))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    light = 0.55 + 0.45 * np.abs(normals[:, 2]) / np.where(lengths > 0, lengths, 1.0)
+    for axes, order, values in zip(panels, portrait.orders, shown, strict=False):
+        largest = float(np.abs(values).max()) or 1.0
+        scale = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
+        colors = scale.to_rgba(values[portrait.triangles].mean(axis=1))
+        colors[:, :3] *= light[:, None]
+        patches = PolyCollection(corners[painted, :, :2], facecolors=colors[painted], edgecolors="face", linewidths=0.1)
+        patches.set_rasterized(True)
+        axes.add_collection(patches)
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        axes.set_title(f"order {order:g}", fontsize="medium")
+        figure.colorbar(scale, ax=axes, shrink=0.8, orientation="horizontal").ax.tick_params(labelsize="x-small")
+    figure.suptitle(_plain(portrait.label), fontsize="medium")
+    return figure
+
+
+def _view() -> np.ndarray:
+    """From the coordinates of space to right, up and towards the eye, which looks from the front and above."""
+    eye = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
+    right = np.cross([0, 0, 1], eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(eye, right), eye], axis=1)
 
 
 def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:
