@@ -38,8 +38,13 @@ class Cell:
 
     @classmethod
     def count(cls, value: int) -> Cell:
-        """A whole number, none where it is zero."""
-        return cls(f"{value:,}", value) if value else cls("")
+        """A whole number."""
+        return cls(f"{value:,}", value)
+
+    @classmethod
+    def words(cls, text: str) -> Cell:
+        """A text, which may be empty."""
+        return cls(text, text or None)
 
     @classmethod
     def number(cls, value: float, text: str | None = None, mark: str = "") -> Cell:
@@ -156,6 +161,11 @@ def minus(text: str) -> str:
     return text.replace("-", "−")
 
 
+def moment(text: str) -> str:
+    """A time of a record, in UTC, for people."""
+    return text.replace("T", " ").removesuffix("Z")
+
+
 def study_text(table: Mapping[str, Any]) -> str:
     """The study file of a study as it was written, up to comments and layout."""
     return tomli_w.dumps(_without_nothing(table))
@@ -189,12 +199,12 @@ def _line(line: Mapping[str, Any], families: tuple[str, ...]) -> Line:
     mark = "" if line["within"] else "above rtol"
     area = math.nan if not line["distance"] else (line["area_part"] / line["distance"]) ** 2
     cells = (
-        Cell.count(line["triangles"]),
+        Cell.count(line["triangles"]) if line["triangles"] else Cell(""),
         Cell.number(line["edge_length"]),
         Cell.number(line["distance"], distance.value, mark if line["resolved"] else "below its error"),
         Cell.number(line["error"], distance.error),
-        Cell.number(line["relative"], f"{relative.value} ± {relative.error}"),
-        Cell.number(line["rate"], f"{rate.value} ± {rate.error}"),
+        Cell.number(line["relative"], relative.together),
+        Cell.number(line["rate"], rate.together),
         Cell.number(area, f"{100 * area:.1f} %"),
     )
     return Line(*about, cells)
@@ -204,17 +214,22 @@ def _mesh_lines(meshes: xr.Dataset, families: tuple[str, ...]) -> Iterator[Line]
     columns = {name: meshes[name].values.tolist() for name in meshes.data_vars}
     for i, label in enumerate(meshes["mesh"].values.tolist()):
         about = {name: values[i] for name, values in columns.items()}
+        is_mesh = about["triangles"] > 0
+        counts = {
+            name: Cell.count(about[name]) if is_mesh else Cell("")
+            for name in ("vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges")
+        }
         cells = (
-            Cell.count(about["vertices"]),
-            Cell.count(about["triangles"]),
-            Cell.count(about["points"]),
-            Cell.number(about["area"]),
-            Cell.count(about["boundary_edges"]),
-            Cell.count(about["nonmanifold_edges"]),
+            counts["vertices"],
+            counts["triangles"],
             Cell.number(about["seconds"], f"{about['seconds']:.2f}"),
-            Cell(about["backend"], about["backend"] or None),
-            Cell(about["worker"], about["worker"] or None),
-            Cell(about["finished"].replace("T", " ").removesuffix("Z"), about["finished"] or None),
+            Cell.words(about["backend"]),
+            Cell.number(about["area"]),
+            counts["boundary_edges"],
+            counts["nonmanifold_edges"],
+            counts["points"],
+            Cell.words(about["worker"]),
+            Cell.words(moment(about["finished"])),
         )
         yield Line(label, families.index(about["family"]), about["status"], cells)
 
@@ -258,7 +273,7 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
     own = 1 / similarity["scale"]
     of = meshes["family"].values.tolist()
     for family in table["family"]:
-        yield f"family {family['name']}", f"{of.count(family['name'])} meshes: {_described(family)}"
+        yield f"family {family['name']}", f"{_counted(of.count(family['name']))}: {_described(family)}"
     yield "reference", f"{study['reference']}: {_described(table['reference'])}"
     if "accuracy" in table:
         yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
@@ -284,6 +299,10 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
         )
 
 
+def _counted(count: int) -> str:
+    return "1 mesh" if count == 1 else f"{count:,} meshes"
+
+
 def _described(entry: Mapping[str, Any]) -> str:
     """A source and its parameters, on one line."""
     parts = [f"{key} {_value(value)}" for key, value in entry.items() if key not in ("name", "source")]
@@ -305,7 +324,7 @@ def _run(status: Status) -> Iterator[tuple[str, str]]:
     if status.run is not None:
         yield "state", status.run.state
         yield "driver", status.run.driver
-        yield "begun", f"{status.run.started}"
-        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", status.run.seen
+        yield "begun", moment(status.run.started)
+        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", moment(status.run.seen)
         if status.run.error:
             yield "error", status.run.error

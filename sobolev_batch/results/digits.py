@@ -9,35 +9,44 @@ from dataclasses import dataclass
 _MOST_DIGITS = 7
 _DIGITS_WITHOUT_ERROR = 4
 # Beyond these, powers of ten are easier to read.
-_SMALLEST_PLAIN, _LARGEST_PLAIN = 1e-3, 1e5
+_SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
+_POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
 class Digits:
-    """A number and its error in words, both empty where there is none.
+    """A number and its error in words, empty where there is none.
 
     Attributes:
         value: with as many digits as the error leaves it.
         error: with two digits, rounded up: the true value still lies within it.
+        together: both, in units of the same power of ten.
     """
 
     value: str
     error: str = ""
+    together: str = ""
 
     @classmethod
     def of(cls, value: float, error: float = math.nan) -> Digits:
         """The digits of a value whose error may be unknown (NaN)."""
         if not math.isfinite(value):
             return cls("")
-        if not math.isfinite(error):
-            return cls(_shown(value, _magnitude(value) - _DIGITS_WITHOUT_ERROR + 1))
-        if error == 0:
-            return cls(_shown(value, _magnitude(value) - _MOST_DIGITS + 1), "0")
+        if not math.isfinite(error) or error == 0:
+            digits, word = (_MOST_DIGITS, "0") if error == 0 else (_DIGITS_WITHOUT_ERROR, "")
+            shown = _shown(value, _magnitude(value) - digits + 1)
+            return cls(shown, word, f"{shown} ± {word or '?'}")
         rounded = _rounded_up(error, 2)
         # A value below its error keeps a digit, to be told from zero.
         last = min(_magnitude(value), max(_magnitude(rounded) - 1, _magnitude(value) - _MOST_DIGITS + 1))
-        return cls(_shown(value, last), _shown(rounded, _magnitude(rounded) - 1))
+        shown, shown_error = _shown(value, last), _shown(rounded, _magnitude(rounded) - 1)
+        together = f"{shown} ± {shown_error}"
+        if _POWER in shown and rounded < value * 1e3 and _magnitude(rounded) - 1 >= last:
+            power = _magnitude(round(value, -last))
+            unit, decimals = 10.0**power, max(0, power - last)
+            together = f"({value / unit:.{decimals}f} ± {rounded / unit:.{decimals}f}){_power(power)}"
+        return cls(shown, shown_error, together)
 
 
 def concise(value: float, error: float) -> str:
@@ -76,7 +85,11 @@ def _shown(value: float, last: int) -> str:
     value = round(value, -last)
     if value == 0:
         return "0"
-    if _SMALLEST_PLAIN <= abs(value) < _LARGEST_PLAIN:
+    if abs(value) < _LARGEST_PLAIN and (abs(value) >= _SMALLEST_PLAIN or last >= _LAST_PLAIN):
         return f"{value:.{max(0, -last)}f}"
     power = _magnitude(value)
-    return f"{value / 10.0**power:.{max(0, power - last)}f} × 10{str(power).translate(_SUPERSCRIPTS)}"
+    return f"{value / 10.0**power:.{max(0, power - last)}f}{_power(power)}"
+
+
+def _power(power: int) -> str:
+    return _POWER + str(power).translate(_SUPERSCRIPTS)

@@ -83,7 +83,7 @@ def make_report(place: str | Path | Location, *, folder: str | Path = ".", witne
         import plotly.offline
         from jinja2.utils import htmlsafe_json_dumps
 
-        from sobolev_batch.results.account import Account
+        from sobolev_batch.results.account import Account, moment
     except ImportError as error:
         raise InputError(
             f"a report needs the library {error.name}, which is not installed; "
@@ -110,7 +110,7 @@ def make_report(place: str | Path | Location, *, folder: str | Path = ".", witne
         # Nothing else may run, and nothing be fetched, whatever names and reasons hold.
         policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
         f"script-src {' '.join(map(_fingerprint, scripts))}; base-uri 'none'; form-action 'none'",
-        written=utc_now().replace("T", " ").removesuffix("Z"),
+        written=moment(utc_now()),
     )
 
 

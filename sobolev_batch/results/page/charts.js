@@ -3,7 +3,9 @@
 (() => {
   const data = JSON.parse(document.getElementById("data").textContent);
   const symbols = ["circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x"];
-  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+  // Named one by one: others would hand data to a service.
+  const flat = [["toImage", "zoomIn2d", "zoomOut2d", "resetScale2d"]];
+  const space = [["toImage", "resetCameraDefault3d"]];
   const viridis = [[0, "#440154"], [0.25, "#3b528b"], [0.5, "#21918c"], [0.75, "#5ec962"], [1, "#fde725"]];
   const state = { order: 0, portrait: 0, alike: true };
 
@@ -27,16 +29,29 @@
       font: { family: color("sans"), size: narrow() ? 11 : 13, color: color("ink") },
       margin: { l: 10, r: 10, t: 30, b: 10 },
       hoverlabel: { align: "left", bgcolor: color("raised"), bordercolor: color("line"), font: { color: color("ink") } },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: color("soft"), activecolor: color("accent") },
       legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
       xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis },
       ...others,
     };
   };
 
-  const draw = (name, traces, changes) => {
+  const draw = (name, traces, changes, modeBarButtons = flat) => {
     const place = document.getElementById(`chart-${name}`);
-    if (!place) return;
+    const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
     Plotly.react(place, traces, layout({ height: Number(place.dataset.height), ...changes }), config);
+  };
+
+  // Of a logarithmic axis: powers of ten, and 2 and 5 between them where there are few of these.
+  const ticks = (values) => {
+    const [low, high] = [Math.log10(Math.min(...values)), Math.log10(Math.max(...values))];
+    const steps = high - low > 2.5 ? [1] : [1, 2, 5];
+    const found = [];
+    for (let power = Math.floor(low) - 1; power <= Math.ceil(high); power += 1) {
+      for (const step of steps) found.push(Number(`${step}e${power}`));
+    }
+    const plainly = low > -4 && high < 5;
+    return { tickvals: found, ticktext: found.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
   };
 
   const convergence = () => {
@@ -66,10 +81,9 @@
         line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
       });
     }
-    const log = { type: "log", dtick: "D2", exponentformat: "power" };
     draw("convergence", traces, {
-      xaxis: { ...log, title: { text: "mean edge length" } },
-      yaxis: { ...log, dtick: 1, title: { text: narrow() ? "" : "relative distance" } },
+      xaxis: { type: "log", ...(all("sizes").length ? ticks(all("sizes")) : {}), title: { text: "mean edge length" } },
+      yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "relative distance" } },
     });
   };
 
@@ -84,10 +98,10 @@
       `${plain(labels[i])}<br>${plain(labels[j])}<br>${number(at(values, i, j))} ± ${at(errors, i, j) ?? "?"}`);
     const seen = z.flat().filter((value) => value !== null);
     const [low, high] = seen.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
-    const ticks = [];
-    for (let power = Math.ceil(low); power <= high; power += 1) ticks.push(power);
+    const powers = [];
+    for (let power = Math.ceil(low); power <= high; power += 1) powers.push(power);
     // Within one power of ten, its ends say more.
-    if (ticks.length < 2 && seen.length) ticks.splice(0, 1, low, high);
+    if (powers.length < 2 && seen.length) powers.splice(0, 1, low, high);
     const room = narrow() ? 14 : 28;
     const named = labels.length <= 60;
     const axis = {
@@ -100,11 +114,11 @@
       ygap: labels.length < 60 ? 1 : 0,
       colorbar: {
         title: { text: "distance", side: narrow() ? "top" : "right" }, outlinewidth: 0, thickness: 12,
-        tickvals: ticks, ticktext: ticks.map((v) => (Number.isInteger(v) ? `10<sup>${v}</sup>` : (10 ** v).toPrecision(2))),
+        tickvals: powers, ticktext: powers.map((v) => (Number.isInteger(v) ? `10<sup>${v}</sup>` : (10 ** v).toPrecision(2))),
         ...(narrow() ? { orientation: "h", y: -0.02, yanchor: "top" } : {}),
       },
     }], {
-      height: narrow() ? 520 : 680,
+      height: narrow() ? innerWidth + 20 : 680,
       xaxis: { ...axis, tickangle: -90, side: narrow() ? "top" : "bottom", showticklabels: named && !narrow() },
       yaxis: { ...axis, autorange: "reversed", scaleanchor: "x", scaleratio: 1 },
     });
@@ -148,7 +162,7 @@
     }], {
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
-        title: { text: "wavelength in the study’s unit" }, tickangle: narrow() ? -60 : 0,
+        title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: narrow() ? -60 : 0,
       },
       yaxis: {
         autorange: "reversed", showgrid: false, zeroline: false, ticks: "", tickvals: labels.map((_, i) => i),
@@ -177,7 +191,7 @@
         xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "data",
         camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
       },
-    });
+    }, space);
   };
 
   const drawings = [convergence, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum,
