@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         StoreError,
         StudyError,
     )
+    from sobolev_batch.results.accessor import SobolevAccessor
     from sobolev_batch.results.opening import open_store
     from sobolev_batch.spectral.bands import spectrum
     from sobolev_batch.spectral.fields import fourier_transform
@@ -62,6 +63,7 @@ __all__ = [
     "MeshError",
     "OrderError",
     "Similarity",
+    "SobolevAccessor",
     "SobolevBatchError",
     "Sphere",
     "StoreError",
@@ -103,6 +105,7 @@ _MODULES = {
     "MeshError": "errors",
     "OrderError": "errors",
     "Similarity": "surfaces.similarity",
+    "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
     "Sphere": "surfaces.sphere",
     "StoreError": "errors",
@@ -126,11 +129,16 @@ _MODULES = {
     "verify": "batch.verification",
     "witness": "spectral.witness",
 }
+# What makes or opens fields registers their accessor `field.sobolev` with xarray, which would be too much
+# for the import of the package.
+_FIELD_MAKERS = ("fourier_transform", "open_store")
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _FIELD_MAKERS:
+        import_module(f"{__name__}.{_MODULES['SobolevAccessor']}")
     value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value
     return value

@@ -29,6 +29,7 @@ def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
     (example,) = blocks("README.md", "python")
     small = (ROOT / "workflows" / "icosphere.toml").read_text().replace("M = 128", "M = 32")
     (tmp_path / "workflows").mkdir()
+    (tmp_path / "storage").mkdir()
     (tmp_path / "workflows" / "icosphere.toml").write_text(small.replace("3, 4, 5, 6, 7]", "3]"))
     # The first block of store.md opens the store, the others query it.
     queries = "".join(blocks("docs/store.md", "python"))

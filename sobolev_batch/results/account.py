@@ -130,7 +130,7 @@ class Account:
             InputError: the store has no tables yet.
         """
         meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
-        attributes = tree.attrs
+        attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
         families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
         orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
         tables, left_out = _tables(tree, families)

@@ -154,10 +154,12 @@ def _table(here: xr.Dataset, columns: Sequence[int], style: Format) -> str:
     """One table; of a symmetric matrix the part below the diagonal."""
     labels, others = (here[name].values.tolist() for name in ("mesh", "other"))
     rows = [row for row in _rows(here, columns) if any(row[1:])]
-    return tabulate(
-        rows,
-        headers=["", *(str(labels.index(others[j]) + 1) for j in columns)],
-        tablefmt=TABULATE_FORMATS[style],
-        disable_numparse=True,
-        colalign=("left", *["right"] * len(columns)),
+    return str(
+        tabulate(
+            rows,
+            headers=["", *(str(labels.index(others[j]) + 1) for j in columns)],
+            tablefmt=TABULATE_FORMATS[style],
+            disable_numparse=True,
+            colalign=("left", *["right"] * len(columns)),
+        )
     )

@@ -20,7 +20,7 @@ from sobolev_batch.errors import StoreError
 from sobolev_batch.results.arrangement import Map, alike_together
 from sobolev_batch.results.matrix import Matrix
 from sobolev_batch.results.portraits import Portrait
-from sobolev_batch.results.tables import convergence_frame
+from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
 
 # P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
@@ -282,7 +282,7 @@ def _reach(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 
 def _matrices(tree: xr.DataTree, orders: Sequence[float] | None) -> list[Matrix]:
-    chosen = tree["convergence"]["order"].values.tolist() if orders is None else orders
+    chosen = chosen_orders(finished_group(tree, "convergence"), orders)
     return [matrix for order in chosen if (matrix := Matrix.of(tree, order, MOST_MESHES)) is not None]
 
 
@@ -302,7 +302,7 @@ def _styles(tree: xr.DataTree) -> dict[str, tuple[str, str]]:
 
 
 def _cut(tree: xr.DataTree, matrix: Matrix) -> str:
-    complete = int((tree["meshes"]["status"].values == "complete").sum())
+    complete = int(np.count_nonzero(tree["meshes"].to_dataset()["status"].values == "complete"))
     return f"\nthe first {len(matrix.labels)} of {complete} meshes" if len(matrix.labels) < complete else ""
 
 

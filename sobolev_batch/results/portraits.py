@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.plan import members_of
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.tables import convergence_frame
+from sobolev_batch.results.tables import convergence_frame, finished_group
 from sobolev_batch.spectral.witness import witness
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.similarity import Similarity
@@ -146,11 +146,11 @@ def _made_again(
 
 
 def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, count: int) -> Portrait:
-    orders = tuple(tree["convergence"]["order"].values.tolist())
+    orders = tuple(finished_group(tree, "convergence")["order"].values.tolist())
     # A closed mesh has half as many vertices as triangles.
     room = 2 * _MOST_VALUES // (count * len(orders))
     vertices, triangles = _for_looking(mesh, min(_MOST_TRIANGLES, room))
-    fields = tree["fourier"]["fourier"]
+    fields = tree["fourier"].to_dataset()["fourier"]
     reference = tree["convergence"].attrs["reference"]
     # Collapsed edges may leave the period by a hair where the mesh fills it.
     inside = np.clip(vertices, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0))

@@ -28,6 +28,7 @@ from sobolev_batch.results.plots import (
 )
 from sobolev_batch.results.portraits import Gallery, make_gallery
 from sobolev_batch.results.status import Status
+from sobolev_batch.results.tables import finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
 
 _PAGE = "page"
@@ -124,7 +125,7 @@ def _fingerprint(script: str) -> str:
 
 
 def _stills(tree: xr.DataTree, spectra: Wavelengths | None, gallery: Gallery) -> dict[str, list[Still]]:
-    orders = tree["convergence"]["order"].values.tolist()[:_MOST_STILL_ORDERS]
+    orders = finished_group(tree, "convergence")["order"].values.tolist()[:_MOST_STILL_ORDERS]
     found = {
         "convergence": _drawn(
             lambda s: convergence_figure(tree, [s]), "Relative distance over mean edge length", orders

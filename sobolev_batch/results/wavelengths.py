@@ -57,7 +57,7 @@ class Wavelengths:
         others = [label for label in complete if label != reference]
         if reference not in complete or not others:
             return None
-        fields = tree["fourier"]["fourier"]
+        fields = tree["fourier"].to_dataset()["fourier"]
         room = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
         labels = spread(others, max(1, min(_MOST_MESHES, room)))
         known = tuple(chosen_orders(convergence, orders))

@@ -29,7 +29,15 @@ _NAN = float("nan")
     ],
 )
 def test_errors_decide_on_digits(value: float, error: float, shown: str, shown_error: str) -> None:
-    assert Digits.of(value, error) == Digits(shown, shown_error)
+    found = Digits.of(value, error)
+    assert (found.value, found.error) == (shown, shown_error)
+
+
+def test_both_have_one_power_of_ten() -> None:
+    assert Digits.of(0.04733, 4.6e-4).together == "0.04733 ± 0.00046"
+    assert Digits.of(2.0123e-5, 1.23e-8).together == "(2.0123 ± 0.0013) × 10⁻⁵"
+    assert Digits.of(1.84604e-5, 1.1e-12).together == "1.846040 × 10⁻⁵ ± 1.1 × 10⁻¹²"
+    assert Digits.of(12.0).together == "12.00 ± ?"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,134 @@
+"""`field.sobolev` on computed and stored fields, single ones and stacks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import dask.array
+import numpy as np
+import pytest
+import xarray as xr
+
+import sobolev_batch as sb
+from sobolev_batch.results.accessor import SobolevAccessor
+from tests.batch.conftest import SMALL_LATTICE, client, finished_store, variable
+
+__all__ = ["client", "finished_store"]  # fixtures
+
+ORDERS = [-1.5, -7.0]
+
+
+@pytest.fixture(scope="module")
+def fields() -> tuple[xr.DataArray, xr.DataArray]:
+    lattice = sb.Lattice(4.0, 32)
+    return sb.fourier_transform(sb.icosphere(1), lattice), sb.fourier_transform(sb.Sphere(), lattice)
+
+
+def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
+    a, b = fields
+    points = sb.icosphere(1).vertices
+    own: SobolevAccessor = a.sobolev
+    xr.testing.assert_identical(own.norm(ORDERS), sb.norm(a, ORDERS))
+    xr.testing.assert_identical(own.distance(b, -2), sb.distance(a, b, -2))
+    xr.testing.assert_identical(own.inner_product(b, ORDERS), sb.inner_product(a, b, ORDERS))
+    xr.testing.assert_identical(own.proportion(b, ORDERS), sb.proportion(a, b, ORDERS))
+    xr.testing.assert_identical(own.spectrum(b, ORDERS, bands=5), sb.spectrum(a, b, ORDERS, bands=5))
+    xr.testing.assert_identical(own.spectrum(None, -2), sb.spectrum(a, None, -2))
+    xr.testing.assert_allclose(own.witness(b, -2, points), sb.witness(a, b, -2, points), rtol=1e-9)
+    assert own.lattice == sb.Lattice(4.0, 32)
+    assert own.full().shape == (33, 33, 33)
+    assert own.at([[0.0, 0.0, 0.0]]).item() == pytest.approx(sb.icosphere(1).area, rel=1e-6)
+    # A surface beside a field is transformed on its lattice.
+    assert own.distance(sb.Sphere(), -2)["distance"].item() == pytest.approx(own.distance(b, -2)["distance"].item())
+
+
+def test_stored_fields_at_any_order(finished_store: Path) -> None:
+    tree = xr.open_datatree(finished_store, engine="zarr")
+    stored = variable(tree, "fourier", "fourier")
+    field, reference = stored.sel(mesh="ico/3"), stored.sel(mesh="reference")
+    fresh = sb.distance(sb.icosphere(3), sb.Sphere(), -3.5, lattice=SMALL_LATTICE)
+    found = field.sobolev.distance(reference, -3.5)
+    assert found["distance"].item() == pytest.approx(fresh["distance"].item(), rel=1e-6)
+    assert np.isfinite(found["error"].item())
+    frequencies = np.array([[0.3, -0.2, 0.111], [-0.5, 0.4, -0.25]])
+    expected = sb.fourier_transform(sb.icosphere(3), sb.Lattice(3.0, 60)).sobolev.at(frequencies)
+    values = field.sobolev.at(frequencies)
+    # The small lattice's period is hardly more than the sphere: the error is large, and said so.
+    assert (np.abs(values - expected) <= values["error"] + expected["error"] + 1e-6).all()
+
+
+def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
+    tree = sb.open_store(finished_store)
+    stored = variable(tree, "fourier", "fourier")
+    levels = stored.sel(mesh=["ico/1", "ico/3"])
+    norms = levels.sobolev.norm(ORDERS)
+    assert norms["norm"].dims == ("mesh", "order")
+    assert norms["mesh"].values.tolist() == ["ico/1", "ico/3"]
+    distances = levels.sobolev.distance(stored.sel(mesh="reference"), [-10.0, -3.0])
+    tables = variable(tree, "convergence", "distance").sel(mesh=["ico/1", "ico/3"], order=[-10.0, -3.0])
+    assert distances["distance"].values == pytest.approx(tables.values, rel=1e-9)
+    shape = levels.sobolev.proportion(sb.Sphere(), -3.0)["shape_part"]
+    assert shape.values == pytest.approx(
+        variable(tree, "convergence", "shape_part").sel(mesh=["ico/1", "ico/3"], order=-3.0).values, rel=1e-6
+    )
+    bands = levels.sobolev.spectrum(None, -2.0)
+    assert bands["squared"].dims == ("mesh", "band")
+    assert bands["lower"].dims == ("band",)
+    for i, label in enumerate(["ico/1", "ico/3"]):
+        one = stored.sel(mesh=label)
+        assert norms["norm"].values[i] == pytest.approx(sb.norm(one, ORDERS)["norm"].values, rel=1e-13)
+
+
+def test_a_stack_is_not_held_at_once() -> None:
+    field = sb.fourier_transform(sb.Sphere(0.5), sb.Lattice(4.0, 48))
+    count = 40
+    sizes = (count, *field.shape)
+    lazy = xr.DataArray(
+        dask.array.ones(sizes, dtype=np.complex128, chunks=(1, *field.shape)),
+        dims=("mesh", *field.dims),
+        coords={**field.coords, "mesh": np.arange(count)},
+    )
+    lazy.isel(mesh=slice(1)).sobolev.norm(-2.0)
+    tracemalloc.start()
+    try:
+        found = lazy.sobolev.norm(-2.0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found["norm"].shape == (count,)
+    assert lazy.nbytes > 35e6
+    assert peak < lazy.nbytes / 4
+
+
+def test_refusals(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
+    a, b = fields
+    stack = xr.concat([a, b], dim="mesh")
+    with pytest.raises(sb.LatticeError, match="select one mesh"):
+        stack.sobolev.witness(b, -2, np.zeros((1, 3)))
+    with pytest.raises(sb.LatticeError, match="one dimension, found time, mesh"):
+        stack.expand_dims(time=2).sobolev.norm(-2)
+    with pytest.raises(sb.InputError, match="no fields along mesh"):
+        stack.isel(mesh=slice(0)).sobolev.norm(-2)
+    with pytest.raises(sb.LatticeError, match="needs the coordinates"):
+        repr(xr.DataArray(np.zeros(3)).sobolev.lattice)
+    with pytest.raises(sb.LatticeError, match="different lattices"):
+        a.sobolev.distance(sb.fourier_transform(sb.Sphere(), sb.Lattice(4.0, 30)), -2)
+    # Without labels, the dimension alone.
+    assert "mesh" not in stack.sobolev.norm(-2).coords
+
+
+@pytest.mark.parametrize("name", ["fourier_transform", "open_store", "SobolevAccessor"])
+def test_is_registered_when_fields_are_made_and_not_before(name: str) -> None:
+    code = f"""
+import sys
+import sobolev_batch as sb
+assert "xarray" not in sys.modules
+sb.{name}
+import xarray
+assert "sobolev" in dir(xarray.DataArray)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,61 @@
+"""The gallery of docs/queries.md runs as it stands, and answers what it says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from tests.batch.conftest import client
+from tests.test_readme import ROOT, blocks
+
+__all__ = ["client"]  # a fixture
+
+
+def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "workflows" / "icosphere.toml").read_text(encoding="utf-8")
+    small = text.replace("M = 128", "M = 48").replace("3, 4, 5, 6, 7]", "3]")
+    assert small.count("M = 48") == 1
+    (tmp_path / "study.toml").write_text(small)
+    (tmp_path / "storage").mkdir()
+    study = sb.Study.from_toml(tmp_path / "study.toml")
+    sb.run(study, tmp_path / "storage" / "icosphere.zarr", client)
+    monkeypatch.chdir(tmp_path)
+    queries = blocks("docs/queries.md", "python")
+    numbers = re.findall(r"^\*\*(\d+)\.", (ROOT / "docs" / "queries.md").read_text(encoding="utf-8"), re.M)
+    assert numbers == [str(i + 1) for i in range(10)]
+    assert len(queries) == 11
+    found: dict[str, Any] = {}
+    for query in queries:
+        exec(compile(query, "docs/queries.md", "exec"), found)
+
+    levels = [f"icosphere/{level}" for level in range(4)]
+    assert found["rates"].index.tolist() == levels
+    assert found["at_level"]["mesh"].values.tolist() == levels[3:]
+    assert found["nearest"].is_monotonic_increasing
+    assert found["part"].shape == (4, 4)
+    lattice = found["fields"].sobolev.lattice
+    field, reference = (sb.fourier_transform(surface, lattice) for surface in (sb.icosphere(3), sb.Sphere()))
+    expected = sb.distance(field, reference, [-3.5, -2.25])["distance"].values
+    assert found["another"]["distance"].values == pytest.approx(expected, rel=1e-6)
+    assert found["norms"]["icosphere/1"] == pytest.approx(
+        sb.norm(sb.icosphere(1), -4, lattice=lattice)["norm"].item(), rel=1e-6
+    )
+    assert set(found["pair"]) == {levels[0], levels[3]}
+    assert found["along_axis"].loc[0.0].real == pytest.approx(sb.icosphere(3).area, rel=1e-6)
+    assert (found["diagonal"]["error"] < 1e-4).all()
+    assert found["by_wavelength"].sum() == pytest.approx(1, rel=1e-10)
+    assert found["by_wavelength"].index.is_monotonic_increasing
+    # An inscribed mesh lacks area and lies inside: at its vertices, next to the sphere, the sphere has more.
+    assert (found["w"].values < 0).all()
+    assert 0 < found["share"].sel(mesh=levels[3], order=-10).item() < 1
+    exported = pd.read_csv(tmp_path / "convergence.csv")
+    assert len(exported) == 5 * len(study.orders)
+    squares = exported["area_part"] ** 2 + exported["shape_part"] ** 2
+    assert np.allclose(squares, exported["distance"] ** 2, rtol=1e-10)
