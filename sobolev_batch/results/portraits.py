@@ -81,7 +81,7 @@ def make_gallery(
         tree: an open store.
         table: the study as it was written.
         folder: where relative paths in it start.
-        wanted: labels; by default the farthest mesh of each family at the first order, and the closest ones.
+        wanted: labels; by default the closest mesh of each family at the first order, and the farthest ones.
 
     Raises:
         InputError: a label that the store does not have, or too many.
@@ -110,11 +110,11 @@ def make_gallery(
 
 
 def _extremes(tree: xr.DataTree) -> Iterator[str]:
-    """The mesh of each family that is farthest from the reference, then those that are closest, while there is room."""
+    """The mesh of each family that is closest to the reference, then those that are farthest, while there is room."""
     frame = convergence_frame(tree)
     frame = frame[(frame["order"] == frame["order"].iloc[0]) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
     families = [lines for _, lines in frame.groupby("family", sort=False)]
-    extremes = [lines["distance"].idxmax() for lines in families] + [lines["distance"].idxmin() for lines in families]
+    extremes = [lines["distance"].idxmin() for lines in families] + [lines["distance"].idxmax() for lines in families]
     yield from frame.loc[list(dict.fromkeys(extremes))[:MOST_PORTRAITS], "mesh"]
 
 
