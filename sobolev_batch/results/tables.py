@@ -17,6 +17,7 @@ from sobolev_batch.errors import InputError
 Format = Literal["text", "csv", "json", "markdown", "latex"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
+_ABOUT = ("family", "name", "level", "status", "reason", "triangles")
 _NUMBERS = (
     "edge_length",
     "distance",
@@ -66,22 +67,15 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
         InputError: no tables in the store yet, or an order that it was not reduced for.
     """
     convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
-    lines = []
+    labels = convergence["mesh"].values
+    others = labels != convergence.attrs["reference"]
+    about = {key: meshes[key].values[others] for key in _ABOUT}
+    parts = []
     for order in chosen_orders(convergence, orders):
-        for i, label in enumerate(convergence["mesh"].values.tolist()):
-            if label == convergence.attrs["reference"]:
-                continue
-            here = convergence.isel(mesh=i).sel(order=order)
-            about = meshes.isel(mesh=i)
-            lines.append(
-                {
-                    "order": order,
-                    "mesh": label,
-                    **{key: about[key].item() for key in ("family", "name", "level", "status", "reason", "triangles")},
-                    **{key: here[key].item() if key in here else math.nan for key in _NUMBERS},
-                }
-            )
-    return pd.DataFrame(lines)
+        here = convergence.sel(order=order)
+        numbers = {key: here[key].values[others] if key in here else math.nan for key in _NUMBERS}
+        parts.append(pd.DataFrame({"order": order, "mesh": labels[others], **about, **numbers}))
+    return pd.concat(parts, ignore_index=True)
 
 
 def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:

@@ -235,6 +235,23 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
         make_gallery(tree, study, folder, ["nobody"])
 
 
+def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sobolev_batch.results.account._MOST_LINES", 6)
+    monkeypatch.setattr("sobolev_batch.results.account._MOST_MESHES", 2)
+    monkeypatch.setattr("sobolev_batch.results.exhibits.MOST_MESHES", 3)
+    monkeypatch.setattr("sobolev_batch.results.wavelengths._MOST_MESHES", 2)
+    nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
+    monkeypatch.setattr("sobolev_batch.results.report._stills", lambda *_: nothing)
+    text = make_report(store, folder=folder)
+    for note in (
+        "2 more meshes are left out here; <code>sobolev-batch table --format csv</code>",
+        "4 more meshes are left out here.",
+        "Of 5 meshes the first 3 are shown, the reference among them",
+        "Of 4 meshes 2 are shown, evenly through the study",
+    ):
+        assert note in text
+
+
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="no store of a study is there"):
         make_report(tmp_path)
