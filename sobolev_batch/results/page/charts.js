@@ -182,7 +182,7 @@
       type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmid: 0, hoverinfo: "x+y+z+text",
       hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
       colorscale: [[0, color("less")], [0.5, color("neutral")], [1, color("more")]],
-      lighting: { ambient: 0.65, diffuse: 0.6, specular: 0.08, roughness: 0.8 },
+      lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
       colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
         ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
     }], {
