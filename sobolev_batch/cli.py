@@ -29,7 +29,7 @@ from sobolev_batch.batch.submission import submit
 from sobolev_batch.batch.verification import verify
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.matrix import format_matrix
-from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 from sobolev_batch.spectral.lattice import Lattice
@@ -228,7 +228,9 @@ def plot_command(store: Location, output: Path) -> None:
     # Imported here: it takes as long as everything that the other commands do at their start.
     from sobolev_batch.results.plots import plot_store
 
-    for path in plot_store(open_store(store), output):
+    with fields_read(store):
+        paths = plot_store(open_store(store), output)
+    for path in paths:
         click.echo(path)
 
 

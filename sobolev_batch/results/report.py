@@ -17,7 +17,7 @@ from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.exhibits import make_exhibits
-from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.plots import (
     convergence_figure,
     map_figure,
@@ -92,8 +92,9 @@ def make_report(place: str | Path | Location, *, folder: str | Path = ".", witne
         ) from error
     tree = open_store(place)
     account = Account.of(tree, Status.of(place))
-    spectra = Wavelengths.of_store(tree)
-    gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, witnesses)
+    with fields_read(place):
+        spectra = Wavelengths.of_store(tree)
+        gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, witnesses)
     exhibits = make_exhibits(tree, spectra, gallery)
     scripts = [plotly.offline.get_plotlyjs(), _part("tables.js"), _part("charts.js")]
     environment = jinja2.Environment(

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 
-from sobolev_batch import InputError, StoreError, Study, icosphere, open_store, run
+from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.cli import cli
 from sobolev_batch.results.portraits import make_gallery
 from sobolev_batch.results.report import make_report, write_report
@@ -251,6 +251,15 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         "Of 4 meshes 2 are shown, evenly through the study",
     ):
         assert note in text
+
+
+def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(tree: xr.DataTree) -> None:
+        raise ValueError("Stored and computed checksum do not match.")
+
+    monkeypatch.setattr("sobolev_batch.results.report.Wavelengths.of_store", damaged)
+    with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
+        make_report(store)
 
 
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
