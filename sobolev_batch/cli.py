@@ -28,7 +28,8 @@ from sobolev_batch.batch.study import Study
 from sobolev_batch.batch.submission import submit
 from sobolev_batch.batch.verification import verify
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.matrix import format_matrix
+from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 from sobolev_batch.spectral.lattice import Lattice
@@ -210,9 +211,11 @@ def release_command(store: Location, force: bool) -> None:
 @click.argument("store", type=Location.of)
 @click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
 @click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
-def table_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
-    """Print the convergence tables of STORE."""
-    click.echo(format_table(open_store(store), style, orders or None))
+@click.option("--matrix", is_flag=True, help="The distance of every mesh to every other instead.")
+def table_command(store: Location, style: Format, orders: tuple[float, ...], matrix: bool) -> None:
+    """Print the convergence tables of STORE, or its distance matrices."""
+    form = format_matrix if matrix else format_table
+    click.echo(form(open_store(store), style, orders or None))
 
 
 @cli.command("plot")
@@ -225,8 +228,28 @@ def plot_command(store: Location, output: Path) -> None:
     # Imported here: it takes as long as everything that the other commands do at their start.
     from sobolev_batch.results.plots import plot_store
 
-    for path in plot_store(open_store(store), output):
+    with fields_read(store):
+        paths = plot_store(open_store(store), output)
+    for path in paths:
         click.echo(path)
+
+
+@cli.command("report")
+@click.argument("store", type=Location.of)
+@click.option("--output", type=click.Path(path_type=Path), default="report.html", show_default=True, help="The page.")
+@click.option(
+    *("--folder", "folder"),
+    type=click.Path(path_type=Path),
+    default=".",
+    help="Where relative paths in the study start: its meshes are shown if they are there. [default: here]",
+)
+@click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Show this mesh; may be repeated.")
+def report_command(store: Location, output: Path, folder: Path, witnesses: tuple[str, ...]) -> None:
+    """Write everything about STORE into one HTML page that needs nothing besides itself."""
+    # Imported here, as for plots.
+    from sobolev_batch.results.report import write_report
+
+    click.echo(write_report(store, output, folder=folder, witnesses=witnesses))
 
 
 @cli.command("compare")

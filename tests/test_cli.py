@@ -105,9 +105,17 @@ def test_tables_in_every_format(folder: Path) -> None:
     assert "| ico/1" in outputs["markdown"]
 
 
-def test_plot_draws_both_pictures(folder: Path) -> None:
+def test_matrices(folder: Path) -> None:
+    done = call("table", "storage/cli.zarr", "--matrix", "--order", "-3", folder=folder)
+    assert re.search(r"^3 reference( +\d(\.\d+)?\(\d+\)e[+-]0\d){2}$", done.stdout, re.M), done.stdout
+    lines = call("table", "storage/cli.zarr", "--matrix", "--format", "csv", folder=folder).stdout.splitlines()
+    assert len(lines) == 1 + 2 * 3 * 3
+
+
+def test_plot_draws_every_picture(folder: Path) -> None:
     done = call("plot", "storage/cli.zarr", "--output", "pictures", folder=folder)
-    assert done.stdout.split() == ["pictures/convergence.png", "pictures/transform.png"]
+    names = ("convergence", "transform", "matrix", "map", "spectrum")
+    assert done.stdout.split() == [f"pictures/{name}.png" for name in names]
     for name in done.stdout.split():
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 

@@ -120,7 +120,7 @@ def make_plan(study: Study, known: Choice | None = None) -> Plan:
         LatticeError: the reference does not fit into the lattice's period.
         AccuracyError: the accuracy is out of reach within the memory.
     """
-    members = _members(study)
+    members = members_of(study)
     reference = _reference_label(study, members)
     surface = _load_reference(members[reference][1])
     similarity = Similarity.to_unit_ball(surface) if study.scaling.mode == "reference" else study.scaling.fixed
@@ -161,7 +161,12 @@ def _blocks(choice: Choice) -> tuple[Block, ...]:
     return choice.lattice.split(_LARGEST_CHUNK_BYTES // item_bytes)
 
 
-def _members(study: Study) -> dict[str, tuple[str, Member]]:
+def members_of(study: Study) -> dict[str, tuple[str, Member]]:
+    """Family and member of each surface of a study, by label; none is made.
+
+    Raises:
+        StudyError: labels that collide, or sources that make no surface.
+    """
     members: dict[str, tuple[str, Member]] = {}
     for family in study.families:
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,26 @@ import xarray as xr
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import DamageError
+
+
+@contextmanager
+def fields_read(place: str | Path | Location) -> Iterator[None]:
+    """Where fields of an open store are read: says what to do about a damaged one.
+
+    Raises:
+        DamageError: the bytes of a field are not those that were stored.
+    """
+    try:
+        yield
+    except ValueError as error:
+        # Of zarr's codec, which has no exception of its own.
+        if "checksum" not in str(error):
+            raise
+        raise DamageError(
+            f"{Location.of(place)}: a field is damaged: its bytes are not those that were stored; "
+            "sobolev-batch verify tells which, and run computes it again",
+            "its bytes are not those that were stored",
+        ) from error
 
 
 def open_store(place: str | Path | Location) -> xr.DataTree:

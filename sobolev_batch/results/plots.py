@@ -1,23 +1,50 @@
-"""Pictures of a store: convergence on log axes, and transforms along one frequency axis."""
+"""Pictures of a store: convergence, transforms along one frequency axis, distance matrices, maps of the meshes."""
 
 from __future__ import annotations
 
+import re
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from sobolev_batch.errors import StoreError
-from sobolev_batch.results.tables import convergence_frame
+from sobolev_batch.results.arrangement import Map, alike_together
+from sobolev_batch.results.matrix import Matrix
+from sobolev_batch.results.portraits import Portrait
+from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
+from sobolev_batch.results.wavelengths import Wavelengths
 
+# P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
+COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#777777")
+_MARKERS = "osD^vPX"
 _WIDTH_INCHES = 6.4
 _MOST_CURVES = 5
+# In matrices and on maps.
+MOST_MESHES = 300
+_MOST_TICKS = 40
+_LONGEST_LABEL = 24
+# Of the width of a map.
+_NAMES_APART = 0.08
+_LEGEND_ENTRIES = 12
+# Smaller ones are not written into their cells.
+_SMALLEST_SHARE = 0.005
+_MOST_VIEWS = 3
 
 
 def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
-    """Draw convergence.png and transform.png of an open store into a folder.
+    """Draw the pictures of an open store into a folder.
+
+    convergence.png, transform.png and, of the first order, spectrum.png; where the study asks for the
+    distances of all pairs, matrix.png and map.png too.
 
     Returns:
         The paths of the pictures.
@@ -28,18 +55,30 @@ def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """
     folder = Path(folder)
     pictures = {"convergence.png": convergence_figure(tree), "transform.png": transform_figure(tree)}
+    if "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]:
+        pictures |= {"matrix.png": matrix_figure(tree), "map.png": map_figure(tree)}
+    if "similarity" in tree.attrs and (spectra := Wavelengths.of_store(tree)) is not None:
+        pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders[0])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, figure in pictures.items():
-            figure.savefig(folder / name, dpi=150)
+            save(figure, folder / name)
     except OSError as error:
         raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
     return tuple(folder / name for name in pictures)
 
 
-def convergence_figure(tree: xr.DataTree) -> Figure:
+def save(figure: Figure, target: object, **options: object) -> None:
+    """Write a picture; characters that its font lacks become boxes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        figure.savefig(target, dpi=150, **options)  # type: ignore[arg-type]
+
+
+def convergence_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
     """Relative distance to the reference against mean edge length, one panel per order."""
-    frame = convergence_frame(tree)
+    frame = convergence_frame(tree, orders)
+    styles = _styles(tree)
     orders = list(dict.fromkeys(frame["order"]))
     figure = Figure(figsize=(_WIDTH_INCHES, 3.6 * len(orders)), layout="constrained")
     panels = figure.subplots(len(orders), 1, squeeze=False)[:, 0]
@@ -47,13 +86,16 @@ def convergence_figure(tree: xr.DataTree) -> Figure:
         chosen = frame[(frame["order"] == order) & (frame["relative"] > 0) & frame["edge_length"].notna()]
         for family, line in chosen.groupby("family", sort=False):
             ordered = line.sort_values("edge_length")
-            style = "o-" if (ordered["level"] >= 0).all() else "o"
-            axes.loglog(ordered["edge_length"], ordered["relative"], style, label=str(family), markersize=4)
+            color, marker = styles[str(family)]
+            sizes, values, errors = (ordered[name].to_numpy() for name in ("edge_length", "relative", "relative_error"))
+            style = f"{marker}-" if (ordered["level"] >= 0).all() else marker
+            axes.loglog(sizes, values, style, color=color, label=_plain(str(family)), markersize=4, linewidth=1.2)
+            axes.errorbar(sizes, values, yerr=_reach(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
         if len(chosen):
             _draw_slope(axes, chosen["edge_length"].to_numpy(), chosen["relative"].to_numpy())
-            axes.legend(frameon=False)
+            _legend(axes)
         axes.set_title(f"order {order:g}")
-        axes.set_xlabel("mean edge length")
+        axes.set_xlabel("mean edge length in the study's unit")
         axes.set_ylabel("relative Sobolev distance")
         axes.grid(visible=True, which="major", alpha=0.3)
     return figure
@@ -79,11 +121,11 @@ def transform_figure(tree: xr.DataTree) -> Figure:
         spread = np.unique(np.linspace(0, len(rows) - 1, min(_MOST_CURVES, len(rows))).round().astype(int))
         for row in rows[spread]:
             values = np.real(along.isel(mesh=int(row)).to_numpy())
-            axes.plot(along["xi_x"], values, linewidth=1, label=str(meshes["mesh"].values[row]))
+            axes.plot(along["xi_x"], values, linewidth=1, label=_plain(str(meshes["mesh"].values[row])))
         place = meshes["mesh"].values.tolist().index(reference)
         if complete[place]:
             values = np.real(along.isel(mesh=place).to_numpy())
-            axes.plot(along["xi_x"], values, "k--", linewidth=1.2, label=str(reference))
+            axes.plot(along["xi_x"], values, "k--", linewidth=1.2, label=_plain(str(reference)))
         axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
         axes.set_ylabel("Re of the transform")
         axes.legend(frameon=False, fontsize="small")
@@ -91,8 +133,193 @@ def transform_figure(tree: xr.DataTree) -> Figure:
     return figure
 
 
+def matrix_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
+    """The distances of all pairs, one panel per order, meshes that are alike beside each other."""
+    matrices = _matrices(tree, orders)
+    figure = Figure(figsize=(_WIDTH_INCHES, 5.6 * len(matrices)), layout="constrained")
+    panels = figure.subplots(len(matrices), 1, squeeze=False)[:, 0]
+    for axes, matrix in zip(panels, matrices, strict=True):
+        arranged = alike_together(matrix.values)
+        values = matrix.values[np.ix_(arranged, arranged)]
+        seen = values[values > 0]
+        axes.set_title(f"Sobolev distance of order {matrix.order:g}{_cut(tree, matrix)}")
+        if not seen.size:
+            axes.text(0.5, 0.5, "no two meshes differ", ha="center")
+            axes.set_axis_off()
+            continue
+        image = axes.imshow(
+            np.ma.masked_less_equal(values, 0), norm=LogNorm(seen.min(), seen.max()), cmap="viridis", aspect="equal"
+        )
+        figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit")
+        labels = [_plain(_shortened(matrix.labels[i])) for i in arranged]
+        size = float(np.clip(240 / len(labels), 4, 8))
+        if len(labels) <= _MOST_TICKS:
+            axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
+            axes.set_yticks(range(len(labels)), labels, fontsize=size)
+        else:
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.set_xlabel(f"{len(labels)} meshes, those that are alike beside each other")
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+    return figure
+
+
+def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
+    """The meshes as points whose distances are nearly the Sobolev distances, one panel per order."""
+    matrices = _matrices(tree, orders)
+    styles, family_of = _styles(tree), _families(tree)
+    reference = tree["convergence"].attrs["reference"]
+    figure = Figure(figsize=(_WIDTH_INCHES, 4.4 * len(matrices)), layout="constrained")
+    panels = figure.subplots(len(matrices), 1, squeeze=False)[:, 0]
+    for axes, matrix in zip(panels, matrices, strict=True):
+        found = Map.of(matrix.values)
+        families = [family_of[label] for label in matrix.labels]
+        for family in dict.fromkeys(families):
+            chosen = [i for i, label in enumerate(matrix.labels) if families[i] == family and label != reference]
+            if chosen:
+                color, marker = styles[family]
+                axes.plot(*found.places[chosen].T, marker, color=color, label=_plain(family), markersize=5, alpha=0.85)
+        if reference in matrix.labels:
+            place = found.places[matrix.labels.index(reference)]
+            axes.plot(*place, "*", color="black", markersize=12, label=_plain(reference))
+        for i in _spread(found.places, first=matrix.labels.index(reference) if reference in matrix.labels else 0):
+            if matrix.labels[i] == reference:
+                continue
+            name = matrix.labels[i].partition("/")[2] or matrix.labels[i]
+            axes.annotate(
+                _plain(_shortened(name)), found.places[i], (5, 4), textcoords="offset points", fontsize=7, alpha=0.8
+            )
+        share = "" if np.isnan(found.share) else f", {found.share:.0%} of the variance"
+        axes.set_title(f"map of the meshes at order {matrix.order:g}{share}{_cut(tree, matrix)}", fontsize="medium")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.1)
+        axes.grid(visible=True, alpha=0.3)
+        axes.set_xlabel("in the unit of distances")
+        if matrix.labels:
+            _legend(axes)
+    return figure
+
+
+def spectrum_figure(spectra: Wavelengths, order: float) -> Figure:
+    """Which part of each mesh's squared distance lies at which wavelengths, at one order."""
+    shares = spectra.shares[:, spectra.orders.index(order)]
+    figure = Figure(figsize=(_WIDTH_INCHES, 1.6 + 0.24 * len(spectra.labels)), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
+    figure.colorbar(image, ax=axes, label="share of the squared distance", format=PercentFormatter(1.0, 0))
+    for (i, j), share in np.ndenumerate(shares):
+        if share >= _SMALLEST_SHARE:
+            color = "white" if share > 0.6 * np.nanmax(shares) else "black"
+            axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
+    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5)
+    axes.set_yticks(range(len(spectra.labels)), [_plain(_shortened(label)) for label in spectra.labels], fontsize=7.5)
+    axes.set_xlabel("wavelength in the study's unit")
+    axes.set_title(f"where the differences lie, order {order:g}")
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def witness_figure(portrait: Portrait) -> Figure:
+    """A mesh seen from one side, coloured by its witness function, one panel per order."""
+    shown = portrait.values[:_MOST_VIEWS]
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    seen = portrait.vertices @ _view()
+    corners = seen[portrait.triangles]
+    # Painted from the back, darker where a triangle turns away from the eye.
+    painted = np.argsort(corners[:, :, 2].mean(axis=1))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    light = 0.55 + 0.45 * np.abs(normals[:, 2]) / np.where(lengths > 0, lengths, 1.0)
+    for axes, order, values in zip(panels, portrait.orders, shown, strict=False):
+        largest = float(np.abs(values).max()) or 1.0
+        scale = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
+        colors = scale.to_rgba(values[portrait.triangles].mean(axis=1))
+        colors[:, :3] *= light[:, None]
+        patches = PolyCollection(corners[painted, :, :2], facecolors=colors[painted], edgecolors="face", linewidths=0.1)
+        patches.set_rasterized(True)
+        axes.add_collection(patches)
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        axes.set_title(f"order {order:g}", fontsize="medium")
+        figure.colorbar(scale, ax=axes, shrink=0.8, orientation="horizontal").ax.tick_params(labelsize="x-small")
+    figure.suptitle(_plain(portrait.label), fontsize="medium")
+    return figure
+
+
+def _view() -> np.ndarray:
+    """From the coordinates of space to right, up and towards the eye, which looks from the front and above."""
+    eye = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
+    right = np.cross([0, 0, 1], eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(eye, right), eye], axis=1)
+
+
 def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:
     """A line of second order through the geometric middle of the points."""
     span = np.array([sizes.min(), sizes.max()])
     middle_size, middle_error = np.exp(np.log(sizes).mean()), np.exp(np.log(errors).mean())
     axes.loglog(span, middle_error * (span / middle_size) ** 2, "k:", linewidth=1, label="slope 2")
+
+
+def _spread(places: np.ndarray, first: int) -> list[int]:
+    """Points that are far enough from each other for their names to be read."""
+    kept: list[int] = []
+    apart = _NAMES_APART * np.ptp(places, axis=0).max(initial=0.0)
+    for i in sorted(range(len(places)), key=lambda i: i != first):
+        if all(np.linalg.norm(places[i] - places[j]) > apart for j in kept):
+            kept.append(i)
+    return kept
+
+
+def _reach(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """How far error bars go down and up; on a logarithmic axis not below zero."""
+    known = np.nan_to_num(errors)
+    return np.stack([np.minimum(known, 0.999 * values), known])
+
+
+def _matrices(tree: xr.DataTree, orders: Sequence[float] | None) -> list[Matrix]:
+    chosen = chosen_orders(finished_group(tree, "convergence"), orders)
+    return [matrix for order in chosen if (matrix := Matrix.of(tree, order, MOST_MESHES)) is not None]
+
+
+def _families(tree: xr.DataTree) -> dict[str, str]:
+    """The family of each mesh."""
+    meshes = tree["meshes"].to_dataset()
+    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
+
+
+def _styles(tree: xr.DataTree) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each family; only both together are unique where there are many."""
+    families = dict.fromkeys(_families(tree).values())
+    return {
+        family: (COLORS[i % len(COLORS)], _MARKERS[(i + i // len(COLORS)) % len(_MARKERS)])
+        for i, family in enumerate(families)
+    }
+
+
+def _cut(tree: xr.DataTree, matrix: Matrix) -> str:
+    complete = int(np.count_nonzero(tree["meshes"].to_dataset()["status"].values == "complete"))
+    return f"\nthe first {len(matrix.labels)} of {complete} meshes" if len(matrix.labels) < complete else ""
+
+
+def _legend(axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) > _LEGEND_ENTRIES:
+        # A longer one would hide the picture.
+        kept = _LEGEND_ENTRIES - 1
+        labels = [*labels[:kept], f"and {len(labels) - kept} more"]
+        handles = handles[: kept + 1]
+    axes.legend(handles, labels, frameon=False, fontsize="small")
+
+
+def _shortened(label: str) -> str:
+    return label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
+
+
+def _plain(text: str) -> str:
+    """A name as matplotlib shows it unchanged: dollars would begin a formula, a leading underscore hides it."""
+    return re.sub(r"^_", "\u2009_", text.replace("$", r"\$"))

@@ -17,6 +17,7 @@ from sobolev_batch.errors import InputError
 Format = Literal["text", "csv", "json", "markdown", "latex"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
+_ABOUT = ("family", "name", "level", "status", "reason", "triangles")
 _NUMBERS = (
     "edge_length",
     "distance",
@@ -33,7 +34,7 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
 _NOTE = """\
 The true distance lies within its error: truncation (beyond xi_max; it can only
@@ -65,26 +66,16 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
     Raises:
         InputError: no tables in the store yet, or an order that it was not reduced for.
     """
-    if "convergence" not in tree.children:
-        raise InputError("the store has no tables yet: run the study to its end")
-    convergence = tree["convergence"].to_dataset().load()
-    meshes = tree["meshes"].to_dataset().load()
-    lines = []
-    for order in _chosen(convergence, orders):
-        for i, label in enumerate(convergence["mesh"].values.tolist()):
-            if label == convergence.attrs["reference"]:
-                continue
-            here = convergence.isel(mesh=i).sel(order=order)
-            about = meshes.isel(mesh=i)
-            lines.append(
-                {
-                    "order": order,
-                    "mesh": label,
-                    **{key: about[key].item() for key in ("family", "name", "level", "status", "reason", "triangles")},
-                    **{key: here[key].item() if key in here else math.nan for key in _NUMBERS},
-                }
-            )
-    return pd.DataFrame(lines)
+    convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
+    labels = convergence["mesh"].values
+    others = labels != convergence.attrs["reference"]
+    about = {key: meshes[key].values[others] for key in _ABOUT}
+    parts = []
+    for order in chosen_orders(convergence, orders):
+        here = convergence.sel(order=order)
+        numbers = {key: here[key].values[others] if key in here else math.nan for key in _NUMBERS}
+        parts.append(pd.DataFrame({"order": order, "mesh": labels[others], **about, **numbers}))
+    return pd.concat(parts, ignore_index=True)
 
 
 def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
@@ -107,7 +98,7 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
         table = tabulate(
             cells,
             headers=_HEADERS,
-            tablefmt=_TABULATE_FORMATS[style],
+            tablefmt=TABULATE_FORMATS[style],
             disable_numparse=True,
             colalign=("left", *["right"] * (len(_HEADERS) - 1)),
         )
@@ -123,8 +114,25 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     return "\n\n".join(parts)
 
 
-def _chosen(convergence: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
-    there: list[float] = convergence["order"].values.tolist()
+def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
+    """A table of an open store, in memory unless it may stay where it is.
+
+    Raises:
+        InputError: there are no tables in the store yet.
+    """
+    if name not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    found = tree[name].to_dataset()
+    return found.load() if load else found
+
+
+def chosen_orders(table: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
+    """Those of a table's orders that are asked for; all of them by default.
+
+    Raises:
+        InputError: one is not there.
+    """
+    there: list[float] = table["order"].values.tolist()
     if orders is None:
         return there
     for order in orders:

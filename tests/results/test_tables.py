@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, StoreError, open_store
-from sobolev_batch.results.plots import convergence_figure, plot_store, transform_figure
+from sobolev_batch.results.plots import convergence_figure, map_figure, matrix_figure, plot_store, transform_figure
 from sobolev_batch.results.tables import convergence_frame, format_table
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
@@ -135,6 +135,37 @@ def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
     assert np.array_equal(data[:, 0], [0.0, 1.0, 2.0])
     # Row 1, xi_y = xi_z = 0: strides of 75, 15, 3 and 1.
     assert np.array_equal(data[:, 1], 75 + 15 * np.array([2, 3, 4]) + 6)
+
+
+@pytest.fixture
+def pairs(tree: xr.DataTree) -> xr.DataTree:
+    """The same with the distances of all pairs, and names that matplotlib would take for a formula, or for hidden."""
+    labels, families = ["$^$/0", "$^$/1", "_f/2", "reference"], ["$^$", "$^$", "_f", "reference"]
+    places = np.array([0.4, 0.1, np.nan, 0.0])
+    distance = np.abs(places[:, None] - places)[..., None] * np.array([1.0, 2.0])
+    tree["distances"] = xr.DataTree(
+        xr.Dataset(
+            dict.fromkeys(("distance", "error"), (("mesh", "other", "order"), distance)),
+            coords={"mesh": labels, "other": labels, "order": [-10.0, -2.5]},
+        )
+    )
+    for group in ("convergence", "meshes", "fourier"):
+        named = tree[group].to_dataset().assign_coords(mesh=labels)
+        tree[group] = xr.DataTree(named.assign(family=("mesh", families)) if group == "meshes" else named)
+    return tree
+
+
+def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> None:
+    figure = matrix_figure(pairs, [-10.0])
+    axes = figure.axes[0]
+    assert axes.get_title().startswith("Sobolev distance of order -10")
+    shown = [text.get_text() for text in axes.get_yticklabels()]
+    assert shown in ([r"\$^\$/0", r"\$^\$/1", "reference"], ["reference", r"\$^\$/1", r"\$^\$/0"])
+    places = np.concatenate([line.get_xydata() for line in map_figure(pairs, [-10.0]).axes[0].lines])
+    assert np.ptp(places[:, 0]) == pytest.approx(0.4)
+    assert np.allclose(places[:, 1], 0, atol=1e-7)
+    names = [path.name for path in plot_store(pairs, tmp_path)]
+    assert names == ["convergence.png", "transform.png", "matrix.png", "map.png"]
 
 
 def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:

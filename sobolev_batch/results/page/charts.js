@@ -1,0 +1,215 @@
+"use strict";
+// Pictures of a report, drawn by plotly.js from the page's data, in the colours of its style sheet.
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const symbols = ["circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x"];
+  // Named one by one: others would hand data to a service.
+  const flat = [["toImage", "zoomIn2d", "zoomOut2d", "resetScale2d"]];
+  const space = [["toImage", "resetCameraDefault3d"]];
+  const viridis = [[0, "#440154"], [0.25, "#3b528b"], [0.5, "#21918c"], [0.75, "#5ec962"], [1, "#fde725"]];
+  const state = { order: 0, portrait: 0, alike: true };
+
+  // Plotly takes a few tags in any text; names are shown as they are.
+  const plain = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
+  const short = (text, most) => plain(text.length > most ? `${text.slice(0, most - 1)}…` : text);
+  const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  const series = (family) => color(`series-${data.families.indexOf(family) % 7}`);
+  const symbol = (family) => {
+    const i = data.families.indexOf(family);
+    return symbols[(i + Math.floor(i / 7)) % 7];
+  };
+  const number = (value) => (value === null ? "?" : value.toPrecision(4));
+  const narrow = () => innerWidth < 700;
+
+  const layout = (changes) => {
+    const axis = { gridcolor: color("line"), zerolinecolor: color("line"), linecolor: color("line"), automargin: true };
+    const { xaxis, yaxis, ...others } = changes;
+    return {
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: color("sans"), size: narrow() ? 11 : 13, color: color("ink") },
+      margin: { l: 10, r: 10, t: 30, b: 10 },
+      hoverlabel: { align: "left", bgcolor: color("raised"), bordercolor: color("line"), font: { color: color("ink") } },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: color("soft"), activecolor: color("accent") },
+      legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
+      xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis },
+      ...others,
+    };
+  };
+
+  const draw = (name, traces, changes, modeBarButtons = flat) => {
+    const place = document.getElementById(`chart-${name}`);
+    const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
+    Plotly.react(place, traces, layout({ height: Number(place.dataset.height), ...changes }), config);
+  };
+
+  // Of a logarithmic axis: powers of ten, and 2 and 5 between them where there are few of these.
+  const ticks = (values) => {
+    const [low, high] = [Math.log10(Math.min(...values)), Math.log10(Math.max(...values))];
+    const steps = high - low > 2.5 ? [1] : [1, 2, 5];
+    const found = [];
+    for (let power = Math.floor(low) - 1; power <= Math.ceil(high); power += 1) {
+      for (const step of steps) found.push(Number(`${step}e${power}`));
+    }
+    const plainly = low > -4 && high < 5;
+    return { tickvals: found, ticktext: found.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
+  };
+
+  const convergence = () => {
+    const families = data.convergence[state.order] ?? [];
+    const traces = families.map((line) => ({
+      type: "scatter", mode: line.joined ? "lines+markers" : "markers", name: short(line.family, 40),
+      x: line.sizes, y: line.values,
+      error_y: {
+        type: "data", symmetric: false, array: line.errors, thickness: 1, width: 3,
+        // Below zero there is no logarithm.
+        arrayminus: line.errors.map((error, i) => Math.min(error, 0.999 * line.values[i])),
+      },
+      line: { color: series(line.family), width: 1.8 },
+      marker: { color: series(line.family), symbol: symbol(line.family), size: 8 },
+      text: line.labels.map((label, i) =>
+        `${plain(label)}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.sizes[i])}` +
+        `<br>relative distance ${number(line.values[i])} ± ${line.errors[i]?.toPrecision(2) ?? "?"}`),
+      hoverinfo: "text",
+    }));
+    const all = (key) => families.flatMap((line) => line[key]);
+    if (all("sizes").length) {
+      const middle = (values) => Math.exp(values.reduce((sum, x) => sum + Math.log(x), 0) / values.length);
+      const ends = [Math.min(...all("sizes")), Math.max(...all("sizes"))];
+      const [size, value] = [middle(all("sizes")), middle(all("values"))];
+      traces.push({
+        type: "scatter", mode: "lines", name: "slope 2", x: ends, y: ends.map((x) => value * (x / size) ** 2),
+        line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
+      });
+    }
+    draw("convergence", traces, {
+      xaxis: { type: "log", ...(all("sizes").length ? ticks(all("sizes")) : {}), title: { text: "mean edge length" } },
+      yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "relative distance" } },
+    });
+  };
+
+  const matrix = () => {
+    const { labels } = data.matrix;
+    const { values, errors, alike } = data.matrix.orders[state.order];
+    const at = (table, i, j) => (i > j ? table[i][j] : table[j][i]);
+    const arranged = state.alike ? alike : labels.map((_, i) => i);
+    const cells = (of) => arranged.map((i) => arranged.map((j) => (i === j ? null : of(i, j))));
+    const z = cells((i, j) => (at(values, i, j) > 0 ? Math.log10(at(values, i, j)) : null));
+    const text = cells((i, j) =>
+      `${plain(labels[i])}<br>${plain(labels[j])}<br>${number(at(values, i, j))} ± ${at(errors, i, j) ?? "?"}`);
+    const seen = z.flat().filter((value) => value !== null);
+    const [low, high] = seen.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+    const powers = [];
+    for (let power = Math.ceil(low); power <= high; power += 1) powers.push(power);
+    // Within one power of ten, its ends say more.
+    if (powers.length < 2 && seen.length) powers.splice(0, 1, low, high);
+    const room = narrow() ? 14 : 28;
+    const named = labels.length <= 60;
+    const axis = {
+      type: "linear", showgrid: false, zeroline: false, showticklabels: named, ticks: "", constrain: "domain",
+      tickvals: labels.map((_, i) => i), ticktext: arranged.map((i) => short(labels[i], room)),
+      tickfont: { size: labels.length > 30 ? 9 : 11 },
+    };
+    draw("matrix", [{
+      type: "heatmap", z, text, hoverinfo: "text", colorscale: viridis, xgap: labels.length < 60 ? 1 : 0,
+      ygap: labels.length < 60 ? 1 : 0,
+      colorbar: {
+        title: { text: "distance", side: narrow() ? "top" : "right" }, outlinewidth: 0, thickness: 12,
+        tickvals: powers, ticktext: powers.map((v) => (Number.isInteger(v) ? `10<sup>${v}</sup>` : (10 ** v).toPrecision(2))),
+        ...(narrow() ? { orientation: "h", y: -0.02, yanchor: "top" } : {}),
+      },
+    }], {
+      height: narrow() ? innerWidth + 20 : 680,
+      xaxis: { ...axis, tickangle: -90, side: narrow() ? "top" : "bottom", showticklabels: named && !narrow() },
+      yaxis: { ...axis, autorange: "reversed", scaleanchor: "x", scaleratio: 1 },
+    });
+  };
+
+  const map = () => {
+    const { labels, families, orders } = data.matrix;
+    const { places: [x, y], share } = orders[state.order];
+    const traces = [...new Set(families)].map((family) => {
+      const chosen = labels.flatMap((label, i) => (families[i] === family && label !== data.reference ? [i] : []));
+      return {
+        type: "scatter", mode: "markers", name: short(family, 40), x: chosen.map((i) => x[i]), y: chosen.map((i) => y[i]),
+        text: chosen.map((i) => plain(labels[i])), hoverinfo: "text",
+        marker: { color: series(family), symbol: symbol(family), size: 9, opacity: 0.85 },
+      };
+    }).filter((trace) => trace.x.length);
+    const center = labels.indexOf(data.reference);
+    if (center >= 0) {
+      traces.push({
+        type: "scatter", mode: "markers", name: short(data.reference, 40), x: [x[center]], y: [y[center]],
+        text: [plain(data.reference)], hoverinfo: "text", marker: { color: color("ink"), symbol: "star", size: 14 },
+      });
+    }
+    document.getElementById("share").textContent = share === null ? "" : `${(100 * share).toFixed(1)} %, `;
+    draw("map", traces, {
+      height: narrow() ? 380 : 480, xaxis: { title: { text: "in the unit of distances" } },
+      yaxis: { scaleanchor: "x", scaleratio: 1 },
+    });
+  };
+
+  const spectrum = () => {
+    const { labels, bands, shares } = data.spectrum;
+    const z = shares[state.order];
+    const percent = (share) => (share === null ? "" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`);
+    draw("spectrum", [{
+      type: "heatmap", z, text: z.map((row) => row.map((share) => (share >= 0.005 ? percent(share) : ""))),
+      texttemplate: narrow() ? "" : "%{text}", zmin: 0, xgap: 2, ygap: 2, showscale: false,
+      colorscale: [[0, color("empty")], [1, color("most")]],
+      hovertext: z.map((row, i) => row.map((share, j) => `${plain(labels[i])}<br>wavelengths ${plain(bands[j])}<br>${percent(share)}`)),
+      hoverinfo: "text",
+    }], {
+      xaxis: {
+        side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
+        title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: narrow() ? -60 : 0,
+      },
+      yaxis: {
+        autorange: "reversed", showgrid: false, zeroline: false, ticks: "", tickvals: labels.map((_, i) => i),
+        ticktext: labels.map((label) => short(label, narrow() ? 14 : 30)),
+      },
+    });
+  };
+
+  const witness = () => {
+    const { label, places: [x, y, z], corners: [i, j, k], values, triangles, shown } = data.witness[state.portrait];
+    const whole = triangles.toLocaleString("en");
+    document.getElementById("size").textContent = shown < triangles
+      ? `Shown with ${shown.toLocaleString("en")} of ${whole} triangles.`
+      : `It has ${whole} triangles.`;
+    const hidden = { visible: false, showbackground: false };
+    draw("witness", [{
+      type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmid: 0, hoverinfo: "x+y+z+text",
+      hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
+      colorscale: [[0, color("less")], [0.5, color("neutral")], [1, color("more")]],
+      lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
+      colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
+        ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
+    }], {
+      height: narrow() ? 420 : 560, margin: { l: 0, r: 0, t: 0, b: 0 },
+      scene: {
+        xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "data",
+        camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
+      },
+    }, space);
+  };
+
+  const drawings = [convergence, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum,
+    data.witness.length && witness].filter(Boolean);
+  const redraw = () => { for (const drawing of drawings) drawing(); };
+
+  document.addEventListener("order", ({ detail }) => { state.order = detail; redraw(); });
+  document.getElementById("alike")?.addEventListener("change", (event) => {
+    state.alike = event.target.checked;
+    matrix();
+  });
+  document.getElementById("portrait")?.addEventListener("change", (event) => {
+    state.portrait = Number(event.target.value);
+    witness();
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  matchMedia("(max-width: 699px)").addEventListener("change", redraw);
+  const chosen = document.querySelector("input[name=order]:checked, #order");
+  state.order = chosen ? Number(chosen.value) : 0;
+  redraw();
+})();

@@ -1,0 +1,88 @@
+"""A headless browser that writes down what it is asked for."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+_FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
+)
+# Its own pages and extensions; what a page asks for has another scheme.
+_INTERNAL = ("chrome", "devtools")
+
+
+class Browser:
+    """Chromium, driven by selenium."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def open(self, path: Path, *, width: int = 1100, height: int = 800, dark: bool = False) -> None:
+        """Load a page and wait for its pictures."""
+        self.command(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.command("Emulation.setEmulatedMedia", features=[scheme])
+        self.driver.get(path.as_uri())
+
+    def wait(self, expression: str) -> None:
+        """Until an expression is true: pages answer events in their own time."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        WebDriverWait(self.driver, 20, 0.05).until(lambda _: self.tell(expression))
+
+    def command(self, name: str, **arguments: Any) -> Any:
+        """A command of the browser's own protocol."""
+        return self.driver.execute_cdp_cmd(name, arguments)
+
+    def tell(self, expression: str) -> Any:
+        """The value of an expression on the page."""
+        return self.driver.execute_script(f"return {expression}")
+
+    def texts(self, selector: str) -> list[str]:
+        """The text of each element that is shown."""
+        return list(
+            self.tell(
+                f"[...document.querySelectorAll({json.dumps(selector)})].filter(e => e.offsetParent)"
+                ".map(e => e.innerText.trim())"
+            )
+        )
+
+    def complaints(self) -> list[str]:
+        """Errors on its console since the last call; of warnings, those are its own about drawing."""
+        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
+
+    def requests(self) -> list[str]:
+        """The addresses that pages asked for since the last call, but for data within the page itself."""
+        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        urls = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
+        return [url for url in urls if not url.startswith(("data:", "blob:", *_INTERNAL))]
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Browser]:
+    """A browser with an empty profile; tests skip where there is none."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium, of the extra dev, is not installed")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    driver_program = shutil.which("chromedriver")
+    if program is None or driver_program is None:
+        pytest.skip("chromium and chromedriver are not installed: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for flag in (*_FLAGS, f"--user-data-dir={folder}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver_program))
+    try:
+        yield Browser(driver)
+    finally:
+        driver.quit()

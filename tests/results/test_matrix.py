@@ -1,0 +1,118 @@
+"""Distance matrices from a store put together by hand."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sobolev_batch import InputError
+from sobolev_batch.results.matrix import Matrix, format_matrix, matrix_frame
+
+ORDERS = [-4.0, -2.0]
+
+
+def made(count: int, failed: int = 1, others: str = "all") -> xr.DataTree:
+    """Meshes on a line, at 1, 2, 3, ..., and the reference at zero."""
+    labels = [f"f/{i}" for i in range(count)] + ["reference"]
+    places = np.append(np.arange(1.0, count + 1), 0.0)
+    places[failed] = np.nan
+    chosen = labels if others == "all" else ["reference"]
+    there = places if others == "all" else places[-1:]
+    distance = np.abs(places[:, None] - there)[..., None] * np.array([1.0, 10.0])
+    names = ("error", "truncation", "aliasing", "discretisation")
+    distances = xr.Dataset(
+        {
+            "distance": (("mesh", "other", "order"), distance),
+            **dict.fromkeys(names, (("mesh", "other", "order"), distance / 100)),
+        },
+        coords={"mesh": labels, "other": chosen, "order": ORDERS},
+    )
+    status = np.array(["complete"] * len(labels), dtype=object)
+    status[failed] = "failed"
+    return xr.DataTree.from_dict(
+        {
+            "/distances": distances,
+            "/meshes": xr.Dataset({"status": ("mesh", status)}, coords={"mesh": labels}),
+            "/convergence": xr.Dataset(attrs={"reference": "reference"}),
+        }
+    )
+
+
+def test_frame_becomes_the_matrix() -> None:
+    frame = matrix_frame(made(4), -2.0)
+    assert frame.columns.tolist()[:4] == ["order", "mesh", "other", "distance"]
+    matrix = frame.pivot(index="mesh", columns="other", values="distance")
+    assert matrix.loc["f/0", "f/3"] == matrix.loc["f/3", "f/0"] == 30.0
+    assert matrix.loc["reference", "f/2"] == 30.0
+    assert matrix.loc["f/0", "f/0"] == 0.0
+    assert matrix["f/1"].isna().all()
+    assert (frame["order"] == -2).all()
+
+
+def test_text_has_brackets_and_fits_a_terminal() -> None:
+    text = format_matrix(made(15))
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 100
+    assert lines[0] == "Sobolev distances of order -4"
+    assert "Sobolev distances of order -2" in lines
+    row = next(line.split() for line in lines if line.startswith("4 f/3"))
+    assert row == ["4", "f/3", "3.00(3)e+00", "missing", "1.00(1)e+00"]
+    assert "1.234(5)e-02" in text.split("\n\n")[-1]
+
+
+def test_programs_get_lines_of_pairs() -> None:
+    lines = format_matrix(made(3), "csv").splitlines()
+    assert lines[0] == "order,mesh,other,distance,error,truncation,aliasing,discretisation"
+    assert len(lines) == 1 + 2 * 4 * 4
+    assert "-4.0,f/0,f/1,,,,," in lines
+    records = json.loads(format_matrix(made(3), "json", [-4.0]))
+    assert records[2] == {
+        "order": -4.0,
+        "mesh": "f/0",
+        "other": "f/2",
+        "distance": 2.0,
+        **dict.fromkeys(("error", "truncation", "aliasing", "discretisation"), 0.02),
+    }
+    assert records[1]["distance"] is None
+
+
+@pytest.mark.parametrize("style", ["markdown", "latex"])
+def test_documents_get_one_table_an_order(style: str) -> None:
+    text = format_matrix(made(12), style)  # type: ignore[arg-type]
+    assert text.count("Sobolev distances of order") == 2
+    assert text.count("missing") == 2 * 12
+
+
+def test_many_meshes_are_for_programs() -> None:
+    with pytest.raises(InputError, match=r"25 meshes is too large to be read as text.*--format csv"):
+        format_matrix(made(24))
+    assert len(format_matrix(made(24), "csv", [-4.0]).splitlines()) == 1 + 25**2
+
+
+def test_distances_to_the_reference_alone() -> None:
+    tree = made(4, others="reference")
+    assert len(matrix_frame(tree, -4.0)) == 5
+    text = format_matrix(tree, "text", [-4.0])
+    assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)e+00"]
+    assert Matrix.of(tree, -4.0) is None
+
+
+def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
+    matrix = Matrix.of(made(5), -4.0)
+    assert matrix is not None
+    assert matrix.labels == ("f/0", "f/2", "f/3", "f/4", "reference")
+    assert np.isfinite(matrix.values).all()
+    cut = Matrix.of(made(5), -4.0, most=3)
+    assert cut is not None
+    assert cut.labels == ("f/0", "f/2", "reference")
+    assert cut.values[0, 2] == 1.0
+
+
+def test_unknown_orders_and_unfinished_stores() -> None:
+    with pytest.raises(InputError, match="no order -3, only -4, -2"):
+        matrix_frame(made(3), -3.0)
+    with pytest.raises(InputError, match="no tables yet"):
+        format_matrix(xr.DataTree())
