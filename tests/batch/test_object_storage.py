@@ -117,7 +117,7 @@ def test_a_second_run_reuses_and_writes_no_field(server: Server, s3_client: Clie
     root = url.replace("s3:/", "")
     written = {path for method, path in made if method not in ("GET", "HEAD")}
     assert written == {f"{root}/zarr.json", f"{root}/records/zarr.json", f"{root}/claim.json"}
-    assert len(made) < 28
+    assert len(made) < 36
 
 
 def test_requests_grow_by_six_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
@@ -201,8 +201,9 @@ def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
     assert status[1].startswith("done; by process ")
     table = call("table", url, "--format", "csv", folder=tmp_path)
     assert table.stdout.count("\n") == 5
-    assert call("plot", url, folder=tmp_path).stdout.split() == ["convergence.png", "transform.png"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.png", "study.toml", "transform.png"]
+    drawn = call("plot", url, folder=tmp_path).stdout.split()
+    assert {"convergence.png", "transform.png"} <= set(drawn)
+    assert {path.name for path in tmp_path.iterdir()} == {"study.toml", *drawn}
 
 
 def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url: str) -> None:

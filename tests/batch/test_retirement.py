@@ -1,6 +1,6 @@
 """Workers that leave in the middle of a study hand on their work, and late ones get some.
 
-A mesh file that is a named pipe holds the worker that reads it in its task for as long as a test wants.
+A gate beside a mesh file holds the worker that loads it in its task for as long as a test wants.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from distributed import Client
 from sobolev_batch import Study, icosphere, open_store, run
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.store import Store
+from tests.batch import gate
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop
 
@@ -32,7 +33,7 @@ class Cluster:
         self.address = address
 
     def start(self, *options: str) -> subprocess.Popen[str]:
-        self.processes.append(dask("worker", self.address, *WORKER, *options))
+        self.processes.append(dask("worker", self.address, *WORKER, "--preload", gate.__file__, *options))
         return self.processes[-1]
 
 
@@ -63,30 +64,24 @@ def study(tmp_path: Path) -> Study:
     return Study.from_table(small_table(family=family), folder=folder)
 
 
-class Pipe:
-    """Takes the place of a mesh file: its reader waits until the file's content is written."""
+class Gate:
+    """Holds whoever loads a mesh file, once it is begun, until it is opened."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.content = path, path.read_bytes()
-        self.pipe = path.with_suffix(".pipe")
-        path.unlink()
-        os.mkfifo(path)
+        self.path = gate.gate_of(path)
+        self.aside = path.with_suffix(".aside")
+        os.mkfifo(self.path)
 
-    def restore(self) -> None:
-        """Put the file back; who has begun to read the pipe goes on waiting."""
-        os.link(self.path, self.pipe)
-        temporary = self.path.with_suffix(".new")
-        temporary.write_bytes(self.content)
-        temporary.replace(self.path)
+    def set_aside(self) -> None:
+        """Let everybody pass but those who wait already."""
+        self.path.rename(self.aside)
 
-    def release(self) -> bool:
-        """Let the one who reads the pipe have the content; whether there is any."""
+    def open(self) -> bool:
+        """Let those pass who wait; whether there are any."""
         try:
-            writer = os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
+            os.close(os.open(self.aside, os.O_WRONLY | os.O_NONBLOCK))
         except OSError:
             return False
-        with os.fdopen(writer, "wb") as file:
-            file.write(self.content)
         return True
 
 
@@ -108,19 +103,19 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
     with Client(cluster.address) as ours:
         ours.wait_for_workers(2, timeout=60)
         early = set(ours.scheduler_info(n_workers=-1)["workers"])
-        pipe: Pipe | None = None
+        held: Gate | None = None
 
         def disturb(progress: Progress) -> None:
-            nonlocal pipe
+            nonlocal held
             if progress.stage == "cluster":
-                pipe = Pipe(study.folder / "0.off")  # what it depends on is known, nothing is submitted yet
+                held = Gate(study.folder / "0.off")  # what it depends on is known, nothing is submitted yet
             if progress.record is not None:
                 records.append(progress.record)
             if progress.stage == "fields" and progress.done == progress.total - 1:
-                assert pipe is not None
+                assert held is not None
                 busy = [worker for worker, keys in ours.processing().items() if keys]
                 assert len(busy) == 1
-                pipe.restore()
+                held.set_aside()
                 cluster.start()
                 ours.wait_for_workers(3, timeout=60)
                 # The one in the middle of its task, and the one that could have taken it.
@@ -132,8 +127,8 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
     assert {record.worker for record in records[:-1]} <= early
     assert records[-1].worker not in early
     # What had begun on the retired worker ends there after all, and leaves the same store.
-    assert pipe is not None
-    assert pipe.release()
+    assert held is not None
+    assert held.open()
     for process in processes:
         process.communicate(timeout=60)
     last = next(record for record in Store.open(store_path).records() if record and record.key == records[-1].key)
@@ -150,23 +145,23 @@ def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
     with Client(cluster.address) as ours, following(ours, "remove-worker", left):
         ours.wait_for_workers(1, timeout=60)
         first = next(iter(ours.scheduler_info()["workers"]))
-        pipe: Pipe | None = None
+        held: Gate | None = None
 
         def disturb(progress: Progress) -> None:
-            nonlocal pipe
+            nonlocal held
             if progress.stage == "cluster":
-                pipe = Pipe(study.folder / "0.off")
-                threading.Thread(target=replace, args=(pipe,)).start()
+                held = Gate(study.folder / "0.off")
+                threading.Thread(target=replace, args=(held,)).start()
 
-        def replace(pipe: Pipe) -> None:
+        def replace(held: Gate) -> None:
             assert left.wait(timeout=120)
-            pipe.restore()
+            held.set_aside()
             cluster.start()
 
         summary = run(study, store_path, ours, on_progress=disturb)
     assert len(summary.computed) == 5
-    assert pipe is not None
-    pipe.release()
+    assert held is not None
+    held.open()
     leaving.communicate(timeout=60)
     workers = {record.worker for record in Store.open(store_path).records() if record}
     assert workers - {first}

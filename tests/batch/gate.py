@@ -1,0 +1,28 @@
+"""Loaded into a worker before it starts: whoever loads a mesh file beside which there is a gate waits at it.
+
+A gate is a named pipe with the file's stem: it opens when somebody writes to it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sobolev_batch.batch import tasks
+from sobolev_batch.batch.tasks import Job, load_surface
+from sobolev_batch.surfaces.files import FileMember
+from sobolev_batch.surfaces.similarity import Surface
+
+
+def gate_of(path: Path) -> Path:
+    """Where the gate of a mesh file is."""
+    return path.with_suffix(".gate")
+
+
+def wait_and_load(job: Job) -> Surface:
+    """The surface of a job, once its gate is open."""
+    if isinstance(job.member, FileMember) and gate_of(job.member.path).exists():
+        gate_of(job.member.path).read_bytes()
+    return load_surface(job)
+
+
+vars(tasks)["load_surface"] = wait_and_load
