@@ -8,9 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from sobolev_batch.batch import tasks
-from sobolev_batch.batch.tasks import Job, load_surface
+from sobolev_batch.batch.tasks import Job
 from sobolev_batch.surfaces.files import FileMember
 from sobolev_batch.surfaces.similarity import Surface
+
+# Dask may load this twice.
+_LOAD = vars(tasks).setdefault("_load_surface_without_gate", tasks.load_surface)
 
 
 def gate_of(path: Path) -> Path:
@@ -22,7 +25,8 @@ def wait_and_load(job: Job) -> Surface:
     """The surface of a job, once its gate is open."""
     if isinstance(job.member, FileMember) and gate_of(job.member.path).exists():
         gate_of(job.member.path).read_bytes()
-    return load_surface(job)
+    surface: Surface = _LOAD(job)
+    return surface
 
 
 vars(tasks)["load_surface"] = wait_and_load
