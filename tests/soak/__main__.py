@@ -25,7 +25,9 @@ def main(meshes: int, seed: int, kills: int, driver_kills: int, rate: float) -> 
         logging.getLogger(talkative).setLevel(logging.CRITICAL)
     with TemporaryDirectory() as folder:
         outcome = soak(Path(folder), meshes, seed, kills, driver_kills, rate)
-    click.echo(tabulate(rows(outcome), headers=[f"{meshes} meshes, seed {seed}", ""], floatfmt=".1f"))
+    shown = [(name, f"{figure:.1f}" if isinstance(figure, float) else f"{figure:,}") for name, figure in rows(outcome)]
+    headers = [f"{meshes:,} meshes, seed {seed}", ""]
+    click.echo(tabulate(shown, headers=headers, disable_numparse=True, colalign=("left", "right")))
     for difference in outcome.differences:
         click.echo(f"not the same: {difference}")
     sys.exit(bool(outcome.differences))
