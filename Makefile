@@ -18,7 +18,7 @@ test: $(READY)  ## the tests
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage
 
-soak: $(READY)  ## 2,000 meshes while workers and drivers are killed and the storage fails; some ten minutes
+soak: $(READY)  ## 2,000 meshes while workers and drivers are killed and the storage fails; some five minutes
 	$(BIN)/python -m tests.soak
 
 check: $(READY)  ## lint, formatting, types
