@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import subprocess
@@ -42,19 +43,19 @@ class Havoc:
         workers, drivers: killed so far.
     """
 
-    def __init__(self, plan: Plan, seed: int, workers: int, known: Callable[[], int]) -> None:
+    def __init__(self, plan: Plan, seed: int, workers: Callable[[], list[int]], known: Callable[[], int]) -> None:
         """Take up a plan.
 
         Args:
             plan: when to kill.
             seed: of the choice among the workers.
-            workers: that the cluster has when all are there.
-            known: how many its scheduler knows of.
+            workers: the ids of the processes that the cluster has for workers, whether they are alive or not.
+            known: how many of them its scheduler knows of.
         """
         self.workers = self.drivers = 0
         self._workers_due, self._drivers_due = deque(plan.workers), deque(plan.drivers)
         self._random = random.Random(seed)
-        self._all, self._known = workers, known
+        self._pids, self._known = workers, known
         self._driver: subprocess.Popen[str] | None = None
         self._requests = 0
         self._lock = threading.Lock()
@@ -75,9 +76,9 @@ class Havoc:
                 self.drivers += 1
                 self._drivers_due.popleft()
             if self._is_due(self._workers_due):
-                alive = worker_processes()
-                if len(alive) == self._known() == self._all:
-                    self._random.choice(alive).send_signal(signal.SIGKILL)
+                pids = sorted(self._pids())
+                if self._known() == len(pids) and all(map(_is_alive, pids)):
+                    os.kill(self._random.choice(pids), signal.SIGKILL)
                     self.workers += 1
                     self._workers_due.popleft()
 
@@ -85,14 +86,5 @@ class Havoc:
         return bool(plan) and plan[0] <= self._requests
 
 
-def worker_processes() -> list[psutil.Process]:
-    """The worker processes that nannies in this process have started, in the order of their ids."""
-    found = []
-    for child in psutil.Process().children():
-        try:
-            # Beside them there is the process that keeps track of shared resources.
-            if child.status() != psutil.STATUS_ZOMBIE and "--multiprocessing-fork" in child.cmdline():
-                found.append(child)
-        except psutil.NoSuchProcess:
-            continue
-    return sorted(found, key=lambda child: child.pid)
+def _is_alive(pid: int) -> bool:
+    return pid > 0 and psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE

@@ -29,8 +29,8 @@ def outcome(folder: Path) -> Outcome:
 def test_nothing_is_lost_by_kills_and_failing_requests(outcome: Outcome) -> None:
     assert outcome.differences == ()
     assert outcome.drivers == 1
-    # A worker is killed while another one is there, if there is still something to do then.
-    assert outcome.workers <= 2
+    # The second comes when the first is back, if there is still something to do then.
+    assert outcome.workers in (1, 2)
     assert sum(outcome.failures.values()) > 0
     assert outcome.failures.total() >= 5
 

@@ -61,7 +61,13 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
             started = time.monotonic()
             run(Study.from_toml(path), clean, client)
             clean_seconds = time.monotonic() - started
-            havoc = Havoc(plan, seed, _WORKERS, lambda: len(client.cluster.scheduler.workers))
+            nannies = client.cluster.workers
+            havoc = Havoc(
+                plan,
+                seed,
+                lambda: [nanny.pid or 0 for nanny in nannies.values()],
+                lambda: len(client.cluster.scheduler.workers),
+            )
             storage.call(havoc.on_request)
             storage.rule = Rule(rate)
             started = time.monotonic()
