@@ -103,7 +103,7 @@ def study_overhead(effort: Effort) -> Iterator[Row]:
 def all_pairs(effort: Effort) -> Iterator[Row]:
     """Item 6: the distances of all pairs of stored fields against the bare matrix product."""
     count, intervals = (24, 32) if effort.quick else (500, 64)
-    orders = (-10.0, -5.0)
+    orders = (-10.0, -5.0, -2.0)
     by_reference, by_pair = (_study_of_spheres(count, intervals, orders, pairs) for pairs in ("reference", "all"))
     with TemporaryDirectory() as name, local_client(_WORKERS) as client:
         store = Path(name) / "pairs.zarr"

@@ -82,3 +82,38 @@ def test_a_command_that_has_not_begun_says_so(tmp_path: Path) -> None:
     assert rest.strip().startswith("interrupted")
     assert len(rest.strip().splitlines()) == 1
     assert not (tmp_path / "s.zarr").exists()
+
+
+# A command that is asked to end while a finalizer runs, where Python reports what is raised and goes on.
+IN_A_FINALIZER = """
+import signal, sys, time
+import click
+import sobolev_batch.cli as line
+
+class Finalized:
+    def __del__(self):
+        signal.raise_signal({number})
+        time.sleep(0)
+
+@line.cli.command("finalize")
+def finalize():
+    Finalized()
+    click.echo("goes on", err=True)
+    time.sleep(20)
+
+sys.argv = ["sobolev-batch", "finalize"]
+line.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_a_request_within_a_finalizer_is_heard(number: int, status: int, word: str) -> None:
+    script = IN_A_FINALIZER.format(number=int(number))
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=_SECONDS)
+    lines = [line for line in found.stderr.splitlines() if line]
+    assert lines[0] == "goes on"
+    assert lines[1].startswith(f"{word}; the same command goes on")
+    assert len(lines) == 2
+    assert found.returncode == status

@@ -1,0 +1,43 @@
+"""The command line: sobolev-batch."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+# Each joins the group.
+from sobolev_batch.cli import meshes, stores, studies  # noqa: F401
+from sobolev_batch.cli.group import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_OTHER, EXIT_TERMINATED, cli
+from sobolev_batch.cli.interruption import Terminated, ignore_requests, raise_when_asked
+from sobolev_batch.errors import InputError, SobolevBatchError
+
+__all__ = ["cli", "main"]
+
+
+def main() -> None:
+    """Run the command line; the process ends with its exit status."""
+    debug = "--debug" in sys.argv
+    # Also what ends a job at its time limit: it leaves the time to give up the claim on a store.
+    raise_when_asked()
+    try:
+        status = cli.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        ignore_requests()
+        click.echo("interrupted; the same command goes on from what is stored", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except Terminated:
+        ignore_requests()
+        click.echo("terminated; the same command goes on from what is stored", err=True)
+        sys.exit(EXIT_TERMINATED)
+    except Exception as error:
+        if debug:
+            raise
+        known = isinstance(error, SobolevBatchError)
+        what = str(error) if known else f"{type(error).__name__}: {error} (--debug shows where)"
+        click.echo(f"error: {what}", err=True)
+        sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
+    sys.exit(status or 0)

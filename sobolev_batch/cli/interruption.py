@@ -1,0 +1,56 @@
+"""Being asked to end: Ctrl-C and the SIGTERM of a job at its time limit, as exceptions that cannot get lost."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+# Long enough for the finalizer to have returned.
+_AGAIN_SECONDS = 0.01
+
+
+class Terminated(SystemExit):
+    """Somebody has asked the process to end."""
+
+
+def raise_when_asked() -> None:
+    """Raise KeyboardInterrupt and `Terminated` in the main thread when the process is asked to end.
+
+    An exception that a signal raises within a finalizer gets no further than that: Python only reports it.
+    It is then raised again.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
+    if not hasattr(signal, "setitimer"):  # Windows
+        return
+    report = sys.unraisablehook
+
+    def insist(lost: UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, KeyboardInterrupt | Terminated):
+            report(lost)
+            return
+        asked = type(lost.exc_value)
+
+        def ask_again(number: int, frame: FrameType | None) -> None:
+            raise asked
+
+        signal.signal(signal.SIGALRM, ask_again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_SECONDS)
+
+    sys.unraisablehook = insist
+
+
+def ignore_requests() -> None:
+    """What asks a process to end that is ending must not change how it ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
