@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sobolev_batch.surfaces.interval import Interval
     from sobolev_batch.surfaces.mesh import Mesh
     from sobolev_batch.surfaces.parametrised import ParametrisedSurface
+    from sobolev_batch.surfaces.proximity import Proximity, proximity
     from sobolev_batch.surfaces.readers import read_mesh
     from sobolev_batch.surfaces.similarity import Similarity
     from sobolev_batch.surfaces.sphere import Sphere
@@ -69,6 +70,7 @@ __all__ = [
     "MeshError",
     "OrderError",
     "ParametrisedSurface",
+    "Proximity",
     "Similarity",
     "SobolevAccessor",
     "SobolevBatchError",
@@ -87,6 +89,7 @@ __all__ = [
     "norm",
     "open_store",
     "proportion",
+    "proximity",
     "read_mesh",
     "release",
     "run",
@@ -115,6 +118,7 @@ _MODULES = {
     "MeshError": "errors",
     "OrderError": "errors",
     "ParametrisedSurface": "surfaces.parametrised",
+    "Proximity": "surfaces.proximity",
     "Similarity": "surfaces.similarity",
     "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
@@ -133,6 +137,7 @@ _MODULES = {
     "norm": "spectral.norms",
     "open_store": "results.opening",
     "proportion": "spectral.proportion",
+    "proximity": "surfaces.proximity",
     "read_mesh": "surfaces.readers",
     "release": "batch.release",
     "run": "batch.run",

@@ -21,9 +21,9 @@ from sobolev_batch.surfaces.sources import Size
 _PART_TRIANGLES = 1 << 21
 _FEWEST_TRIANGLES = 1 << 16
 # Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
-_MESH_BYTES = 100.0
+MESH_BYTES = 100.0
 # Less makes a transform's batches and parts of a block so small that it becomes slow.
-_LEAST_ROOM_BYTES = 256e6
+LEAST_ROOM_BYTES = 256e6
 # Of the choice of rules, for each triangle.
 _CHOICE_BYTES = 100.0
 
@@ -96,11 +96,11 @@ def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Cre
     block_bytes = float(block.size * item_bytes(transform.precision))
 
     def least(triangles: float) -> float:
-        return _LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles
+        return LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles
 
     def fixed(triangles: float) -> float:
         # The block and what it is added to or compared with.
-        return _MESH_BYTES * triangles + 2 * block_bytes
+        return MESH_BYTES * triangles + 2 * block_bytes
 
     whole = size.triangles <= 1.5 * _PART_TRIANGLES and (
         fixed(size.triangles) + least(size.triangles) <= crew.largest_bytes
@@ -108,7 +108,7 @@ def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Cre
     part = size.triangles if whole else _PART_TRIANGLES
     while not whole and fixed(part) + least(part) > crew.share_bytes and part > _FEWEST_TRIANGLES:
         part //= 2
-    making = max(size.making_bytes, _MESH_BYTES * size.triangles)
+    making = max(size.making_bytes, MESH_BYTES * size.triangles)
     needed = max(making, fixed(part) + least(part))
     if needed > crew.largest_bytes:
         raise ClusterError(

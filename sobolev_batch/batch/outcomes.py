@@ -11,6 +11,12 @@ from distributed.scheduler import KilledWorker
 
 from sobolev_batch.errors import ClusterError
 
+# Why a mesh failed whose tasks have ended their workers, with nothing else beside them.
+DEADLY = (
+    "its tasks ended the worker that they ran on again and again, at last with nothing else beside them, as "
+    "happens for want of memory ({}); start workers with more memory, or take it out of the study"
+)
+
 
 def outcomes(client: Client, futures: Sequence[Future]) -> list[Any]:
     """The results of futures that have ended, or what they raised, all fetched at once.

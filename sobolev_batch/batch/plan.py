@@ -17,6 +17,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
 from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
+from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources import Member, sole_member
@@ -128,6 +129,11 @@ def make_plan(study: Study, known: Choice | None = None) -> Plan:
     choice = _choice(study, similarity, members, reference, scaled, known)
     if not isinstance(scaled, Sphere):
         require_inside(scaled, choice.lattice)
+    if study.proximity is not None and not isinstance(scaled, Mesh):
+        raise StudyError(
+            "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
+            f"but a {type(scaled).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
+        )
     rows = []
     for label, (family, member) in members.items():
         fingerprint = _fingerprint(label, member)

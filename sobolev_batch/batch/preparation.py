@@ -206,12 +206,9 @@ def _extend(store: Store, plan: Plan) -> None:
     if not added:
         return
     for name in (RECORD, FIELD, QUALITY, LABELS):
-        array = store.array(name)
-        array.resize((len(there) + len(added), *array.shape[1:]))
+        store.resize(name, (len(there) + len(added), *store.array(name).shape[1:]))
         if name == LABELS:
-            array[len(there) :] = np.array(added, dtype=object)
-        del store.documents[name]
-        store.document(name)
+            store.array(name)[len(there) :] = np.array(added, dtype=object)
 
 
 def _attributes(plan: Plan) -> dict[str, Any]:

@@ -15,13 +15,13 @@ class Progress:
 
     Attributes:
         stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
-            tables are made.
+            tables are made, "comparisons" while meshes are compared with the reference.
         done, total: steps of the stage.
         label: of the mesh that was finished, or the address of the cluster's dashboard; else empty.
         record: of that mesh.
     """
 
-    stage: Literal["cluster", "fields", "reduction"]
+    stage: Literal["cluster", "fields", "reduction", "comparisons"]
     done: int
     total: int
     label: str = ""

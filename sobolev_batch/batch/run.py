@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 from distributed import Client
@@ -15,6 +15,7 @@ from distributed import Client
 from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.claim import Claim, claimed
 from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.computing import compute_fields
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.equipment import enlist, worry_about
@@ -41,6 +42,9 @@ _MOST_ROUNDS = 3
 _MOST_REPAIRS = 3
 
 
+Found = TypeVar("Found")
+
+
 @dataclass(frozen=True)
 class Summary:
     """What a run did.
@@ -50,12 +54,15 @@ class Summary:
         computed: labels of the meshes whose fields were computed now.
         reused: labels of those that were already there.
         failed: the reason for each mesh that could not be computed.
+        not_compared: the reason for each mesh whose field is there, and whose witness function or Hausdorff and
+            Chamfer distances, which the study asks for, are not.
     """
 
     store: str
     computed: tuple[str, ...]
     reused: tuple[str, ...]
     failed: Mapping[str, str]
+    not_compared: Mapping[str, str] = field(default_factory=dict)
 
 
 def run(
@@ -123,9 +130,10 @@ def carry_out(
     claim.require(location)
     work = _Work.of(location, plan)
     computed: set[int] = set()
+    not_compared: dict[str, str] = {}
     with Journal(work.store, claim) as journal:
         missing = work.missing()
-        if missing or not work.is_tabulated:
+        if missing or not work.is_tabulated or not work.comparer.is_done:
             with cluster as client:
                 journal.cluster = client.scheduler.address
                 journal.write("running")
@@ -153,7 +161,9 @@ def carry_out(
                         work = _Work.of(location, work.plan.on(choice))
                     journal.write("running")
                     missing = work.missing()
-    return work.summary(computed)
+                repaired, not_compared = work.compare(client, crew, note)
+                computed.update(repaired)
+    return work.summary(computed, not_compared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +189,11 @@ class _Work:
     @property
     def is_tabulated(self) -> bool:
         return are_tabulated(self.store, self.plan, self.rows, self.records)
+
+    @property
+    def comparer(self) -> Comparer:
+        """What compares the meshes with the reference as the study asks."""
+        return Comparer.of(self.store, self.plan, self.rows, self.records)
 
     def missing(self) -> list[int]:
         """The rows whose fields are to be computed; records of fields that are not there are withdrawn."""
@@ -207,23 +222,43 @@ class _Work:
         self, client: Client, crew: Crew, missing: Sequence[int], notify: Notify
     ) -> tuple[set[int], Assessed | None]:
         """Compute fields and tables, and again what turns out damaged; these rows, and distances if they are new."""
-        repaired: set[int] = set()
-        repairs = 0
-        while True:
+
+        def attempt(missing: Sequence[int]) -> Assessed | None:
             compute_fields(client, crew, self.store, self.plan, self.rows, missing, self.records, notify)
+            return tabulate_fields(client, crew, self.store, self.plan, self.rows, self.records, notify)
+
+        return self._repairing(client, missing, attempt)
+
+    def compare(self, client: Client, crew: Crew, notify: Notify) -> tuple[set[int], dict[str, str]]:
+        """Make the comparisons that are asked for; rows whose fields turned out damaged, and why meshes are without."""
+
+        def attempt(damaged: Sequence[int]) -> dict[str, str]:
+            if damaged:
+                compute_fields(client, crew, self.store, self.plan, self.rows, damaged, self.records, notify)
+                tabulate_fields(client, crew, self.store, self.plan, self.rows, self.records, notify)
+            return self.comparer.carry_out(client, crew, notify)
+
+        return self._repairing(client, (), attempt)
+
+    def _repairing(
+        self, client: Client, missing: Sequence[int], attempt: Callable[[Sequence[int]], Found]
+    ) -> tuple[set[int], Found]:
+        """What an attempt finds, given the rows that are missing; and the rows that turned out damaged on the way."""
+        repaired: set[int] = set()
+        for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
             try:
-                return repaired, tabulate_fields(client, crew, self.store, self.plan, self.rows, self.records, notify)
+                return repaired, attempt(missing)
             except DamageError as error:
-                repairs += 1
-                if repairs > _MOST_REPAIRS:
+                if not attempts_left:
                     raise
                 _log.warning("%s", error)
                 # Where one is damaged, others may be.
                 missing = damaged_rows(client, self.store, self.records)
                 self._withdraw(missing, "its values are not what was stored")
                 repaired.update(missing)
+        raise AssertionError("unreachable: the last attempt returns or raises")
 
-    def summary(self, computed: set[int]) -> Summary:
+    def summary(self, computed: set[int], not_compared: Mapping[str, str]) -> Summary:
         failed = {
             row.label: record.reason if record else "not computed"
             for row, record in zip(self.rows, self.records, strict=True)
@@ -234,6 +269,7 @@ class _Work:
             tuple(row.label for i, row in enumerate(self.rows) if i in computed and row.label not in failed),
             tuple(row.label for i, row in enumerate(self.rows) if i not in computed),
             failed,
+            not_compared,
         )
 
     def _withdraw(self, rows: Sequence[int], reason: str) -> None:

@@ -50,12 +50,15 @@ FIELD = "fourier/fourier"
 LABELS = "fourier/mesh"
 QUALITY = "fourier/quality"
 RECORD = "records/record"
+RECORDS = "records"
+WITNESS_GROUP = "witness"
+WITNESS = "witness/witness"
 _MESHES = "meshes/mesh"
-_RECORDS, _RUN = "records", "run"
+_RUN = "run"
 # All other groups are tables, which the reduction makes.
-_GROUPS_OF_TASKS = ("fourier", _RECORDS)
+_GROUPS_OF_TASKS = ("fourier", RECORDS, WITNESS_GROUP)
 # Bytes of the codec at the end of a chunk.
-_CHECKSUM_BYTES = 4
+CHECKSUM_BYTES = 4
 _REQUESTS_AT_ONCE = 64
 
 
@@ -77,7 +80,11 @@ class Store:
 
     def __getstate__(self) -> dict[str, Any]:
         # What tasks write and read; tables have fifty times as much.
-        carried = {name: self.documents[name] for name in (FIELD, RECORD) if name in self.documents}
+        carried = {
+            name: document
+            for name, document in self.documents.items()
+            if name in (FIELD, WITNESS) or name.startswith(f"{RECORDS}/")
+        }
         return {"location": self.location, "documents": carried, "_withdrawn": []}
 
     @property
@@ -222,7 +229,7 @@ class Store:
         values = np.ascontiguousarray(values, dtype=array.dtype)
         with self.location.access("written"):
             array[(row, *place)] = values
-        return _checksum(values)
+        return checksum_of(values)
 
     def read_fields(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
         """One block of several rows' fields, complex (len(rows), ...).
@@ -249,7 +256,7 @@ class Store:
                     array.get_basic_selection((rows[i], *place), out=NDBuffer.from_numpy_array(values[i]))
                 except damage as error:
                     raise self._damage(rows[i], str(error)) from error
-            if checksums is not None and _checksum(values[i]) != checksums[i]:
+            if checksums is not None and checksum_of(values[i]) != checksums[i]:
                 lost = bool(np.isnan(values[i]).all())
                 raise self._damage(rows[i], "it is not there" if lost else "it is not what was written for its record")
 
@@ -265,7 +272,7 @@ class Store:
     def rows_with_whole_fields(self) -> set[int]:
         """The rows of which every block is there, as long as it should be; nothing is read of them."""
         array = self.array(FIELD)
-        whole = math.prod(array.chunks) * array.dtype.itemsize + _CHECKSUM_BYTES
+        whole = math.prod(array.chunks) * array.dtype.itemsize + CHECKSUM_BYTES
         sizes = self.location.sizes(f"{FIELD}/c")
         blocks = list(np.ndindex(*(-(-n // m) for n, m in zip(array.shape[1:], array.chunks[1:], strict=True))))
         return {
@@ -281,16 +288,16 @@ class Store:
 
     def read_run(self) -> RunRecord | None:
         """The record of the latest run, or None where none was ever begun."""
-        document = self._read_document(_RECORDS) or {}
+        document = self._read_document(RECORDS) or {}
         table = document.get("attributes", {}).get(_RUN)
         return None if table is None else RunRecord.from_table(table)
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, with one key written at once."""
-        document = self.document(_RECORDS)
+        document = self.document(RECORDS)
         # Not remembered: consolidated metadata would tell readers of a run that ended long ago.
         changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: record.to_table()}}
-        self.location.write({f"{_RECORDS}/{ROOT}": json.dumps(changed).encode()})
+        self.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
         """Set the coordinate `quality` of all fields."""
@@ -299,11 +306,15 @@ class Store:
             array[:] = np.array(qualities, dtype=object)
 
     def withdraw_tables(self) -> None:
-        """Have no reader find the tables until `consolidate`: while they are written they do not fit together."""
+        """Have no reader find the tables until `consolidate`: while they are written they do not fit together.
+
+        Nor witness functions, which belong to the fields that are replaced.
+        """
         self._withdrawn = self._tables()
-        for name in self._withdrawn:
+        hidden = [*self._withdrawn, *(name for name in self.documents if name.split("/")[0] == WITNESS_GROUP)]
+        for name in hidden:
             del self.documents[name]
-        if self._withdrawn:
+        if hidden:
             self.consolidate()
 
     def write_table(self, group: str, dataset: xr.Dataset) -> None:
@@ -339,7 +350,7 @@ class Store:
         for name in [*coordinates, QUALITY, *self._tables()]:
             if name not in damaged and self.document(name).get("node_type") == "array":
                 try:
-                    self._read(name, ...)
+                    self.read(name, ...)
                 except DamageError as error:
                     damaged[name] = error.what
         return damaged
@@ -354,7 +365,7 @@ class Store:
             array = self.array(name)
             # Texts have no size that could be foretold.
             fixed = array.dtype.kind in "biufc"
-            expected = math.prod(array.chunks) * array.dtype.itemsize + _CHECKSUM_BYTES * bool(array.ndim)
+            expected = math.prod(array.chunks) * array.dtype.itemsize + CHECKSUM_BYTES * bool(array.ndim)
             counts = (-(-n // m) for n, m in zip(array.shape, array.chunks, strict=True))
             for number in np.ndindex(*counts):
                 found = sizes.get(f"{name}/{array.metadata.encode_chunk_key(number)}", 0)
@@ -384,7 +395,7 @@ class Store:
     def _labels_of(self, name: str) -> tuple[str, ...]:
         """The labels that an array holds; none where it is damaged, or a part of it not there."""
         try:
-            labels = self._read_texts(name)
+            labels = self.texts(name)
         except DamageError:
             return ()
         return labels if all(labels) else ()
@@ -392,7 +403,7 @@ class Store:
     def _examine_records(self) -> tuple[tuple[Record | None, ...], dict[int, str]]:
         lines: list[str | DamageError]
         try:
-            lines = list(self._read_texts(RECORD))
+            lines = list(self.texts(RECORD))
         except DamageError:
             # One of them at least: which, is seen one by one.
             lines = [self._read_record(row) for row in range(self.array(RECORD).shape[0])]
@@ -410,7 +421,7 @@ class Store:
 
     def _read_record(self, row: int) -> str | DamageError:
         try:
-            return str(self._read(RECORD, row))
+            return str(self.read(RECORD, row))
         except DamageError as error:
             return error
 
@@ -450,13 +461,51 @@ class Store:
         """An array by the path of its node, for reading and writing."""
         place = StorePath(self.keys(name), name)
         known = zarr.AsyncArray.from_dict(place, self.document(name))
-        # Chunks of zeros are data too: they must exist, or they would read as never computed.
-        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": True}))
+        # Chunks of zeros are data too: they must exist, or they would read as never computed. Witness functions
+        # are NaN beyond the vertices of their mesh, over any number of chunks.
+        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": name != WITNESS}))
 
-    def _read_texts(self, name: str) -> tuple[str, ...]:
-        return tuple(map(str, np.asarray(self._read(name, ...)).tolist()))
+    def has(self, name: str) -> bool:
+        """Whether a node is there, listed at the root or not."""
+        return name in self.documents or self._read_document(name) is not None
 
-    def _read(self, name: str, where: Any) -> Any:
+    def resize(self, name: str, shape: tuple[int, ...]) -> None:
+        """Give an array another shape; chunks within both stay."""
+        array = self.array(name)
+        with self.location.access("written"):
+            array.resize(shape)
+        del self.documents[name]
+        self.document(name)
+
+    def create_texts(self, name: str, count: int, *, chunk: int) -> None:
+        """Create an array of texts along `mesh`, all of them empty."""
+        made: dict[str, Buffer] = {}
+        zarr.create_group(MemoryStore(made), zarr_format=3).create_array(
+            name,
+            shape=(count,),
+            dtype=str,
+            chunks=(chunk,),
+            compressors=(Crc32cCodec(),),
+            dimension_names=("mesh",),
+            fill_value="",
+        )
+        self.publish({f"{name}/{ROOT}": made[f"{name}/{ROOT}"]}, last="")
+
+    def remove(self, name: str) -> None:
+        """Remove a node and everything in it, if it is there; `consolidate` makes that known to readers."""
+        for known in [known for known in self.documents if known == name or known.startswith(f"{name}/")]:
+            del self.documents[known]
+        self.location.remove(name)
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        """All of an array of texts.
+
+        Raises:
+            DamageError, StoreError: as for `read`.
+        """
+        return tuple(map(str, np.asarray(self.read(name, ...)).tolist()))
+
+    def read(self, name: str, where: Any) -> Any:
         """Some of an array.
 
         Raises:
@@ -494,7 +543,7 @@ def stored_choice(place: str | Path | Location) -> Choice | None:
     return Choice.from_table(table) if table else None
 
 
-def _checksum(values: NDArray[Any]) -> int:
+def checksum_of(values: NDArray[Any]) -> int:
     """CRC-32C of a C-ordered array."""
     data: Any = values.view(np.uint8).reshape(-1)
     # The library takes what cannot change while it reads.

@@ -23,6 +23,7 @@ from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.surfaces.contents import open_regular
 from sobolev_batch.surfaces.names import flaw, folded, shown, twins
+from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.similarity import Similarity
 from sobolev_batch.surfaces.sources import Source, at_most, parse_source
 
@@ -112,6 +113,10 @@ class Study:
         families: the surfaces to compare.
         reference: what they are compared with.
         scaling: how all of them are brought to one unit of length.
+        witness: the orders of which every mesh's witness function against the reference is stored, at its
+            vertices; empty where none is asked for.
+        proximity: how many points are drawn on each mesh for its Hausdorff and Chamfer distances from the
+            reference; None where these are not asked for.
         folder: where relative paths start.
         table: the study as it was written, for the record.
     """
@@ -128,6 +133,8 @@ class Study:
     families: tuple[Family, ...]
     reference: Source | FamilyReference
     scaling: Scaling
+    witness: tuple[float, ...]
+    proximity: int | None
     folder: Path
     table: Mapping[str, Any]
 
@@ -137,7 +144,8 @@ class Study:
         sources = [family.source for family in self.families]
         if isinstance(self.reference, Source):
             sources.append(self.reference)
-        return tuple(sorted({library for source in sources for library in source.libraries}))
+        own = () if self.proximity is None else ("vtk",)
+        return tuple(sorted({*own, *(library for source in sources for library in source.libraries)}))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -159,7 +167,7 @@ class Study:
 
         Args:
             table: sections [study], [lattice] or [accuracy], [norm], [transform], [reference],
-                [[family]], [scaling].
+                [[family]], [scaling], [witness], [proximity].
             folder: where relative paths start.
 
         Raises:
@@ -181,6 +189,7 @@ class Study:
         if any(folded(family.name) == REFERENCE_LABEL for family in families):
             raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
         try:
+            orders = _distinct(check_orders(document.norm.orders))
             return cls(
                 name=document.study.name,
                 title=document.study.title or document.study.name,
@@ -189,11 +198,13 @@ class Study:
                 transform=document.transform.settings(),
                 dtype=document.transform.dtype,
                 backend=document.transform.backend,
-                orders=_distinct(check_orders(document.norm.orders)),
+                orders=orders,
                 pairs=document.norm.pairs,
                 families=families,
                 reference=_reference(document.reference, families),
                 scaling=document.scaling.settings(),
+                witness=() if document.witness is None else document.witness.settings(orders),
+                proximity=None if document.proximity is None else document.proximity.points,
                 folder=Path(folder),
                 table=json.loads(json.dumps(table, default=str)),
             )
@@ -260,6 +271,17 @@ class _ScalingSection(_Section):
         return Scaling(self.mode, Similarity(scale, self.origin or (0.0, 0.0, 0.0)))
 
 
+class _WitnessSection(_Section):
+    orders: Annotated[tuple[Number, ...] | None, Field(strict=False), at_most(_MOST_ORDERS)] = None
+
+    def settings(self, of_norm: tuple[float, ...]) -> tuple[float, ...]:
+        return of_norm if self.orders is None else _distinct(check_orders(self.orders))
+
+
+class _ProximitySection(_Section):
+    points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
+
+
 class _FamilyReferenceSection(_Section):
     family: str
     member: str | None = None
@@ -274,6 +296,8 @@ class _Document(_Section):
     reference: dict[str, Any]
     family: Annotated[list[dict[str, Any]], Field(min_length=1)]
     scaling: _ScalingSection = _ScalingSection()
+    witness: _WitnessSection | None = None
+    proximity: _ProximitySection | None = None
 
     @model_validator(mode="after")
     def _lattice_or_accuracy(self) -> Self:

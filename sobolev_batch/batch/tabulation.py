@@ -8,12 +8,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from distributed import Client, as_completed
+from distributed import Client, Future
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.crew import MEMORY, Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
-from sobolev_batch.batch.outcomes import is_suspect, outcomes
+from sobolev_batch.batch.dealing import deal
+from sobolev_batch.batch.outcomes import is_suspect
 from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.records import Record
@@ -83,13 +84,17 @@ def tabulate_fields(
             distances[..., np.array(other[0])[:, None], np.array(tile)] = np.swapaxes(pairs, -1, -2)
         notify(Progress("reduction", done, len(calls)))
 
-    suspects = _deal(client, calls, resources, enter)
-    for call in suspects:
-        if _deal(client, [call], resources, enter):
+    def submit(number: int, rank: int) -> Future:
+        task, arguments = calls[number]
+        return client.submit(task, *arguments, pure=False, resources=resources)
+
+    for number, outcome in deal(client, submit, range(len(calls)), len(calls)):
+        if is_suspect(outcome):
             raise ClusterError(
                 "a task of the reduction ended the worker that it ran on again and again, at last with nothing else "
                 "beside it, as happens for want of memory; start workers with more memory"
             )
+        enter(calls[number], outcome)
     if every_pair:
         # The direct sums are the more exact ones, and the same numbers in both tables.
         distances[..., reference] = distances[..., reference, :] = to_reference
@@ -97,26 +102,6 @@ def tabulate_fields(
         distances[..., 0] = to_reference
     _write_tables(store, plan, rows, records, norms, to_reference, proportions, distances, [rows[j] for j in others])
     return Assessed(*to_reference)
-
-
-def _deal(
-    client: Client, calls: Sequence[_Call], resources: dict[str, float] | None, enter: Callable[[_Call, Any], None]
-) -> list[_Call]:
-    """Have tasks done, and enter what each returns; those that were on workers which died are left over."""
-    jobs = {client.submit(call[0], *call[1], pure=False, resources=resources): call for call in calls}
-    suspects = []
-    try:
-        for batch in as_completed(list(jobs)).batches():
-            for future, outcome in zip(batch, outcomes(client, batch), strict=True):
-                call = jobs.pop(future)
-                if is_suspect(outcome):
-                    suspects.append(call)
-                else:
-                    enter(call, outcome)
-    finally:
-        for future in jobs:
-            future.release()
-    return suspects
 
 
 def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:

@@ -13,9 +13,11 @@ from distributed import Client, wait
 from sobolev_batch.batch.claim import Claim, give_up, take
 from sobolev_batch.batch.cluster import available_cores
 from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.notes import KINDS, Kind, Notes
 from sobolev_batch.batch.outcomes import outcomes
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import ClaimError, DamageError, StoreError
 
 _log = logging.getLogger(__name__)
@@ -33,22 +35,25 @@ class Verification:
         complete: surfaces with a completion record; their fields were read.
         total: surfaces of the study.
         fields: what is wrong with the field or the record of each surface that is damaged.
+        comparisons: likewise for the witness function, or the note of it or of Hausdorff and Chamfer distances, of
+            each surface where it is damaged.
         tables: likewise for arrays of tables and coordinates.
-        withdrawn: whether the records of these fields, and the tables if any of them is damaged, were taken
-            away, so that the next run makes them anew.
+        withdrawn: whether the records of these fields, the notes of these comparisons, and the tables if anything
+            is damaged, were taken away, so that the next run makes them anew.
     """
 
     store: str
     complete: int
     total: int
     fields: Mapping[str, str]
+    comparisons: Mapping[str, str]
     tables: Mapping[str, str]
     withdrawn: bool
 
     @property
     def is_sound(self) -> bool:
         """Whether nothing is damaged."""
-        return not self.fields and not self.tables
+        return not self.fields and not self.comparisons and not self.tables
 
 
 def verify(place: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
@@ -107,7 +112,8 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
             if on_progress is not None:
                 on_progress(done, len(complete))
     tables = store.damaged_arrays()
-    withdraw = claim is not None and bool(damaged or tables)
+    notes = {kind: _damaged_notes(store, kind, complete) for kind in KINDS}
+    withdraw = claim is not None and bool(damaged or tables or any(notes.values()))
     if claim is not None and withdraw:
         # Whoever has released the store may have changed it since.
         claim.require(store.location)
@@ -116,12 +122,30 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
         store.withdraw_tables()
         for row in damaged:
             store.write_record(row, None)
+        for kind, rows in notes.items():
+            for row in rows:
+                Notes(store, kind).write(row, None)
     fields = {labels[row]: damaged[row] for row in sorted(damaged)}
-    return Verification(store.path, len(complete), len(labels), fields, tables, withdraw)
+    comparisons = {labels[row]: what for rows in notes.values() for row, what in sorted(rows.items())}
+    return Verification(store.path, len(complete), len(labels), fields, comparisons, tables, withdraw)
 
 
 def _complete(records: Sequence[Record | None]) -> dict[int, Record]:
     return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
+
+
+def _damaged_notes(store: Store, kind: Kind, complete: Mapping[int, Record]) -> dict[int, str]:
+    """What is wrong with the comparison of each row, of one kind."""
+    found = Notes(store, kind)
+    damaged = {row: f"the note of its {kind} is damaged ({what})" for row, what in found.damaged().items()}
+    if kind == "witness" and Witnesses(store).are_there():
+        for row, note in enumerate(found.read()):
+            if note is not None and note.status == "complete" and row in complete:
+                try:
+                    Witnesses(store).read(row, complete[row].facts.vertices, note.checksum)
+                except DamageError as error:
+                    damaged[row] = f"its witness function is damaged ({error.what})"
+    return damaged
 
 
 def _damage_of(store: Store, row: int, record: Record) -> str:

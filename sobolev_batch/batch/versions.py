@@ -24,7 +24,7 @@ _OF_NUMBERS = (
     *("fast-simplification", "trimesh", "nibabel", "plyfile"),
 )
 # Not every study needs these; whoever has them must have the same.
-_OF_EXTRAS = ("pyacvd",)
+_OF_EXTRAS = ("pyacvd", "vtk")
 _MOST_NAMED = 4
 
 

@@ -9,6 +9,7 @@ import click
 from sobolev_batch.cli.group import cli
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.norms import distance
+from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.readers import read_mesh
 from sobolev_batch.surfaces.similarity import Similarity
 
@@ -21,6 +22,7 @@ from sobolev_batch.surfaces.similarity import Similarity
 @click.option("--memory-gb", type=float, help="What a transform may take with --rtol. [default: 2]")
 @click.option("--xi-max", type=float, help="Highest frequency per axis. [default: 5]")
 @click.option("--M", "intervals", type=int, help="Lattice intervals per axis. [default: 64]")
+@click.option("--proximity", "nearness", is_flag=True, help="Hausdorff and Chamfer distances too.")
 @click.option("--no-scaling", is_flag=True, help="Keep the files' own unit instead of fitting B into the unit sphere.")
 def compare_command(
     a: Path,
@@ -30,6 +32,7 @@ def compare_command(
     memory_gb: float | None,
     xi_max: float | None,
     intervals: int | None,
+    nearness: bool,
     no_scaling: bool,
 ) -> None:
     """Print the distance of the mesh files A and B, B being the reference."""
@@ -40,6 +43,7 @@ def compare_command(
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)
     memory = None if memory_gb is None else 1e9 * memory_gb
+    near = proximity(*pair) if nearness else None
     found = distance(*pair, tuple(dict.fromkeys(orders)) or (-2.0,), lattice=lattice, rtol=rtol, memory=memory)
     click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
     if rtol is not None:
@@ -49,3 +53,5 @@ def compare_command(
         parts = ", ".join(f"{name} {here[name].item():.0e}" for name in ("truncation", "aliasing", "discretisation"))
         short = "" if rtol is None or here["within"].item() else f", more than rtol {rtol:g}"
         click.echo(f"order {order:g}: {here['distance'].item():.9e} ± {here['error'].item():.0e} ({parts}){short}")
+    if near is not None:
+        click.echo(f"Hausdorff {near.hausdorff:.6e}, Chamfer {near.chamfer:.6e} ± {near.chamfer_error:.0e} (s.e.)")

@@ -38,11 +38,13 @@ class Reporter:
             )
         elif progress.stage == "reduction" and progress.done == progress.total:
             click.echo("tables reduced", err=True)
+        elif progress.stage == "comparisons" and progress.done == progress.total:
+            click.echo(f"{progress.total} comparisons with the reference made", err=True)
 
     def _draw(self, progress: Progress) -> None:
         if progress.done == 0:
             self._close()
-            label = {"fields": "transforms", "reduction": "tables    "}[progress.stage]
+            label = {"fields": "transforms", "reduction": "tables    ", "comparisons": "comparisons"}[progress.stage]
             self._bar = click.progressbar(length=progress.total, label=label, file=sys.stderr, show_pos=True)
             self._bar.__enter__()
         else:

@@ -55,13 +55,18 @@ def verify_command(context: click.Context, store: Location) -> None:
 
         found = verify(store, show)
     click.echo(f"{store}: {found.complete} of {found.total} surfaces complete, their fields read back")
-    for name, what in [*found.fields.items(), *((f"table {name}", what) for name, what in found.tables.items())]:
+    for name, what in [
+        *found.fields.items(),
+        *found.comparisons.items(),
+        *((f"table {name}", what) for name, what in found.tables.items()),
+    ]:
         click.echo(f"{name}: {what}")
     if found.is_sound:
         click.echo("nothing is damaged")
         return
     remedy = "run the study again to repair it" if found.withdrawn else "it cannot be written here, and stays as it is"
-    click.echo(f"{len(found.fields)} surfaces and {len(found.tables)} arrays of tables are damaged; {remedy}")
+    surfaces = len({*found.fields, *found.comparisons})
+    click.echo(f"{surfaces} surfaces and {len(found.tables)} arrays of tables are damaged; {remedy}")
     context.exit(EXIT_OTHER)
 
 

@@ -65,7 +65,9 @@ def run_command(
             summary = run(parsed, place, workers=workers, memory=worker_memory, on_progress=reporter)
     click.echo(format_table(open_store(place)))
     click.echo(_totals(summary))
-    if summary.failed:
+    for label, reason in summary.not_compared.items():
+        click.echo(f"{label}: no {reason}", err=True)
+    if summary.failed or summary.not_compared:
         context.exit(EXIT_SOME_FAILED)
 
 

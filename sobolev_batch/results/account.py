@@ -13,7 +13,7 @@ import xarray as xr
 
 from sobolev_batch.results.digits import Digits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables import convergence_frame, finished_group
+from sobolev_batch.results.tables import convergence_frame, finished_group, has_proximity
 from sobolev_batch.spectral.lattice import Lattice
 
 # Lines of a page in all; browsers become slow beyond.
@@ -99,6 +99,7 @@ class Account:
         left_out: how many meshes the tables leave out, of convergence and of sizes.
         failed: the reason of each mesh that failed, or is missing.
         accuracy: the rtol that was asked for, None where it was not.
+        has_proximity: whether lines of `tables` end with Hausdorff and Chamfer distances.
         run: the latest run, by keyword.
         versions: by library.
         study_text: the study as TOML.
@@ -117,6 +118,7 @@ class Account:
     left_out: tuple[int, int]
     failed: Mapping[str, str]
     accuracy: float | None
+    has_proximity: bool
     run: Mapping[str, str]
     versions: Mapping[str, str]
     study_text: str
@@ -149,6 +151,7 @@ class Account:
             left_out=(left_out, max(0, len(lines) - _MOST_MESHES)),
             failed=_failures(meshes),
             accuracy=convergence.attrs.get("rtol"),
+            has_proximity=has_proximity(tree),
             run=dict(_run(status)),
             versions=attributes["versions"],
             study_text=study_text(study["table"]),
@@ -198,7 +201,7 @@ def _line(line: Mapping[str, Any], families: tuple[str, ...]) -> Line:
     rate = Digits.of(line["rate"], line["rate_error"])
     mark = "" if line["within"] else "above rtol"
     area = math.nan if not line["distance"] else (line["area_part"] / line["distance"]) ** 2
-    cells = (
+    cells: tuple[Cell, ...] = (
         Cell.count(line["triangles"]) if line["triangles"] else Cell(""),
         Cell.number(line["edge_length"]),
         Cell.number(line["distance"], distance.value, mark if line["resolved"] else "below its error"),
@@ -207,6 +210,9 @@ def _line(line: Mapping[str, Any], families: tuple[str, ...]) -> Line:
         Cell.number(line["rate"], rate.together),
         Cell.number(area, f"{100 * area:.1f} %"),
     )
+    if "hausdorff" in line:
+        chamfer = Digits.of(line["chamfer"], line["chamfer_error"])
+        cells = (*cells, Cell.number(line["hausdorff"]), Cell.number(line["chamfer"], chamfer.together))
     return Line(*about, cells)
 
 

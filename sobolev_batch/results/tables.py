@@ -34,14 +34,21 @@ _NUMBERS = (
     "resolved",
     "within",
 )
+# In the study's unit of length, where the study asks for them.
+_PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
+_PROXIMITY_HEADERS = ("Hausdorff", "Chamfer ± s.e.")
 _NOTE = """\
 The true distance lies within its error: truncation (beyond xi_max; it can only
 raise the distance), aliasing (spacing of the lattice) and discretisation
 (quadrature and NUFFT) together. Lengths are in the study's unit. A distance
 marked * is not larger than its error; no rate is taken from it. The column area
 tells which part of the squared distance a pure change of total area explains."""
+_PROXIMITY_NOTE = """\
+Hausdorff (the largest distance found, from vertices and drawn points to the
+other mesh) and Chamfer (mean distances of drawn points, both ways, with their
+standard error) are for orientation; they know no order."""
 _ACCURACY_NOTE = """\
 The study asks for an error of at most {rtol:g} of each distance; where it is
 larger, the distance is marked !."""
@@ -59,9 +66,9 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
         error, truncation, aliasing, discretisation, relative, relative_error, area_part
         and shape_part (of the distance: what a pure change of total area explains, and the rest; their
         squares add up to its square), rate, rate_error, resolved (whether the distance exceeds its
-        error), within (whether the error is as small as the study asks for). Lengths are in the study's
-        unit. A mesh that failed has NaN, never a number; so do the parts in a store whose tables were
-        made before there were any.
+        error), within (whether the error is as small as the study asks for); where the study asks for
+        [proximity] also hausdorff, chamfer and chamfer_error. Lengths are in the study's unit. A mesh that
+        failed has NaN, never a number; so do the parts in a store whose tables were made before there were any.
 
     Raises:
         InputError: no tables in the store yet, or an order that it was not reduced for.
@@ -70,11 +77,15 @@ def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) 
     labels = convergence["mesh"].values
     others = labels != convergence.attrs["reference"]
     about = {key: meshes[key].values[others] for key in _ABOUT}
+    nearness = {}
+    if has_proximity(tree):
+        found = finished_group(tree, "proximity")
+        nearness = {key: found[key].values[others] for key in _PROXIMITIES}
     parts = []
     for order in chosen_orders(convergence, orders):
         here = convergence.sel(order=order)
         numbers = {key: here[key].values[others] if key in here else math.nan for key in _NUMBERS}
-        parts.append(pd.DataFrame({"order": order, "mesh": labels[others], **about, **numbers}))
+        parts.append(pd.DataFrame({"order": order, "mesh": labels[others], **about, **numbers, **nearness}))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -91,19 +102,22 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
         records = frame.replace({np.nan: None}).to_dict(orient="records")
         return json.dumps(records, indent=2, allow_nan=False)
     reference = tree["convergence"].attrs["reference"]
+    headers = (*_HEADERS, *_PROXIMITY_HEADERS) if has_proximity(tree) else _HEADERS
     parts = []
     for order, group in frame.groupby("order", sort=False):
-        cells = [_cells(line) for line in group.to_dict(orient="records")]
+        cells = [_cells(line)[: len(headers)] for line in group.to_dict(orient="records")]
         caption = f"Sobolev distance of order {order:g} to {reference}"
         table = tabulate(
             cells,
-            headers=_HEADERS,
+            headers=headers,
             tablefmt=TABULATE_FORMATS[style],
             disable_numparse=True,
-            colalign=("left", *["right"] * (len(_HEADERS) - 1)),
+            colalign=("left", *["right"] * (len(headers) - 1)),
         )
         parts.append(f"% {caption}\n{table}" if style == "latex" else f"{caption}\n\n{table}")
     note = _NOTE
+    if has_proximity(tree):
+        note += "\n" + _PROXIMITY_NOTE
     if "rtol" in tree["convergence"].attrs:
         note += "\n" + _ACCURACY_NOTE.format(rtol=tree["convergence"].attrs["rtol"])
     parts.append("\n".join(f"% {line}" if style == "latex" else line for line in note.split("\n")))
@@ -112,6 +126,11 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     if notes:
         parts.append("\n".join(f"% {note}" if style == "latex" else note for note in notes))
     return "\n\n".join(parts)
+
+
+def has_proximity(tree: xr.DataTree) -> bool:
+    """Whether a store has Hausdorff and Chamfer distances."""
+    return "proximity" in tree.children
 
 
 def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
@@ -144,7 +163,7 @@ def chosen_orders(table: xr.Dataset, orders: Sequence[float] | None) -> list[flo
 
 def _cells(line: dict[str, Any]) -> list[str]:
     if line["status"] != "complete":
-        return [line["mesh"], *["missing"] * 6]
+        return [line["mesh"], *["missing"] * (len(_HEADERS) + len(_PROXIMITY_HEADERS) - 1)]
     return [
         line["mesh"],
         f"{line['triangles']:,}" if line["triangles"] else "",
@@ -153,6 +172,8 @@ def _cells(line: dict[str, Any]) -> list[str]:
         _number(line["relative"], ".5e"),
         _with_error(line["rate"], line["rate_error"], ".3f", ".0e"),
         _area_share(line),
+        _number(line.get("hausdorff", math.nan), ".4e"),
+        _with_error(line.get("chamfer", math.nan), line.get("chamfer_error", math.nan), ".4e", ".0e"),
     ]
 
 

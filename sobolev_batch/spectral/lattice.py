@@ -42,6 +42,38 @@ class Block:
         """The indices k of an axis, int64 (shape[axis],)."""
         return np.arange(self.start[axis], self.start[axis] + self.shape[axis], dtype=np.int64)
 
+    def split(self, largest_size: int) -> tuple[Block, ...]:
+        """The block in equal ones of at most ``largest_size`` samples.
+
+        They differ in shape only at the high ends, as the chunks of a regular grid do. The slow
+        axes are cut first, which keeps each block one contiguous run as long as possible.
+        """
+        shape = list(self.shape)
+        for axis in range(3):
+            most = max(1, largest_size // math.prod(shape[axis + 1 :]))
+            parts = math.ceil(shape[axis] / most)
+            shape[axis] = math.ceil(shape[axis] / parts)
+            if math.prod(shape) <= largest_size:
+                break
+        return tuple(self._parts((shape[0], shape[1], shape[2])))
+
+    def _parts(self, chunk: tuple[int, int, int]) -> Iterator[Block]:
+        starts = [range(0, total, step) for total, step in zip(self.shape, chunk, strict=True)]
+        for offsets in product(*starts):
+            i, j, k = (
+                (first + offset, min(step, total - offset))
+                for first, offset, step, total in zip(self.start, offsets, chunk, self.shape, strict=True)
+            )
+            yield Block((i[0], j[0], k[0]), (i[1], j[1], k[1]))
+
+    def place_in(self, whole: Block) -> tuple[slice, slice, slice]:
+        """Where this block lies in an array of one that holds it."""
+        x, y, z = (
+            slice(start - first, start - first + count)
+            for first, start, count in zip(whole.start, self.start, self.shape, strict=True)
+        )
+        return x, y, z
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -134,36 +166,12 @@ class Lattice:
         return 3 * (self.M // 2) ** 2 + 1
 
     def split(self, largest_size: int) -> tuple[Block, ...]:
-        """The half lattice in equal blocks of at most ``largest_size`` samples.
-
-        Blocks differ in shape only at the high ends, as the chunks of a regular grid do. The slow
-        axes are cut first, which keeps each block one contiguous run as long as possible.
-        """
-        shape = list(self.shape)
-        for axis in range(3):
-            most = max(1, largest_size // math.prod(shape[axis + 1 :]))
-            parts = math.ceil(shape[axis] / most)
-            shape[axis] = math.ceil(shape[axis] / parts)
-            if math.prod(shape) <= largest_size:
-                break
-        return tuple(self._blocks((shape[0], shape[1], shape[2])))
-
-    def _blocks(self, chunk: tuple[int, int, int]) -> Iterator[Block]:
-        starts = [range(0, total, step) for total, step in zip(self.shape, chunk, strict=True)]
-        for offsets in product(*starts):
-            i, j, k = (
-                (first + offset, min(step, total - offset))
-                for first, offset, step, total in zip(self.half.start, offsets, chunk, self.shape, strict=True)
-            )
-            yield Block((i[0], j[0], k[0]), (i[1], j[1], k[1]))
+        """The half lattice in equal blocks, see `Block.split`."""
+        return self.half.split(largest_size)
 
     def place(self, block: Block) -> tuple[slice, slice, slice]:
         """Where a block lies in an array of the half lattice."""
-        x, y, z = (
-            slice(start - first, start - first + count)
-            for first, start, count in zip(self.half.start, block.start, block.shape, strict=True)
-        )
-        return x, y, z
+        return block.place_in(self.half)
 
     @classmethod
     def of(cls, field: xr.DataArray) -> Lattice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.division import Division, Load, divide
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import evaluate_at
 from sobolev_batch.spectral.operands import BLOCK_SAMPLES, Operand, pair_of, read_blocks
 from sobolev_batch.spectral.precision import Precision, item_bytes
@@ -70,43 +71,85 @@ def witness(
     """
     orders = check_orders(order)
     settings = Transform(eps, dtype)
-    coordinates = _coordinates(points)
+    coordinates = coordinates_of(points)
     first, second = pair_of(a, b, lattice, orders)
     known = Lattice.of(first)
     require_points_inside(coordinates, known)
-    weights = shell_weights(known, orders)
+    evaluation = Evaluation(coordinates, known, shell_weights(known, orders), settings, threads, memory)
     values = np.zeros((len(orders), coordinates.shape[1]))
-    largest = BLOCK_SAMPLES
-    if memory is not None:
-        each = _SAMPLE_BYTES + len(orders) * item_bytes(dtype)
-        largest = max(1, min(largest, int(_SHARE_OF_BLOCKS * memory / each)))
     # FINUFFT refuses to evaluate nothing.
-    for block, (of_a, of_b) in read_blocks(known, first, second, largest=largest) if values.size else ():
-        difference = (of_a - of_b) * known.trapezoid_weights(block)
-        shells = known.shells(block)
-        coefficients = np.empty((len(orders), *block.shape), dtype=dtype)
-        for row, weight in zip(coefficients, weights, strict=True):
-            np.multiply(difference, weight[shells], out=row, casting="same_kind")
-        division = Division(DEFAULT_BATCH)
-        if memory is not None:
-            load = Load(coordinates.shape[1], coordinates.shape[1], fill=1.0)
-            left = (1 - _SHARE_OF_BLOCKS) * memory
-            division = divide(block.shape, settings.accuracy, dtype, load, CPU.costs, memory=left, batch=DEFAULT_BATCH)
-        values += evaluate_at(
-            coordinates,
-            coefficients,
-            known,
-            block,
-            eps=settings.accuracy,
-            precision=dtype,
-            threads=threads or os.cpu_count() or 1,
-            division=division,
-        )
+    for block, (of_a, of_b) in read_blocks(known, first, second, largest=evaluation.largest) if values.size else ():
+        values += evaluation.of_block(block, of_a - of_b)
     return _labelled(values.astype(np.float32 if dtype == "complex64" else np.float64), order)
 
 
-def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
-    """Points as one contiguous row per axis (3, n)."""
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Evaluates witness functions at points, one block of the difference of two fields after the other.
+
+    Attributes:
+        coordinates: of the points, float64 (3, n), contiguous, n > 0, within the half period.
+        lattice: of the fields.
+        weights: of its shells, (orders, lattice.shell_count).
+        settings: accuracy and precision of the NUFFT.
+        threads: of the NUFFT; one per core by default.
+        memory: bytes that a block may take, besides points, result and the fields themselves.
+    """
+
+    coordinates: NDArray[np.float64]
+    lattice: Lattice
+    weights: NDArray[np.float64]
+    settings: Transform
+    threads: int | None = None
+    memory: float | None = None
+
+    @property
+    def largest(self) -> int:
+        """Samples that a block should have at most."""
+        if self.memory is None:
+            return BLOCK_SAMPLES
+        each = _SAMPLE_BYTES + len(self.weights) * item_bytes(self.settings.precision)
+        return max(1, min(BLOCK_SAMPLES, int(_SHARE_OF_BLOCKS * self.memory / each)))
+
+    def of_block(self, block: Block, difference: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+        """What a block adds to the witness functions, (orders, n)."""
+        precision = self.settings.precision
+        weighted = difference * self.lattice.trapezoid_weights(block)
+        shells = self.lattice.shells(block)
+        coefficients = np.empty((len(self.weights), *block.shape), dtype=precision)
+        for row, weight in zip(coefficients, self.weights, strict=True):
+            np.multiply(weighted, weight[shells], out=row, casting="same_kind")
+        division = Division(DEFAULT_BATCH)
+        if self.memory is not None:
+            count = self.coordinates.shape[1]
+            left = (1 - _SHARE_OF_BLOCKS) * self.memory
+            division = divide(
+                block.shape,
+                self.settings.accuracy,
+                precision,
+                Load(count, count, fill=1.0),
+                CPU.costs,
+                memory=left,
+                batch=DEFAULT_BATCH,
+            )
+        return evaluate_at(
+            self.coordinates,
+            coefficients,
+            self.lattice,
+            block,
+            eps=self.settings.accuracy,
+            precision=precision,
+            threads=self.threads or os.cpu_count() or 1,
+            division=division,
+        )
+
+
+def coordinates_of(points: ArrayLike) -> NDArray[np.float64]:
+    """Points (n, 3) as one contiguous row per axis (3, n).
+
+    Raises:
+        InputError: they are not real, finite or of that shape.
+    """
     try:
         found = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError) as error:

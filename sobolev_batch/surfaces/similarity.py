@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 
@@ -55,6 +56,12 @@ class Similarity:
     def is_identity(self) -> bool:
         """Whether the map leaves every point where it is."""
         return self.scale == 1.0 and self.origin == (0.0, 0.0, 0.0)
+
+    @overload
+    def apply(self, surface: Mesh) -> Mesh: ...
+
+    @overload
+    def apply(self, surface: Surface) -> Surface: ...
 
     def apply(self, surface: Surface) -> Surface:
         """The surface in the study's unit of length."""
