@@ -37,13 +37,14 @@ def peaks(effort: Effort) -> Iterator[Row]:
 
 def _peak_bytes(folder: Path, intervals: int, threads: int) -> int:
     """What loading and transforming a mesh adds to the peak of this process."""
-    before = _highest_bytes()
+    before = highest_bytes()
     mesh = sb.Mesh(np.load(folder / "vertices.npy"), np.load(folder / "triangles.npy"))
     our_transform(mesh, sb.Lattice(XI_MAX, intervals), threads)
-    return _highest_bytes() - before
+    return highest_bytes() - before
 
 
-def _highest_bytes() -> int:
+def highest_bytes() -> int:
+    """The peak of this process's resident memory."""
     # On Linux getrusage starts from the peak of the parent process; the kernel's own mark does not.
     status = Path("/proc/self/status")
     marks = re.findall(r"^VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii"), re.M) if status.exists() else []

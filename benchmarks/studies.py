@@ -17,6 +17,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
+from benchmarks.memory import highest_bytes
 from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster import local_client
@@ -27,6 +28,7 @@ from sobolev_batch.spectral.transform import Transform, transform_block
 _WORKERS = 2
 _OVERHEAD = at_most(1.15)
 _ALL_PAIRS = at_most(2)
+_ALL_PAIRS_BYTES = 2e9
 _XI_MAX = 5.0
 _SAMPLE_PER_WORKER = 8
 
@@ -122,8 +124,14 @@ def all_pairs(effort: Effort) -> Iterator[Row]:
         fields = _stored_fields(store)
         weighted = [fields * weights for weights in _weights(sb.Lattice(_XI_MAX, intervals), orders)]
         ours, bare = take_turns([package, product], forget, effort.repeats)
+        # Of their whole life; this process has the other contestant's matrices.
+        peak = sum(client.run(highest_bytes).values())
     what = f"all pairs of {count} fields, M = {intervals}, {len(orders)} orders, {as_bytes(fields.nbytes)}"
     yield Row("6", what, as_seconds(ours), as_seconds(bare), ours / bare, _ALL_PAIRS)
+    share = peak / _ALL_PAIRS_BYTES
+    yield Row(
+        "6", f"{what}: peak memory of {_WORKERS} workers", as_bytes(peak), as_bytes(_ALL_PAIRS_BYTES), share, at_most(1)
+    )
 
 
 def _split_run(study: sb.Study, store: Path, client: Client) -> Split:

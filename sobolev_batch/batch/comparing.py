@@ -24,6 +24,7 @@ from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import StoreError
 from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES
@@ -111,7 +112,7 @@ class Comparer:
         if "witness" in self.kinds:
             Witnesses(self.store).list_them()
         if "proximity" in self.kinds and not self._is_tabulated(self.store):
-            self.store.write_table(PROXIMITY, self._proximity_dataset())
+            Tables(self.store).write(PROXIMITY, self._proximity_dataset())
             self.store.consolidate()
         return reasons
 
@@ -256,5 +257,5 @@ class Comparer:
 
     def _is_tabulated(self, store: Store) -> bool:
         """Whether the table of proximities is there, and made from the notes that are."""
-        attributes = store.table_attributes(PROXIMITY)
+        attributes = Tables(store).attributes(PROXIMITY)
         return attributes is not None and attributes.get("digest") == self._proximity_digest()

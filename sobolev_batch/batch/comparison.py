@@ -20,7 +20,7 @@ from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.shells import shell_weights
 from sobolev_batch.spectral.transform import Transform
-from sobolev_batch.spectral.witness import Evaluation, coordinates_of
+from sobolev_batch.spectral.witness import Evaluation
 from sobolev_batch.surfaces.mesh import Mesh
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.similarity import Similarity
@@ -91,6 +91,8 @@ def compare_by_witness(
 ) -> Note:
     """Store the witness function of a mesh against the reference, at its vertices, then a note.
 
+    It is NaN at vertices that no triangle uses.
+
     Args:
         comparison: what to compare.
         lattice: of both fields.
@@ -102,18 +104,21 @@ def compare_by_witness(
     def outcome() -> Note:
         mesh = comparison.mesh.made_again(comparison.similarity)
         evaluation = Evaluation(
-            coordinates_of(mesh.vertices),
+            # Others may lie anywhere, beyond the lattice's period too.
+            mesh.used_coordinates,
             lattice,
             shell_weights(lattice, orders),
             Transform(),
             threads=1,
             memory=memory,
         )
-        values = np.zeros((len(orders), len(mesh.vertices)))
+        found = np.zeros((len(orders), len(mesh.used_vertices)))
         for number, block in enumerate(blocks):
             difference = _difference(comparison, lattice, block, number)
             for part in block.split(evaluation.largest):
-                values += evaluation.of_block(part, difference[part.place_in(block)])
+                found += evaluation.of_block(part, difference[part.place_in(block)])
+        values = np.full((len(orders), len(mesh.vertices)), np.nan)
+        values[:, mesh.used_vertices] = found
         checksum = Witnesses(comparison.store).write(comparison.mesh.row, values, instead=comparison.again)
         return Note(comparison.key, "complete", checksum=checksum)
 

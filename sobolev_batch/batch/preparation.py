@@ -27,8 +27,8 @@ from sobolev_batch.batch.store import (
     ROOT,
     UNFINISHED,
     Store,
-    table_encoding,
 )
+from sobolev_batch.batch.tables import table_encoding
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity

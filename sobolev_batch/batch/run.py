@@ -28,6 +28,7 @@ from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.tabulation import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verification import damaged_rows
 from sobolev_batch.errors import DamageError
@@ -213,7 +214,7 @@ class _Work:
         """Withdraw what readers would take for facts about fields that are going to be replaced."""
         replaced = {i for i in rows if self.records[i] is not None}
         if replaced:
-            self.store.withdraw_tables()
+            Tables(self.store).withdraw()
             self.store.write_qualities(
                 [record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)]
             )

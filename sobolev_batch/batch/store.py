@@ -21,7 +21,6 @@ from typing import Any, Self
 
 import google_crc32c
 import numpy as np
-import xarray as xr
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.buffer import Buffer
@@ -37,7 +36,6 @@ from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import Record, RunRecord
 from sobolev_batch.batch.scratch import Scratch
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.spectral.lattice import AXES
 
 _log = logging.getLogger(__name__)
 
@@ -55,8 +53,6 @@ WITNESS_GROUP = "witness"
 WITNESS = "witness/witness"
 _MESHES = "meshes/mesh"
 _RUN = "run"
-# All other groups are tables, which the reduction makes.
-_GROUPS_OF_TASKS = ("fourier", RECORDS, WITNESS_GROUP)
 # Bytes of the codec at the end of a chunk.
 CHECKSUM_BYTES = 4
 _REQUESTS_AT_ONCE = 64
@@ -76,7 +72,6 @@ class Store:
     def __init__(self, place: str | Path | Location) -> None:
         self.location = Location.of(place)
         self.documents: dict[str, Document] = {}
-        self._withdrawn: list[str] = []
 
     def __getstate__(self) -> dict[str, Any]:
         # What tasks write and read; tables have fifty times as much.
@@ -85,7 +80,7 @@ class Store:
             for name, document in self.documents.items()
             if name in (FIELD, WITNESS) or name.startswith(f"{RECORDS}/")
         }
-        return {"location": self.location, "documents": carried, "_withdrawn": []}
+        return {"location": self.location, "documents": carried}
 
     @property
     def path(self) -> str:
@@ -305,79 +300,6 @@ class Store:
         with self.location.access("written"):
             array[:] = np.array(qualities, dtype=object)
 
-    def withdraw_tables(self) -> None:
-        """Have no reader find the tables until `consolidate`: while they are written they do not fit together.
-
-        Nor witness functions, which belong to the fields that are replaced.
-        """
-        self._withdrawn = self._tables()
-        hidden = [*self._withdrawn, *(name for name in self.documents if name.split("/")[0] == WITNESS_GROUP)]
-        for name in hidden:
-            del self.documents[name]
-        if hidden:
-            self.consolidate()
-
-    def write_table(self, group: str, dataset: xr.Dataset) -> None:
-        """Replace a group of small arrays, each in one chunk; `consolidate` makes it known to readers."""
-        made: dict[str, Buffer] = {}
-        # A chunk that is not there is a lost one, and never a table of zeros.
-        with zarr.config.set({"array.write_empty_chunks": True}):
-            dataset.to_zarr(
-                MemoryStore(made),
-                group=group,
-                mode="w",
-                zarr_format=3,
-                consolidated=False,
-                encoding=table_encoding(dataset),
-            )
-        made.pop(ROOT, None)
-        for name in self._withdrawn:
-            if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in made:
-                self.location.remove(name)
-        self.publish(made, last=f"{group}/{ROOT}")
-
-    def lost_tables(self) -> tuple[str, ...]:
-        """The arrays of tables that are not all there; nothing is read of them."""
-        lost = self._lost(self._tables(), self._table_groups())
-        # Errors of norms hang on it, and it is written with them.
-        return (*lost, *self._lost([QUALITY], [QUALITY])) if self._tables() else lost
-
-    def damaged_arrays(self) -> dict[str, str]:
-        """What is wrong with each small array, of tables and coordinates, that cannot be read."""
-        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES)]
-        lost = {*self.lost_tables(), *self._lost(coordinates, coordinates)}
-        damaged = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
-        for name in [*coordinates, QUALITY, *self._tables()]:
-            if name not in damaged and self.document(name).get("node_type") == "array":
-                try:
-                    self.read(name, ...)
-                except DamageError as error:
-                    damaged[name] = error.what
-        return damaged
-
-    def _lost(self, names: Sequence[str], prefixes: Sequence[str]) -> tuple[str, ...]:
-        """Which of some arrays are not there as long as they should be, by the sizes of keys."""
-        sizes = {key: size for prefix in prefixes for key, size in self.location.sizes(prefix).items()}
-        lost = []
-        for name in names:
-            if self.document(name).get("node_type") != "array":
-                continue
-            array = self.array(name)
-            # Texts have no size that could be foretold.
-            fixed = array.dtype.kind in "biufc"
-            expected = math.prod(array.chunks) * array.dtype.itemsize + CHECKSUM_BYTES * bool(array.ndim)
-            counts = (-(-n // m) for n, m in zip(array.shape, array.chunks, strict=True))
-            for number in np.ndindex(*counts):
-                found = sizes.get(f"{name}/{array.metadata.encode_chunk_key(number)}", 0)
-                if found != expected if fixed else not found:
-                    lost.append(name)
-                    break
-        return tuple(lost)
-
-    def table_attributes(self, group: str) -> dict[str, Any] | None:
-        """The attributes of a group of small arrays, or None where it was not written yet."""
-        return self.documents[group].get("attributes", {}) if self.is_there() and group in self.documents else None
-
     def consolidate(self) -> None:
         """Collect the metadata of all groups at the root, so that one read opens everything."""
         nodes = {f"{name}/{ROOT}".lstrip("/"): document for name, document in self.documents.items()}
@@ -424,13 +346,6 @@ class Store:
             return str(self.read(RECORD, row))
         except DamageError as error:
             return error
-
-    def _table_groups(self) -> list[str]:
-        return sorted({name.split("/")[0] for name in self.documents if name} - set(_GROUPS_OF_TASKS))
-
-    def _tables(self) -> list[str]:
-        groups = self._table_groups()
-        return [name for name in self.documents if name.split("/")[0] in groups]
 
     def document(self, name: str) -> Document:
         """The metadata document of a node, from the root's if it was not read yet."""
@@ -553,12 +468,3 @@ def checksum_of(values: NDArray[Any]) -> int:
 
 def _to_buffer(document: Document) -> Buffer:
     return BytesBuffer.from_bytes(json.dumps(document).encode())
-
-
-def table_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """One chunk per array, with a checksum."""
-    return {
-        str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}
-        for name, variable in dataset.variables.items()
-        if variable.ndim
-    }

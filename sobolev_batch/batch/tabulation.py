@@ -20,6 +20,7 @@ from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.proportion import Proportion
@@ -145,22 +146,24 @@ def _write_tables(
         plan.reference,
         plan.study.accuracy,
     )
-    store.withdraw_tables()
+    tables = Tables(store)
+    replaced = tables.withdraw()
     store.write_qualities([record.quality if record else "" for record in records])
-    store.write_table("meshes", meshes)
-    store.write_table("norms", norms_dataset(rows, orders, Assessed(*norms)))
-    store.write_table("distances", distances_dataset(rows, others, orders, Assessed(*distances)))
+    tables.write("meshes", meshes, instead_of=replaced)
+    tables.write("norms", norms_dataset(rows, orders, Assessed(*norms)), instead_of=replaced)
+    pairs = distances_dataset(rows, others, orders, Assessed(*distances))
+    tables.write("distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are there.
     digest = _reduction_digest(plan, rows, records)
-    store.write_table("convergence", convergence.assign_attrs(digest=digest))
+    tables.write("convergence", convergence.assign_attrs(digest=digest), instead_of=replaced)
     store.consolidate()
 
 
 def are_tabulated(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
     """Whether the tables of a store are there, and belong to its fields and to the plan."""
-    attributes = store.table_attributes("convergence")
+    attributes = Tables(store).attributes("convergence")
     current = attributes is not None and attributes.get("digest") == _reduction_digest(plan, rows, records)
-    return current and not store.lost_tables()
+    return current and not Tables(store).lost()
 
 
 def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:

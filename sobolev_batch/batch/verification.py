@@ -17,6 +17,7 @@ from sobolev_batch.batch.notes import KINDS, Kind, Notes
 from sobolev_batch.batch.outcomes import outcomes
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import ClaimError, DamageError, StoreError
 
@@ -111,7 +112,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
                 damaged[row] = what
             if on_progress is not None:
                 on_progress(done, len(complete))
-    tables = store.damaged_arrays()
+    tables = Tables(store).damaged()
     notes = {kind: _damaged_notes(store, kind, complete) for kind in KINDS}
     withdraw = claim is not None and bool(damaged or tables or any(notes.values()))
     if claim is not None and withdraw:
@@ -119,7 +120,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
         claim.require(store.location)
         # From a table, as long as there are some.
         store.mend_labels()
-        store.withdraw_tables()
+        Tables(store).withdraw()
         for row in damaged:
             store.write_record(row, None)
         for kind, rows in notes.items():

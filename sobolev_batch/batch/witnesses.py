@@ -15,7 +15,8 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.store import CHECKSUM_BYTES, ROOT, WITNESS, WITNESS_GROUP, Store, checksum_of, table_encoding
+from sobolev_batch.batch.store import CHECKSUM_BYTES, ROOT, WITNESS, WITNESS_GROUP, Store, checksum_of
+from sobolev_batch.batch.tables import table_encoding
 from sobolev_batch.errors import DamageError
 
 # Vertices of a chunk: coarse meshes waste little room, and fine ones make few chunks.
@@ -66,7 +67,8 @@ class Witnesses:
                 fill_value=np.nan,
                 dimension_names=("mesh", "order", "vertex"),
                 attributes={
-                    "description": "positive where the mesh has area that the reference lacks; NaN beyond its vertices",
+                    "description": "positive where the mesh has area that the reference lacks; NaN beyond "
+                    "its vertices, and at those that no triangle uses",
                     "units": "1 / unit length",
                 },
             )
@@ -122,8 +124,7 @@ class Witnesses:
             raise DamageError(f"{self.store.path}: {WITNESS} is too small", "they are not there")
         values = np.ascontiguousarray(self.store.read(WITNESS, (row, slice(None), slice(0, count))))
         if checksum_of(values) != checksum:
-            lost = bool(np.isnan(values).any())
-            what = "it is not there, or not all of it" if lost else "it is not what was written"
+            what = "it is not what was written, or not all of it is there"
             raise DamageError(f"{self.store.path}: {WITNESS} is damaged ({what})", what)
         return values
 

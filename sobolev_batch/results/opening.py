@@ -11,6 +11,7 @@ import xarray as xr
 
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 from sobolev_batch.errors import DamageError
 
 
@@ -45,7 +46,7 @@ def open_store(place: str | Path | Location) -> xr.DataTree:
         DamageError: data of a table are not there. (Those that are damaged raise when they are read.)
     """
     store = Store.open(place)
-    lost = store.lost_tables()
+    lost = Tables(store).lost()
     if lost:
         # They would read as NaN, zero or nothing, like data.
         raise DamageError(

@@ -10,6 +10,7 @@ from sobolev_batch.batch.journal import PATIENCE_SECONDS
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import RunRecord, age_seconds
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 
 _SUBMITTED_PATIENCE_SECONDS = 600.0
 
@@ -55,7 +56,7 @@ class Status:
                 if record is not None and record.status == "failed"
             },
             run,
-            store.table_attributes("convergence") is not None,
+            Tables(store).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
         )
 

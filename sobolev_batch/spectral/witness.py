@@ -71,7 +71,7 @@ def witness(
     """
     orders = check_orders(order)
     settings = Transform(eps, dtype)
-    coordinates = coordinates_of(points)
+    coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
     known = Lattice.of(first)
     require_points_inside(coordinates, known)
@@ -144,7 +144,7 @@ class Evaluation:
         )
 
 
-def coordinates_of(points: ArrayLike) -> NDArray[np.float64]:
+def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
     """Points (n, 3) as one contiguous row per axis (3, n).
 
     Raises:

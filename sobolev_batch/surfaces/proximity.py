@@ -74,7 +74,7 @@ def proximity(a: Mesh, b: Mesh, *, points: int = DEFAULT_POINTS, seed: int = 0) 
         distances = scale * np.asarray(pyvista.wrap(search.GetOutput(port)).point_data["Distance"])
         drawn.append(distances[:points])
         # A vertex that no triangle has is not on the surface.
-        on_surface = distances[points:][np.unique(mesh.triangles)]
+        on_surface = distances[points:][mesh.used_vertices]
         farthest = max(farthest, float(drawn[port].max()), float(on_surface.max()))
     return Proximity(
         hausdorff=farthest,

@@ -54,7 +54,7 @@ def run_and_count(study: sb.Study, path: Path, client: Client | None) -> tuple[S
 def assert_right(path: Path, study: sb.Study) -> None:
     """Every mesh's witness function is what the library finds at its vertices, and NaN beyond them."""
     tree = sb.open_store(path)
-    fields, witnesses = tree["fourier"]["fourier"], variable(tree, "witness", "witness").load()
+    fields, witnesses = variable(tree, "fourier", "fourier"), variable(tree, "witness", "witness").load()
     plan = make_plan(study)
     for row in plan.rows:
         found = witnesses.sel(mesh=row.label).to_numpy()
@@ -206,6 +206,15 @@ def test_damage_is_named_and_repaired(
     assert_same_fields(store, compared)
 
 
+@pytest.mark.parametrize("axis", ["mesh", "order"])
+def test_a_damaged_coordinate_of_witness_functions(axis: str, store: Path, client: Client) -> None:
+    flip(store / f"witness/{axis}/c/0")
+    assert [*sb.verify(store).tables] == [f"witness/{axis}"]
+    sb.run(asking(), store, client)
+    assert sb.verify(store).is_sound
+    assert_right(store, asking())
+
+
 def test_a_lost_chunk_is_seen_by_the_next_run(store: Path, client: Client) -> None:
     (store / "witness/witness/c/3/0/0").unlink()
     _, made = run_and_count(asking(), store, client)
@@ -237,6 +246,21 @@ def test_a_smaller_mesh_leaves_nothing_of_a_larger_one(store_path: Path, tmp_pat
         study = write(level)
         sb.run(study, store_path, client)
         assert_right(store_path, study)
+
+
+def test_vertices_that_no_triangle_uses(store_path: Path, tmp_path: Path, client: Client) -> None:
+    """They may lie beyond the lattice's period."""
+    mesh = sb.icosphere(1)
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in [[900.0, 0.0, 0.0], *mesh.vertices.tolist()]]
+    lines += [f"f {i + 2} {j + 2} {k + 2}" for i, j, k in mesh.triangles.tolist()]
+    (tmp_path / "stray.obj").write_text("\n".join(lines))
+    table = small_table(**TO_A_MESH, **ASKED, family=[{"name": "f", "source": "files", "paths": ["*.obj"]}])
+    summary = sb.run(sb.Study.from_table(table, folder=tmp_path), store_path, client)
+    assert not summary.not_compared
+    values = variable(sb.open_store(store_path), "witness", "witness").sel(mesh="f/stray").to_numpy()
+    assert np.isnan(values[:, 0]).all()
+    assert not np.isnan(values[:, 1:43]).any()
+    assert variable(sb.open_store(store_path), "proximity", "hausdorff").sel(mesh="f/stray").item() < 1
 
 
 def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:

@@ -31,6 +31,7 @@ from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.tables import Tables
 from tests.batch.conftest import small_table, variable
 from tests.batch.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.batch.test_store import READER
@@ -168,14 +169,14 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     empty = server.keys(prefix)
     store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
     store.write_record(1, Record("key", "complete"))
-    store.write_table("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
+    Tables(store).write("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
     store.consolidate()
     assert len(server.keys(prefix)) == len(empty) + 5
     finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
     again = prepare_store(url, finer)
     assert server.keys(prefix) == empty
     assert again.records() == (None,) * 5
-    assert again.table_attributes("norms") is None
+    assert Tables(again).attributes("norms") is None
     assert np.isnan(again.read_fields([1], finer.lattice.place(finer.blocks[0]))).all()
     assert Store.open(url).labels() == store.labels()
 
