@@ -140,6 +140,10 @@ def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, 
             f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
         )
     yield "backend", study.backend
+    if study.witness:
+        yield "witness", f"of order {', '.join(f'{order:g}' for order in study.witness)}, at the vertices of every mesh"
+    if study.proximity is not None:
+        yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
     yield from _task_lines(plan, crew)
     yield "storage", f"{_size(plan.field_bytes)} per surface, {_size(plan.field_bytes * len(plan.rows))} in all"
     there = _stored_keys(place)
