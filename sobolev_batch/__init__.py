@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         StudyError,
     )
     from sobolev_batch.results.accessor import SobolevAccessor
+    from sobolev_batch.results.export import write_witness
     from sobolev_batch.results.opening import open_store
     from sobolev_batch.spectral.bands import spectrum
     from sobolev_batch.spectral.fields import fourier_transform
@@ -97,6 +98,7 @@ __all__ = [
     "submit",
     "verify",
     "witness",
+    "write_witness",
 ]
 
 
@@ -145,6 +147,7 @@ _MODULES = {
     "submit": "batch.submission",
     "verify": "batch.verification",
     "witness": "spectral.witness",
+    "write_witness": "results.export",
 }
 # What makes or opens fields registers their accessor `field.sobolev` with xarray, which would be too much
 # for the import of the package.

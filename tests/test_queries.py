@@ -54,6 +54,7 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     assert found["by_wavelength"].index.is_monotonic_increasing
     # An inscribed mesh lacks area and lies inside: at its vertices, next to the sphere, the sphere has more.
     assert (found["w"].values < 0).all()
+    assert (sb.read_mesh(tmp_path / "icosphere-3.ply").vertices == sb.icosphere(3).vertices).all()
     assert 0 < found["share"].sel(mesh=levels[3], order=-10).item() < 1
     exported = pd.read_csv(tmp_path / "convergence.csv")
     assert len(exported) == 5 * len(study.orders)

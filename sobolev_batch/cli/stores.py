@@ -1,4 +1,4 @@
-"""Commands that read a store: status, verify, release, table, plot, report."""
+"""Commands that read a store: status, verify, release, table, plot, witness, report."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.release import release
 from sobolev_batch.batch.verification import verify
 from sobolev_batch.cli.group import EXIT_OTHER, EXIT_SOME_FAILED, cli
+from sobolev_batch.errors import SobolevBatchError, StoreError
 from sobolev_batch.results.matrix import format_matrix
 from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 
 _FOLLOW_SECONDS = 5.0
+
+_study_folder = click.option(
+    *("--folder", "folder"),
+    type=click.Path(path_type=Path),
+    default=".",
+    help="Where relative paths in the study start, by which meshes are made again. [default: here]",
+)
 
 
 @cli.command("status")
@@ -98,26 +106,93 @@ def table_command(store: Location, style: Format, orders: tuple[float, ...], mat
 @click.option(
     "--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the pictures."
 )
-def plot_command(store: Location, output: Path) -> None:
-    """Draw the convergence and the transforms of STORE."""
+@click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Draw this mesh; may be repeated.")
+@_study_folder
+@click.pass_context
+def plot_command(
+    context: click.Context, store: Location, output: Path, witnesses: tuple[str, ...], folder: Path
+) -> None:
+    """Draw the convergence and the transforms of STORE, and where meshes differ from the reference.
+
+    Meshes are made again by the study and drawn with the extra "vtk"; by default a few that are chosen by their
+    distances, if that can be done.
+    """
     # Imported here: it takes as long as everything that the other commands do at their start.
-    from sobolev_batch.results.plots import plot_store
+    from sobolev_batch.results.plots import plot_store, plot_witnesses
 
     with fields_read(store):
-        paths = plot_store(open_store(store), output)
+        tree = open_store(store)
+        for path in plot_store(tree, output):
+            click.echo(path)
+        paths, absent = plot_witnesses(tree, output, folder, witnesses)
     for path in paths:
         click.echo(path)
+    if absent:
+        why: dict[str, list[str]] = {}
+        for label, reason in absent.items():
+            why.setdefault(reason, []).append(label)
+        parts = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in why.items())
+        click.echo(f"not drawn with their witness functions: {parts}", err=True)
+    if witnesses and absent:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("witness")
+@click.argument("store", type=Location.of)
+@click.option("--mesh", "labels", multiple=True, help="Only this mesh; may be repeated.")
+@click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
+@click.option(
+    *("--format", "style"),
+    type=click.Choice(["ply", "vtp"]),
+    default="ply",
+    show_default=True,
+    help="For MeshLab and its like, or for ParaView.",
+)
+@click.option("--output", type=click.Path(path_type=Path), default=".", show_default=True, help="Folder of the files.")
+@_study_folder
+@click.pass_context
+def witness_command(
+    context: click.Context,
+    store: Location,
+    labels: tuple[str, ...],
+    orders: tuple[float, ...],
+    style: str,
+    output: Path,
+    folder: Path,
+) -> None:
+    """Write the meshes of STORE, each with its witness function: where it differs from the reference.
+
+    One file per mesh, in its own unit of length. Meshes are made again by the study; those that cannot be, or
+    are no longer the ones that were computed, are named.
+    """
+    # Imported here, as for plots.
+    from sobolev_batch.results.export import Exporter
+
+    exporter = Exporter.of(store, orders or None, folder)
+    chosen = exporter.labels(labels)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{output}: no files can be written there: {error.strerror or error}") from error
+    missing = False
+    for label in chosen:
+        try:
+            field = exporter.field(label)
+        except SobolevBatchError as error:
+            click.echo(f"{label}: {error}", err=True)
+            missing = True
+            continue
+        path = output / f"{exporter.stem(label)}.{style}"
+        field.write(path)
+        click.echo(path)
+    if missing:
+        context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("report")
 @click.argument("store", type=Location.of)
 @click.option("--output", type=click.Path(path_type=Path), default="report.html", show_default=True, help="The page.")
-@click.option(
-    *("--folder", "folder"),
-    type=click.Path(path_type=Path),
-    default=".",
-    help="Where relative paths in the study start: its meshes are shown if they are there. [default: here]",
-)
+@_study_folder
 @click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Show this mesh; may be repeated.")
 def report_command(store: Location, output: Path, folder: Path, witnesses: tuple[str, ...]) -> None:
     """Write everything about STORE into one HTML page that needs nothing besides itself."""

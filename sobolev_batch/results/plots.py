@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
 
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.arrangement import Map, alike_together
 from sobolev_batch.results.matrix import Matrix
-from sobolev_batch.results.portraits import Portrait
+from sobolev_batch.results.portraits import PICTURES, Portrait, make_gallery
+from sobolev_batch.results.rendering import Pictures, render
 from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
+from sobolev_batch.surfaces.names import file_stem
 
 # P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
 COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#777777")
 _MARKERS = "osD^vPX"
 _WIDTH_INCHES = 6.4
+# Of a mesh.
+_HEIGHT_INCHES = 5.0
 _MOST_CURVES = 5
 # In matrices and on maps.
 MOST_MESHES = 300
@@ -37,7 +40,9 @@ _NAMES_APART = 0.08
 _LEGEND_ENTRIES = 12
 # Smaller ones are not written into their cells.
 _SMALLEST_SHARE = 0.005
-_MOST_VIEWS = 3
+# Of a mesh, one for each of its first orders.
+MOST_VIEWS = 6
+_VIEWS_ABREAST = 3
 
 
 def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
@@ -59,13 +64,48 @@ def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
         pictures |= {"matrix.png": matrix_figure(tree), "map.png": map_figure(tree)}
     if "similarity" in tree.attrs and (spectra := Wavelengths.of_store(tree)) is not None:
         pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders[0])
+    return _write(pictures, folder)
+
+
+def plot_witnesses(
+    tree: xr.DataTree, output: str | Path, folder: str | Path = ".", wanted: Sequence[str] = ()
+) -> tuple[tuple[Path, ...], Mapping[str, str]]:
+    """Draw meshes of an open store, coloured by their witness functions, as witness-*.png into a folder.
+
+    Args:
+        tree: an open store with tables.
+        output: the folder of the pictures.
+        folder: where relative paths in the study start; meshes are made again by it.
+        wanted: labels; by default those that `make_gallery` chooses.
+
+    Returns:
+        The paths of the pictures, and for each mesh without one the reason.
+
+    Raises:
+        InputError: a label that the store does not have, or too many.
+        StoreError: the folder cannot be written.
+    """
+    gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, wanted, PICTURES)
+    numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
+    try:
+        rendered = render(gallery.portraits, MOST_VIEWS)
+    except InputError as error:
+        return (), {**gallery.absent, **{portrait.label: str(error) for portrait in gallery.portraits}}
+    figures = {
+        f"witness-{file_stem(numbers[portrait.label], portrait.label)}.png": witness_figure(portrait, pictures)
+        for portrait, pictures in zip(gallery.portraits, rendered, strict=True)
+    }
+    return _write(figures, Path(output)), gallery.absent
+
+
+def _write(figures: Mapping[str, Figure], folder: Path) -> tuple[Path, ...]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in pictures.items():
+        for name, figure in figures.items():
             save(figure, folder / name)
     except OSError as error:
         raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
-    return tuple(folder / name for name in pictures)
+    return tuple(folder / name for name in figures)
 
 
 def save(figure: Figure, target: object, **options: object) -> None:
@@ -221,41 +261,35 @@ def spectrum_figure(spectra: Wavelengths, order: float) -> Figure:
     return figure
 
 
-def witness_figure(portrait: Portrait) -> Figure:
-    """A mesh seen from one side, coloured by its witness function, one panel per order."""
-    shown = portrait.values[:_MOST_VIEWS]
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
-    panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    seen = portrait.vertices @ _view()
-    corners = seen[portrait.triangles]
-    # Painted from the back, darker where a triangle turns away from the eye.
-    painted = np.argsort(corners[:, :, 2].mean(axis=1))
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    light = 0.55 + 0.45 * np.abs(normals[:, 2]) / np.where(lengths > 0, lengths, 1.0)
-    for axes, order, values in zip(panels, portrait.orders, shown, strict=False):
-        largest = float(np.abs(values).max()) or 1.0
-        scale = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
-        colors = scale.to_rgba(values[portrait.triangles].mean(axis=1))
-        colors[:, :3] *= light[:, None]
-        patches = PolyCollection(corners[painted, :, :2], facecolors=colors[painted], edgecolors="face", linewidths=0.1)
-        patches.set_rasterized(True)
-        axes.add_collection(patches)
-        axes.autoscale_view()
-        axes.set_aspect("equal")
+def witness_figure(portrait: Portrait, pictures: Pictures) -> Figure:
+    """A mesh seen from one side, coloured by its witness function, one panel per order that was rendered."""
+    columns = min(_VIEWS_ABREAST, len(pictures))
+    rows = -(-len(pictures) // columns)
+    _, high, wide, _ = pictures.shape
+    # Below each panel its colours, above all of them the name of the mesh.
+    panel = min(_WIDTH_INCHES / columns, _HEIGHT_INCHES * wide / high)
+    figure = Figure(figsize=(_WIDTH_INCHES, 0.3 + rows * (0.7 + panel * high / wide)), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels:
         axes.set_axis_off()
-        axes.set_title(f"order {order:g}", fontsize="medium")
-        figure.colorbar(scale, ax=axes, shrink=0.8, orientation="horizontal").ax.tick_params(labelsize="x-small")
+    for axes, order, values, picture in zip(panels, portrait.orders, portrait.values, pictures, strict=False):
+        largest = float(np.abs(values).max()) or 1.0
+        axes.imshow(picture)
+        numbers = ScalarFormatter()
+        numbers.set_powerlimits((-2, 3))
+        bar = figure.colorbar(
+            ScalarMappable(Normalize(-largest, largest), "RdBu_r"),
+            ax=axes,
+            shrink=0.8,
+            orientation="horizontal",
+            ticks=MaxNLocator(4, symmetric=True),
+            format=numbers,
+        )
+        bar.set_label(f"witness, order {order:g}", fontsize="small")
+        bar.ax.tick_params(labelsize="x-small")
+        bar.ax.xaxis.get_offset_text().set_fontsize("x-small")
     figure.suptitle(_plain(portrait.label), fontsize="medium")
     return figure
-
-
-def _view() -> np.ndarray:
-    """From the coordinates of space to right, up and towards the eye, which looks from the front and above."""
-    eye = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
-    right = np.cross([0, 0, 1], eye)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(eye, right), eye], axis=1)
 
 
 def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:

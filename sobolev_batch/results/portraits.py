@@ -13,25 +13,41 @@ import trimesh
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.plan import members_of
-from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.results.remaking import Remaker, require_known
 from sobolev_batch.results.tables import convergence_frame, finished_group
-from sobolev_batch.spectral.witness import witness
+from sobolev_batch.results.witnesses import witness_at, witness_at_vertices
 from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Similarity
-from sobolev_batch.surfaces.sources import Member
 
 Reals = NDArray[np.float64]
+Corners = NDArray[np.int32]
 
-MOST_PORTRAITS = 4
-# Beyond, a page would take long to load and to turn.
-_MOST_TRIANGLES = 12_000
+# Of a store, where none are named.
+_MOST_EXTREMES = 4
 _ENOUGH_TRIANGLES = 6_000
-# Of all portraits together, at 4 bytes each.
-_MOST_VALUES = 500_000
 # Larger ones take minutes to be made again.
 _LARGEST_MADE = 2_000_000
+
+
+@dataclass(frozen=True)
+class Detail:
+    """How much may be shown.
+
+    Attributes:
+        meshes: at most.
+        triangles: of each mesh; larger ones are simplified.
+        values: of all meshes and orders together.
+    """
+
+    meshes: int
+    triangles: int
+    values: int
+
+
+# Beyond, a page would take long to load and to turn; values take 4 bytes each.
+PAGE = Detail(meshes=4, triangles=12_000, values=500_000)
+# A picture has hardly more dots on a mesh; values take 8 bytes each, in memory.
+PICTURES = Detail(meshes=100, triangles=200_000, values=50_000_000)
 
 
 @dataclass(frozen=True)
@@ -50,7 +66,7 @@ class Portrait:
 
     label: str
     vertices: Reals
-    triangles: NDArray[np.int32]
+    triangles: Corners
     values: Reals
     orders: tuple[float, ...]
     whole: int
@@ -70,40 +86,40 @@ class Gallery:
 
 
 def make_gallery(
-    tree: xr.DataTree, table: Mapping[str, Any], folder: str | Path, wanted: Sequence[str] = ()
+    tree: xr.DataTree,
+    table: Mapping[str, Any],
+    folder: str | Path,
+    wanted: Sequence[str] = (),
+    detail: Detail = PAGE,
 ) -> Gallery:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
-
-    A mesh is shown only if it is, to the bit, the one whose field is stored: files may have changed, and a
-    store may name files that its study never saw.
 
     Args:
         tree: an open store.
         table: the study as it was written.
         folder: where relative paths in it start.
         wanted: labels; by default the closest mesh of each family at the first order, and the farthest ones.
+        detail: how much may be shown.
 
     Raises:
         InputError: a label that the store does not have, or too many.
     """
-    meshes = tree["meshes"].to_dataset().load()
-    known = meshes["mesh"].values.tolist()
-    for label in wanted:
-        if label not in known:
-            raise InputError(f"the store has no mesh {label!r}, only such as {known[0]!r}")
-    if len(wanted) > MOST_PORTRAITS:
-        raise InputError(f"at most {MOST_PORTRAITS} meshes can be shown, found {len(wanted)}")
+    require_known(wanted, finished_group(tree, "meshes"))
+    if len(wanted) > detail.meshes:
+        raise InputError(f"at most {detail.meshes} meshes can be shown, found {len(wanted)}")
     labels = tuple(dict.fromkeys(wanted)) or tuple(_extremes(tree))
     try:
-        members = members_of(Study.from_table(table, folder=folder))
-    except SobolevBatchError as error:
-        return Gallery((), dict.fromkeys(labels, f"the study's meshes cannot be listed here: {error}"))
+        remaker = Remaker.of(tree, table, folder)
+    except InputError as error:
+        return Gallery((), dict.fromkeys(labels, str(error)))
+    orders = tuple(finished_group(tree, "convergence")["order"].values.tolist())
     portraits, absent = [], {}
     for label in labels:
         try:
-            about = meshes.sel(mesh=label)
-            mesh = _made_again(label, members, about, Similarity(**_similarity(tree)))
-            portraits.append(_portrait(tree, label, mesh, len(labels)))
+            mesh = remaker.make(label, _LARGEST_MADE).scaled
+            # A closed mesh has half as many vertices as triangles.
+            room = 2 * detail.values // (len(labels) * len(orders))
+            portraits.append(_portrait(tree, label, mesh, orders, min(detail.triangles, room)))
         except SobolevBatchError as error:
             absent[label] = str(error)
     return Gallery(tuple(portraits), absent)
@@ -115,53 +131,26 @@ def _extremes(tree: xr.DataTree) -> Iterator[str]:
     frame = frame[(frame["order"] == frame["order"].iloc[0]) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
     families = [lines for _, lines in frame.groupby("family", sort=False)]
     extremes = [lines["distance"].idxmin() for lines in families] + [lines["distance"].idxmax() for lines in families]
-    yield from frame.loc[list(dict.fromkeys(extremes))[:MOST_PORTRAITS], "mesh"]
+    yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
-def _similarity(tree: xr.DataTree) -> dict[str, Any]:
-    found = tree.attrs["similarity"]
-    return {"scale": found["scale"], "origin": tuple(found["origin"])}
+def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int) -> Portrait:
+    used = mesh.used_vertices
+    number = np.empty(len(mesh.vertices), dtype=np.int32)
+    number[used] = np.arange(len(used))
+    own, corners = mesh.vertices[used], number[mesh.triangles]
+    vertices, triangles = _for_looking(own, corners, most)
+    if vertices is own:
+        values = witness_at_vertices(tree, label, mesh, orders)[:, used]
+    else:
+        # Collapsed edges may leave the period by a hair where the mesh fills it.
+        vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
+        values = witness_at(tree, label, orders, vertices, dtype="complex64")
+    return Portrait(label, vertices, triangles, values, orders, len(corners))
 
 
-def _made_again(
-    label: str, members: Mapping[str, tuple[str, Member]], about: xr.Dataset, similarity: Similarity
-) -> Mesh:
-    """The mesh of a label, in the study's unit.
-
-    Raises:
-        SobolevBatchError: it cannot be made, or is not the one that was computed.
-    """
-    if about["status"].item() != "complete":
-        raise InputError(f"it is {about['status'].item()}")
-    if label not in members:
-        raise InputError("the study makes no such mesh here")
-    if not about["triangles"].item():
-        raise InputError("a surface in closed form has no triangles")
-    if about["triangles"].item() > _LARGEST_MADE:
-        raise InputError(f"it has {about['triangles'].item():,} triangles; up to {_LARGEST_MADE:,} are made again")
-    surface = similarity.apply(members[label][1].load())
-    if not isinstance(surface, Mesh) or surface.digest != about["digest"].item():
-        raise InputError("what the study makes here is not the mesh that was computed; its files may have changed")
-    return surface
-
-
-def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, count: int) -> Portrait:
-    orders = tuple(finished_group(tree, "convergence")["order"].values.tolist())
-    # A closed mesh has half as many vertices as triangles.
-    room = 2 * _MOST_VALUES // (count * len(orders))
-    vertices, triangles = _for_looking(mesh, min(_MOST_TRIANGLES, room))
-    fields = tree["fourier"].to_dataset()["fourier"]
-    reference = tree["convergence"].attrs["reference"]
-    # Collapsed edges may leave the period by a hair where the mesh fills it.
-    inside = np.clip(vertices, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0))
-    values = witness(fields.sel(mesh=label), fields.sel(mesh=reference), orders, inside, dtype="complex64")
-    shown = np.asarray(values.to_numpy(), dtype=np.float64)
-    return Portrait(label, inside, triangles, shown, orders, len(mesh.triangles))
-
-
-def _for_looking(mesh: Mesh, most: int) -> tuple[Reals, NDArray[np.int32]]:
-    """Not more triangles than a page bears, and enough to show what varies within one."""
-    vertices, triangles = np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32)
+def _for_looking(vertices: Reals, triangles: Corners, most: int) -> tuple[Reals, Corners]:
+    """Not more triangles than may be shown, and enough to show what varies within one."""
     if len(triangles) > most:
         found = fast_simplification.simplify(vertices, triangles, target_count=most)
         return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int32)

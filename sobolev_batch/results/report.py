@@ -19,6 +19,7 @@ from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.exhibits import make_exhibits
 from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.plots import (
+    MOST_VIEWS,
     convergence_figure,
     map_figure,
     matrix_figure,
@@ -27,6 +28,7 @@ from sobolev_batch.results.plots import (
     witness_figure,
 )
 from sobolev_batch.results.portraits import Gallery, make_gallery
+from sobolev_batch.results.rendering import render
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
@@ -41,11 +43,11 @@ class Still:
     """A picture as it is printed, or shown where scripts are off.
 
     Attributes:
-        source: the picture as a data: URL.
-        text: what it shows, for those who do not see it.
+        source: the picture as a data: URL; None where it could not be made.
+        text: what it shows, for those who do not see it, or why there is none.
     """
 
-    source: str
+    source: str | None
     text: str
 
 
@@ -134,10 +136,7 @@ def _stills(tree: xr.DataTree, spectra: Wavelengths | None, gallery: Gallery) ->
         "matrix": [],
         "map": [],
         "spectrum": [],
-        "witness": [
-            Still(_source(witness_figure(portrait)), f"{portrait.label}, coloured by its witness function")
-            for portrait in gallery.portraits
-        ],
+        "witness": _seen(gallery),
     }
     if tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]:
         found["matrix"] = _drawn(lambda s: matrix_figure(tree, [s]), "Distances of all pairs", orders)
@@ -149,6 +148,17 @@ def _stills(tree: xr.DataTree, spectra: Wavelengths | None, gallery: Gallery) ->
 
 def _drawn(draw: Callable[[float], Figure], what: str, orders: Sequence[float]) -> list[Still]:
     return [Still(_source(draw(order)), f"{what}, order {order:g}") for order in orders]
+
+
+def _seen(gallery: Gallery) -> list[Still]:
+    try:
+        rendered = render(gallery.portraits, MOST_VIEWS)
+    except InputError as error:
+        return [Still(None, str(error))]
+    return [
+        Still(_source(witness_figure(portrait, pictures)), f"{portrait.label}, coloured by its witness function")
+        for portrait, pictures in zip(gallery.portraits, rendered, strict=True)
+    ]
 
 
 def _source(figure: Figure) -> str:

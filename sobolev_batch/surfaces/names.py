@@ -5,10 +5,13 @@ Labels stand in tables, logs and stores side by side: each must be seen as what 
 
 from __future__ import annotations
 
+import re
 import reprlib
 import unicodedata
 from collections.abc import Iterable
 
+# Short enough for every file system, with a number before it and a suffix after it.
+_LONGEST_STEM = 60
 # Printable to Python, and yet nothing is seen of them: joiners, fillers, selectors of variants, the empty Braille cell.
 _INVISIBLE = frozenset(
     "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
@@ -56,6 +59,13 @@ def flaw(text: str, longest: int, forbidden: str = "") -> str | None:
 def folded(name: str) -> str:
     """The same for names that differ in nothing but case and the spelling of accents (Unicode's D145)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
+
+
+def file_stem(number: int, label: str) -> str:
+    """A name for a file of a label, which itself may hold anything: its number tells it from all others."""
+    plain = unicodedata.normalize("NFKD", label).encode("ascii", "ignore").decode("ascii")
+    readable = re.sub(r"[^A-Za-z0-9]+", "-", plain).strip("-")[:_LONGEST_STEM].rstrip("-")
+    return f"{number:04d}-{readable}" if readable else f"{number:04d}"
 
 
 def twins(names: Iterable[str]) -> list[list[str]]:

@@ -1,0 +1,87 @@
+"""Draws meshes off screen: a program of its own, since VTK ends the process where it finds no OpenGL.
+
+`rendering` runs it as ``python easel.py SCENE PICTURES``. It imports nothing of the package, whose path it does
+not know. SCENE holds the arrays ``count`` and ``side``, and per mesh i ``vertices_i``, ``triangles_i`` and
+``values_i`` (k, vertices); PICTURES gets ``picture_i`` (k, height, width, 3).
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pyvista
+
+# Towards the eye, which looks from the front and above.
+_EYE = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
+_UP = (0.0, 0.0, 1.0)
+# Of the picture's side, around the mesh.
+_MARGIN = 0.02
+# From above the eye's left shoulder, white: colours are to be told from each other, shapes to be seen.
+_LIGHT = (-0.5, 0.7, 1.5)
+_AMBIENT = 0.45
+# Where two faces meet at a larger angle, in degrees, the edge is drawn as one.
+_SHARP = 60.0
+
+
+def main(scene_path: str, pictures_path: str) -> None:
+    """Draw all meshes of a scene."""
+    scene = np.load(scene_path)
+    side = int(scene["side"])
+    pictures = {
+        f"picture_{i}": _pictures(scene[f"vertices_{i}"], scene[f"triangles_{i}"], scene[f"values_{i}"], side)
+        for i in range(int(scene["count"]))
+    }
+    np.savez(pictures_path, **pictures)
+
+
+def _pictures(vertices: Any, triangles: Any, values: Any, side: int) -> Any:
+    threes = np.full((len(triangles), 1), 3)
+    mesh = pyvista.PolyData(vertices, np.hstack([threes, triangles]).ravel())
+    right = np.cross(_UP, _EYE)
+    right /= np.linalg.norm(right)
+    seen = vertices @ np.stack([right, np.cross(_EYE, right)], axis=1)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    # A flat mesh may be seen from its edge.
+    width, height = np.maximum(high - low, 1e-3 * float(np.ptp(vertices, axis=0).max()))
+    scale = (1 - 2 * _MARGIN) * side / max(width, height)
+    size = [max(2, round(scale * extent + 2 * _MARGIN * side)) for extent in (width, height)]
+    center = (low + high) / 2 @ np.stack([right, np.cross(_EYE, right)])
+    found = []
+    for row in values:
+        plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
+        plotter.add_light(pyvista.Light(light_type="camera light", position=_LIGHT))
+        plotter.background_color = "white"
+        plotter.enable_anti_aliasing("ssaa")
+        largest = float(np.abs(row).max()) or 1.0
+        plotter.add_mesh(
+            mesh,
+            scalars=row,
+            cmap="RdBu_r",
+            clim=(-largest, largest),
+            smooth_shading=True,
+            split_sharp_edges=True,
+            feature_angle=_SHARP,
+            show_scalar_bar=False,
+            ambient=_AMBIENT,
+            diffuse=1 - _AMBIENT,
+            copy_mesh=True,
+        )
+        plotter.enable_parallel_projection()
+        distance = 10 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        plotter.camera.focal_point = center
+        plotter.camera.position = center + distance * _EYE
+        plotter.camera.up = _UP
+        plotter.camera.parallel_scale = size[1] / (2 * scale)
+        plotter.reset_camera_clipping_range()
+        picture = plotter.screenshot(return_img=True)
+        plotter.close()
+        if (picture == 255).all():
+            raise RuntimeError("VTK drew nothing")
+        found.append(picture)
+    return np.stack(found)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
