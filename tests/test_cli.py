@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import icosphere
+from tests.results.drawing import obstacle
 
 STUDY = """
 [study]
@@ -114,7 +115,12 @@ def test_matrices(folder: Path) -> None:
 
 def test_plot_draws_every_picture(folder: Path) -> None:
     done = call("plot", "storage/cli.zarr", "--output", "pictures", folder=folder)
-    names = ("convergence", "transform", "matrix", "map", "spectrum")
+    names = ["convergence", "transform", "matrix", "map", "spectrum"]
+    if obstacle() is None:
+        names += ["witness-0001-ico-1", "witness-0000-ico-0"]
+        assert done.stderr == ""
+    else:
+        assert re.match(r"^not drawn with their witness functions: ico/1, ico/0: .*\n$", done.stderr)
     assert done.stdout.split() == [f"pictures/{name}.png" for name in names]
     for name in done.stdout.split():
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
@@ -186,6 +192,10 @@ BAD = [
     (("compare", "a.ply", "b.ply"), "a.ply: cannot be read"),
     (("compare", "nan.off", "nan.off"), "nan.off: 1 of 3 vertices have NaN"),
     (("plot", "storage/cli.zarr", "--output", "study.toml"), "study.toml: pictures cannot be written there"),
+    (("plot", "storage/cli.zarr", "--witness", "ico/11"), "no mesh 'ico/11', did you mean 'ico/1'?"),
+    (("witness", "storage/cli.zarr", "--mesh", "ico/11"), "no mesh 'ico/11', did you mean 'ico/1'?"),
+    (("witness", "storage/cli.zarr", "--mesh", "reference"), "'reference' is the reference: its witness is zero"),
+    (("witness", "storage/cli.zarr", "--output", "study.toml"), "study.toml: no files can be written there"),
 ]
 
 

@@ -122,10 +122,10 @@ def plot_command(
 
     with fields_read(store):
         tree = open_store(store)
-        for path in plot_store(tree, output):
-            click.echo(path)
-        paths, absent = plot_witnesses(tree, output, folder, witnesses)
-    for path in paths:
+        # First, since a label may be wrong.
+        seen, absent = plot_witnesses(tree, output, folder, witnesses)
+        paths = plot_store(tree, output)
+    for path in (*paths, *seen):
         click.echo(path)
     if absent:
         why: dict[str, list[str]] = {}

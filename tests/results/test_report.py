@@ -253,6 +253,19 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         assert note in text
 
 
+def test_a_page_without_rendered_pictures_says_why(
+    store: str, folder: Path, page: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = "No pictures here: meshes cannot be drawn here: no &lt;OpenGL&gt;</p>"
+    assert note not in page.read_text(encoding="utf-8")
+
+    def nothing(*_: object) -> None:
+        raise InputError("meshes cannot be drawn here: no <OpenGL>")
+
+    monkeypatch.setattr("sobolev_batch.results.report.render", nothing)
+    assert make_report(store, folder=folder).count(note) == 1
+
+
 def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def damaged(tree: xr.DataTree) -> None:
         raise ValueError("Stored and computed checksum do not match.")
