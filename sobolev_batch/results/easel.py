@@ -41,13 +41,12 @@ def _pictures(vertices: Any, triangles: Any, values: Any, side: int) -> Any:
     mesh = pyvista.PolyData(vertices, np.hstack([threes, triangles]).ravel())
     right = np.cross(_UP, _EYE)
     right /= np.linalg.norm(right)
-    seen = vertices @ np.stack([right, np.cross(_EYE, right)], axis=1)
+    plane = np.stack([right, np.cross(_EYE, right)], axis=1)
+    seen = vertices @ plane
     low, high = seen.min(axis=0), seen.max(axis=0)
-    # A flat mesh may be seen from its edge.
-    width, height = np.maximum(high - low, 1e-3 * float(np.ptp(vertices, axis=0).max()))
-    scale = (1 - 2 * _MARGIN) * side / max(width, height)
-    size = [max(2, round(scale * extent + 2 * _MARGIN * side)) for extent in (width, height)]
-    center = (low + high) / 2 @ np.stack([right, np.cross(_EYE, right)])
+    scale = (1 - 2 * _MARGIN) * side / (high - low).max()
+    size = [round(scale * extent + 2 * _MARGIN * side) for extent in high - low]
+    center = (low + high) / 2 @ plane.T
     found = []
     for row in values:
         plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")

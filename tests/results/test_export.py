@@ -195,18 +195,18 @@ def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres:
 
 def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place, folder = spheres
-    refused: list[tuple[tuple[Any, ...], str]] = [
-        (("files/besides", "a.ply"), "no mesh 'files/besides', did you mean 'files/beside'"),
-        (("nobody", "a.ply"), "no mesh 'nobody', only such as 'files/"),
-        (("reference", "a.ply"), "'reference' is the reference"),
-        (("files/beside", "a.stl"), r"written as \.ply or \.vtp, found '\.stl'"),
-        (("files/beside", "a.ply", [-7.0]), "no order -7, only -4, -2.5"),
-        (("files/beside", "a.ply", []), "one order at least"),
-        (("files/bad", "a.ply"), "it is failed"),
+    refused: list[tuple[str, str, list[float] | None, str]] = [
+        ("files/besides", "a.ply", None, "no mesh 'files/besides', did you mean 'files/beside'"),
+        ("nobody", "a.ply", None, "no mesh 'nobody', only such as 'files/"),
+        ("reference", "a.ply", None, "'reference' is the reference"),
+        ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),
+        ("files/beside", "a.ply", [-7.0], "no order -7, only -4, -2.5"),
+        ("files/beside", "a.ply", [], "one order at least"),
+        ("files/bad", "a.ply", None, "it is failed"),
     ]
-    for (label, name, *orders), message in refused:
+    for label, name, orders, message in refused:
         with pytest.raises(sb.InputError, match=message):
-            sb.write_witness(place, label, tmp_path / name, *orders, folder=folder)
+            sb.write_witness(place, label, tmp_path / name, orders, folder)
     with pytest.raises(sb.StoreError, match="cannot be written there: No such file"):
         sb.write_witness(place, "files/beside", tmp_path / "nowhere" / "a.ply", folder=folder)
     (tmp_path / "taken").write_text("")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
+from sobolev_batch.results import rendering
 from sobolev_batch.results.plots import plot_witnesses
 from sobolev_batch.results.portraits import Portrait
 from sobolev_batch.results.rendering import render
@@ -110,7 +111,7 @@ def test_plot_does_without_what_cannot_be_drawn(
     assert elsewhere.stderr.count("\n") == 1
     assert "No such file" in elsewhere.stderr
     assert not list(tmp_path.glob("witness-*"))
-    monkeypatch.setattr("sobolev_batch.results.rendering.find_spec", lambda _: None)
+    monkeypatch.setattr(rendering, "find_spec", lambda _: None)
     paths, absent = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
     assert paths == ()
     assert list(absent) == list(LABELS[:2])
@@ -132,10 +133,10 @@ def test_whatever_happens_to_the_process_that_draws_is_said(
     program: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "easel.py").write_text(program)
-    monkeypatch.setattr("sobolev_batch.results.rendering._EASEL", tmp_path / "easel.py")
-    monkeypatch.setattr("sobolev_batch.results.rendering.find_spec", lambda _: True)
+    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    monkeypatch.setattr(rendering, "find_spec", lambda _: True)
     if "sleep" in program:
-        monkeypatch.setattr("sobolev_batch.results.rendering._PATIENCE_SECONDS", 0.5)
+        monkeypatch.setattr(rendering, "_PATIENCE_SECONDS", 0.5)
     with pytest.raises(InputError, match=f"meshes cannot be drawn here: {reason}"):
         render([portrait()], 1)
 
@@ -149,12 +150,13 @@ def test_a_machine_without_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @drawing
-def test_a_display_that_is_gone_is_not_asked(
+def test_neither_a_display_that_is_gone_nor_what_lies_around_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DISPLAY", "203.0.113.1:0")
-    # Modules in the working folder are not taken for libraries.
-    shutil.copy(__file__, tmp_path / "pyvista.py")
+    shutil.copy(rendering._EASEL, tmp_path)
+    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    (tmp_path / "pyvista.py").write_text("raise ImportError('not the library')")
     monkeypatch.chdir(tmp_path)
     render([portrait()], 1, side=50)
     assert capfd.readouterr() == ("", "")
