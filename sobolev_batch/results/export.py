@@ -13,9 +13,10 @@ from sobolev_batch.batch.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.remaking import Remaker, require_known
-from sobolev_batch.results.tables import chosen_orders, finished_group
+from sobolev_batch.results.tables import finished_group
 from sobolev_batch.results.vertex_fields import SUFFIXES, VertexField
 from sobolev_batch.results.witnesses import witness_at_vertices
+from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.surfaces.names import file_stem
 
 
@@ -41,18 +42,18 @@ class Exporter:
 
         Args:
             place: path or URL of the store.
-            orders: by default those of the study.
+            orders: any below -1/2; by default those of the study.
             folder: where relative paths in the study start.
 
         Raises:
-            InputError: the store has no tables yet, no such order or no field of its reference, or the study's
-                meshes cannot be listed here.
+            InputError: the store has no tables yet or no field of its reference, or the study's meshes cannot be
+                listed here.
+            OrderError: an order that is not below -1/2.
             StoreError: no store is there.
         """
         tree = open_store(place)
-        chosen = tuple(dict.fromkeys(chosen_orders(finished_group(tree, "convergence"), orders)))
-        if not chosen:
-            raise InputError("a witness needs one order at least")
+        of_study = finished_group(tree, "convergence")["order"].values.tolist()
+        chosen = tuple(dict.fromkeys(of_study if orders is None else check_orders(list(orders))))
         remaker = Remaker.of(tree, tree.attrs["study"]["table"], folder)
         found = cls(place, tree, remaker, chosen)
         status = remaker.meshes["status"].sel(mesh=found.reference).item()
@@ -116,7 +117,7 @@ def write_witness(
         store: path or URL of the store.
         label: of the mesh, such as "family/name".
         path: the file to write; its suffix is .ply or .vtp. The latter takes the extra "vtk".
-        orders: of the study's, default all.
+        orders: any below -1/2; by default those of the study.
         folder: where relative paths in the study start.
 
     Returns:
@@ -124,7 +125,7 @@ def write_witness(
         that the reference lacks; see `witness`.
 
     Raises:
-        InputError: an unknown label, order or suffix; a library that is not installed; a mesh that cannot be
+        InputError: an unknown label or suffix; a library that is not installed; a mesh that cannot be
             made again, or is not the one that was computed.
         StoreError: no store is there, or the file cannot be written.
     """

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.witness import witness
 from sobolev_batch.surfaces.mesh import Mesh
@@ -29,7 +28,7 @@ def witness_at(
 def witness_at_vertices(tree: xr.DataTree, label: str, mesh: Mesh, orders: Sequence[float]) -> Reals:
     """Values (orders, n) at the mesh's own vertices: the stored ones where the store has them, else from the fields.
 
-    NaN at vertices beyond the lattice's period, which no triangle uses.
+    NaN at vertices that no triangle uses: they may lie beyond the lattice's period.
 
     Args:
         tree: an open store with tables.
@@ -37,20 +36,19 @@ def witness_at_vertices(tree: xr.DataTree, label: str, mesh: Mesh, orders: Seque
         mesh: in the study's unit.
         orders: s, each.
     """
-    lattice = Lattice.of(tree["fourier"].to_dataset()["fourier"])
-    inside = (np.abs(mesh.vertices) < lattice.half_period).all(axis=1)
+    used = mesh.used_vertices
     values = np.full((len(orders), len(mesh.vertices)), np.nan)
     missing = []
     for i, order in enumerate(orders):
         stored = _stored(tree, label, order, len(mesh.vertices))
-        if stored is None or not np.isfinite(stored[mesh.used_vertices]).all():
+        if stored is None or not np.isfinite(stored[used]).all():
             missing.append(i)
         else:
             values[i] = stored
     if missing:
-        found = witness_at(tree, label, [orders[i] for i in missing], mesh.vertices[inside])
+        found = witness_at(tree, label, [orders[i] for i in missing], mesh.vertices[used])
         for i, row in zip(missing, found, strict=True):
-            values[i, inside] = row
+            values[i, used] = row
     return values
 
 
