@@ -19,7 +19,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.comparing import Comparer
-from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity
+from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.crew import Crew, CrewMember
 from sobolev_batch.batch.notes import KINDS, Note, Notes
 from sobolev_batch.batch.plan import make_plan
@@ -261,6 +261,29 @@ def test_vertices_that_no_triangle_uses(store_path: Path, tmp_path: Path, client
     assert np.isnan(values[:, 0]).all()
     assert not np.isnan(values[:, 1:43]).any()
     assert variable(sb.open_store(store_path), "proximity", "hausdorff").sel(mesh="f/stray").item() < 1
+
+
+def test_blocks_and_parts_of_the_lattice_add_up(
+    store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = asking(proximity=None)
+    # Fields of 40 kB in chunks of a few.
+    monkeypatch.setattr("sobolev_batch.batch.plan._LARGEST_CHUNK_BYTES", 16 << 10)
+    sb.run(study, store_path, client)
+    here, plan = Store.open(store_path), make_plan(study)
+    assert len(plan.blocks) > 2
+    assert_right(store_path, study)
+    stored = [
+        Stored(i, row.label, row.member, record.facts.digest, record.checksums)
+        for i, (row, record) in enumerate(zip(plan.rows, here.records(), strict=True))
+        if record is not None
+    ]
+    comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity, True)
+    # Here and not on a worker, so that each block is evaluated in parts.
+    monkeypatch.setattr("sobolev_batch.spectral.witness.BLOCK_SAMPLES", 300)
+    note = compare_by_witness(comparison, plan.lattice, plan.blocks, ORDERS, 1e8)
+    assert note.status == "complete", note.reason
+    assert_right(store_path, study)
 
 
 def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
