@@ -160,6 +160,8 @@
       hovertext: z.map((row, i) => row.map((share, j) => `${plain(labels[i])}<br>wavelengths ${plain(bands[j])}<br>${percent(share)}`)),
       hoverinfo: "text",
     }], {
+      // Slanted labels reach beyond the last column.
+      ...(narrow() ? { margin: { l: 10, r: 45, t: 30, b: 10 } } : {}),
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
         title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: narrow() ? -60 : 0,
