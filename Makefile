@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test coverage soak check bench audit format clean
+.PHONY: study icosphere test coverage soak check bench docs audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -30,6 +30,10 @@ bench: $(READY)  ## time it against the paper's pipeline, print the table of rat
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m benchmarks
 
+docs: $(READY)  ## the API from its docstrings and the pages of docs/, as HTML in site/
+	$(BIN)/python docs/build.py site
+	@echo "open site/index.html"
+
 audit: $(READY)  ## look the installed packages up among known vulnerabilities; asks a service on the internet
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[audit]'
 	$(BIN)/python -m pip freeze --quiet --disable-pip-version-check --exclude-editable > .venv/installed.txt
@@ -40,7 +44,7 @@ format: $(READY)  ## put the sources into shape
 	$(BIN)/ruff format .
 
 clean:  ## remove the environment and all caches
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -9,6 +9,17 @@ task; a reduction over what the tasks stored makes the tables. Data flows one wa
     results    -> what people read: tables, plots, a lazy DataTree
 
 `surfaces` knows none of the others, `spectral` knows neither dask nor zarr. See docs/design.md.
+
+What there is:
+
+- Numbers with their errors, of surfaces and of fields: `distance`, `norm`, `inner_product`.
+- What is behind a distance: `proportion` (area or shape), `spectrum` (wavelengths), `witness` (places).
+- Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
+- Surfaces: `Mesh`, `read_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two
+  `Interval`; a `Similarity` scales and moves them.
+- Studies: `Study`, `run` and its `Summary`, `submit` and its `Submission`.
+- Stores: `open_store`, `verify` and its `Verification`, `release`.
+- Errors: all derive from `SobolevBatchError`.
 """
 
 from importlib import import_module

@@ -50,7 +50,7 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
-    another one takes over from what is stored. `Store.read_run` and ``sobolev-batch status`` tell how far it is.
+    another one takes over from what is stored. ``sobolev-batch status`` tells how far it is.
 
     Args:
         study: what to compute.
