@@ -26,8 +26,8 @@ PAGES = {
     **{
         f"docs/{name}.md": f"{name}.html"
         for name in (
-            *("numerics", "surfaces", "queries", "store", "scale"),
-            *("clusters", "reliability", "design"),
+            *("tutorial", "studies", "surfaces", "queries", "store", "numerics"),
+            *("clusters", "scale", "reliability", "design"),
         )
     },
     "workflows/README.md": "workflows.html",

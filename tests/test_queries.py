@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,27 +12,19 @@ from distributed import Client
 
 import sobolev_batch as sb
 from tests.batch.conftest import client
+from tests.gallery import run_blocks, run_icospheres
 from tests.test_readme import ROOT, blocks
 
 __all__ = ["client"]  # a fixture
 
 
 def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (ROOT / "workflows" / "icosphere.toml").read_text(encoding="utf-8")
-    small = text.replace("M = 128", "M = 48").replace("3, 4, 5, 6, 7]", "3]")
-    assert small.count("M = 48") == 1
-    (tmp_path / "study.toml").write_text(small)
-    (tmp_path / "storage").mkdir()
-    study = sb.Study.from_toml(tmp_path / "study.toml")
-    sb.run(study, tmp_path / "storage" / "icosphere.zarr", client)
+    study = run_icospheres(tmp_path, client)
     monkeypatch.chdir(tmp_path)
-    queries = blocks("docs/queries.md", "python")
     numbers = re.findall(r"^\*\*(\d+)\.", (ROOT / "docs" / "queries.md").read_text(encoding="utf-8"), re.M)
     assert numbers == [str(i + 1) for i in range(10)]
-    assert len(queries) == 11
-    found: dict[str, Any] = {}
-    for query in queries:
-        exec(compile(query, "docs/queries.md", "exec"), found)
+    assert len(blocks("docs/queries.md", "python")) == 11
+    found = run_blocks("docs/queries.md")
 
     levels = [f"icosphere/{level}" for level in range(4)]
     assert found["rates"].index.tolist() == levels

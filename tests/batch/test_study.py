@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
+from pydantic import BaseModel
 
 from sobolev_batch import Lattice, Study, StudyError
+from sobolev_batch.batch.study import _Document, _FamilyName, _FamilyReferenceSection
+from sobolev_batch.surfaces.sources import Source
 from tests.batch.conftest import small_table
+from tests.test_readme import blocks
 
 WORKFLOWS = Path(__file__).parents[2] / "workflows"
 
@@ -57,6 +64,38 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert study.scaling.fixed.scale == 0.5
     assert [family.name for family in study.families] == ["ico", "thin"]
     assert study.folder == tmp_path
+
+
+def keys_of(model: type[BaseModel]) -> set[str]:
+    """Of a section and those below it."""
+    found = set(model.model_fields)
+    for field in model.model_fields.values():
+        for part in (field.annotation, *get_args(field.annotation)):
+            if inspect.isclass(part) and issubclass(part, BaseModel) and not issubclass(part, Source):
+                found |= keys_of(part)
+    return found
+
+
+def test_the_reference_of_study_files_names_every_key_and_source() -> None:
+    text = (WORKFLOWS.parent / "docs" / "studies.md").read_text(encoding="utf-8")
+    keys = keys_of(_Document) | keys_of(_FamilyReferenceSection) | keys_of(_FamilyName)
+    assert {"rtol", "backend", "origin", "member"} < keys
+    rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
+    for key in keys:
+        assert re.search(rf"[`\[]{key}[`\]]", text), key
+    points = {point.name: point for point in entry_points(group="sobolev_batch.sources")}
+    assert "decimate" in points
+    for name, point in points.items():
+        for key in point.load().model_fields:
+            assert f"`{key}`" in rows[name], (name, key)
+
+
+def test_its_example_is_valid(tmp_path: Path) -> None:
+    study, lattice = blocks("docs/studies.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
+    (tmp_path / "study.toml").write_text(study.replace("[accuracy]\nrtol = 1e-3\n", lattice))
+    assert Study.from_toml(tmp_path / "study.toml").lattice == Lattice(5.0, 64)
 
 
 @pytest.mark.parametrize("name", ["icosphere", "cortex"])

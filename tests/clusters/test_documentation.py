@@ -59,7 +59,7 @@ def pods() -> Mapping[str, dict[str, Any]]:
 
 def test_documented_options_exist() -> None:
     commands = [words for words in documented() if tuple(words[:2]) in COMMANDS]
-    assert len(commands) == 6
+    assert len(commands) == 7
     for words in commands:
         check_options(words)
     for words in documented("python "):

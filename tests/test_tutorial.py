@@ -1,0 +1,60 @@
+"""What docs/tutorial.md shows runs as it stands, and what it says of formulas and stores is so."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.cli import cli
+from tests.batch.conftest import client
+from tests.gallery import run_blocks, run_icospheres
+from tests.test_readme import ROOT, blocks
+
+__all__ = ["client"]  # a fixture
+
+
+def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_icospheres(tmp_path, client)
+    monkeypatch.chdir(tmp_path)
+    (commands,) = blocks("docs/tutorial.md", "sh")
+    for line in commands.splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "sobolev-batch"
+        done = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    assert {path.name for path in tmp_path.iterdir()} >= {"pictures", "report.html"}
+
+    found = run_blocks("docs/tutorial.md")
+    assert found["certain"] is True
+    assert found["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
+    assert found["rates"].to_numpy() == pytest.approx(2, abs=0.05)
+    assert found["excess"] < 0
+    assert 0.5 < found["longest"] < 1
+    assert (found["w"].values < 0).all()
+
+    # Every group and every variable of a store has its place in the description of stores.
+    text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
+    for group in found["tree"].subtree:
+        for name in (*group.data_vars, *group.coords, *group.attrs):
+            assert f"`{name}`" in text, (group.path, name)
+
+
+def test_the_table_of_weights() -> None:
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (-\d+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+    assert len(rows) == 4
+    for order, *wavelengths in rows:
+        for weight, wavelength in zip((1 / 2, 1 / 10, 1 / 100), map(float, wavelengths), strict=True):
+            assert (1 + wavelength**-2) ** float(order) == pytest.approx(weight, rel=0.12)
+
+
+def test_the_cow_is_a_valid_study(tmp_path: Path) -> None:
+    (study,) = blocks("docs/tutorial.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(20.0, 160)
