@@ -64,6 +64,7 @@ def test_every_page_is_there_and_asks_nobody(site: Path) -> None:
         assert f"{source.stem}.html" in pages, source
     for name, page in pages.items():
         assert not re.search(r'(?:src=|<link[^>]*href=|url\()"?https?:', page), name
-        for link in re.findall(r'(?:href|src)="([^"#]+)', page):
+        for link, section in re.findall(r'(?:href|src)="([^"#]*)(?:#([^"]*))?"', page):
             if not link.startswith(("https:", "data:")):
                 assert (site / link).exists(), (name, link)
+                assert not section or f'id="{section}"' in pages[link or name], (name, link, section)
