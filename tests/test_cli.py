@@ -117,7 +117,7 @@ def test_plot_draws_every_picture(folder: Path) -> None:
     done = call("plot", "storage/cli.zarr", "--output", "pictures", folder=folder)
     names = ["convergence", "transform", "matrix", "map", "spectrum"]
     if obstacle() is None:
-        names += ["witness-0001-ico-1", "witness-0000-ico-0"]
+        names += ["witness-0001-ico-1", "witness-0000-ico-0", "witness"]
         assert done.stderr == ""
     else:
         assert re.match(r"^not drawn with their witness functions: ico/1, ico/0: .*\n$", done.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,6 +19,9 @@ from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import FORMATS, Format, format_table
 
+if TYPE_CHECKING:
+    from sobolev_batch.results.portraits import Axis
+
 _FOLLOW_SECONDS = 5.0
 
 _study_folder = click.option(
@@ -25,6 +29,9 @@ _study_folder = click.option(
     type=click.Path(path_type=Path),
     default=".",
     help="Where relative paths in the study start, by which meshes are made again. [default: here]",
+)
+_up = click.option(
+    "--up", type=click.Choice(["x", "y", "z"]), default="z", show_default=True, help="The meshes' axis that points up."
 )
 
 
@@ -108,9 +115,10 @@ def table_command(store: Location, style: Format, orders: tuple[float, ...], mat
 )
 @click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Draw this mesh; may be repeated.")
 @_study_folder
+@_up
 @click.pass_context
 def plot_command(
-    context: click.Context, store: Location, output: Path, witnesses: tuple[str, ...], folder: Path
+    context: click.Context, store: Location, output: Path, witnesses: tuple[str, ...], folder: Path, up: Axis
 ) -> None:
     """Draw the convergence and the transforms of STORE, and where meshes differ from the reference.
 
@@ -123,7 +131,7 @@ def plot_command(
     with fields_read(store):
         tree = open_store(store)
         # First, since a label may be wrong.
-        seen, absent = plot_witnesses(tree, output, folder, witnesses)
+        seen, absent = plot_witnesses(tree, output, folder, witnesses, up)
         paths = plot_store(tree, output)
     for path in (*paths, *seen):
         click.echo(path)
@@ -193,10 +201,11 @@ def witness_command(
 @click.argument("store", type=Location.of)
 @click.option("--output", type=click.Path(path_type=Path), default="report.html", show_default=True, help="The page.")
 @_study_folder
+@_up
 @click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Show this mesh; may be repeated.")
-def report_command(store: Location, output: Path, folder: Path, witnesses: tuple[str, ...]) -> None:
+def report_command(store: Location, output: Path, folder: Path, up: Axis, witnesses: tuple[str, ...]) -> None:
     """Write everything about STORE into one HTML page that needs nothing besides itself."""
     # Imported here, as for plots.
     from sobolev_batch.results.report import write_report
 
-    click.echo(write_report(store, output, folder=folder, witnesses=witnesses))
+    click.echo(write_report(store, output, folder=folder, witnesses=witnesses, up=up))

@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 import xarray as xr
 
+from sobolev_batch.batch.study import REFERENCE_LABEL
 from sobolev_batch.results.digits import Digits
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import convergence_frame, finished_group, has_proximity
@@ -280,7 +281,8 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
     of = meshes["family"].values.tolist()
     for family in table["family"]:
         yield f"family {family['name']}", f"{_counted(of.count(family['name']))}: {_described(family)}"
-    yield "reference", f"{study['reference']}: {_described(table['reference'])}"
+    described = _described(table["reference"])
+    yield "reference", described if study["reference"] == REFERENCE_LABEL else f"{study['reference']}: {described}"
     if "accuracy" in table:
         yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
         for reason in (study.get("choice") or {}).get("reasons", ()):

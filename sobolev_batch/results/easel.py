@@ -1,8 +1,8 @@
 """Draws meshes off screen: a program of its own, since VTK ends the process where it finds no OpenGL.
 
 `rendering` runs it as ``python easel.py SCENE PICTURES``. It imports nothing of the package, whose path it does
-not know. SCENE holds the arrays ``count`` and ``side``, and per mesh i ``vertices_i``, ``triangles_i`` and
-``values_i`` (k, vertices); PICTURES gets ``picture_i`` (k, height, width, 3).
+not know. SCENE holds the arrays ``count`` and ``side``, and per mesh i ``vertices_i``, ``triangles_i``,
+``values_i`` (k, vertices) and ``limits_i`` (k,), where colours end; PICTURES gets ``picture_i`` (k, height, width, 3).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ _LIGHT = (-0.5, 0.7, 1.5)
 _AMBIENT = 0.45
 # Where two faces meet at a larger angle, in degrees, the edge is drawn as one.
 _SHARP = 60.0
+_OF_A_MESH = ("vertices", "triangles", "values", "limits")
 
 
 def main(scene_path: str, pictures_path: str) -> None:
@@ -30,13 +31,13 @@ def main(scene_path: str, pictures_path: str) -> None:
     scene = np.load(scene_path)
     side = int(scene["side"])
     pictures = {
-        f"picture_{i}": _pictures(scene[f"vertices_{i}"], scene[f"triangles_{i}"], scene[f"values_{i}"], side)
+        f"picture_{i}": _pictures(*(scene[f"{name}_{i}"] for name in _OF_A_MESH), side=side)
         for i in range(int(scene["count"]))
     }
     np.savez(pictures_path, **pictures)
 
 
-def _pictures(vertices: Any, triangles: Any, values: Any, side: int) -> Any:
+def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, *, side: int) -> Any:
     threes = np.full((len(triangles), 1), 3)
     mesh = pyvista.PolyData(vertices, np.hstack([threes, triangles]).ravel())
     right = np.cross(_UP, _EYE)
@@ -48,17 +49,16 @@ def _pictures(vertices: Any, triangles: Any, values: Any, side: int) -> Any:
     size = [round(scale * extent + 2 * _MARGIN * side) for extent in high - low]
     center = (low + high) / 2 @ plane.T
     found = []
-    for row in values:
+    for row, largest in zip(values, limits, strict=True):
         plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
         plotter.add_light(pyvista.Light(light_type="camera light", position=_LIGHT))
         plotter.background_color = "white"
         plotter.enable_anti_aliasing("ssaa")
-        largest = float(np.abs(row).max()) or 1.0
         plotter.add_mesh(
             mesh,
             scalars=row,
             cmap="RdBu_r",
-            clim=(-largest, largest),
+            clim=(-float(largest), float(largest)),
             smooth_shading=True,
             split_sharp_edges=True,
             feature_angle=_SHARP,

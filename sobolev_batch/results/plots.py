@@ -18,8 +18,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.arrangement import Map, alike_together
 from sobolev_batch.results.matrix import Matrix
-from sobolev_batch.results.portraits import PICTURES, Portrait, make_gallery
-from sobolev_batch.results.rendering import Pictures, render
+from sobolev_batch.results.portraits import PICTURES, Axis, Portrait, make_gallery
+from sobolev_batch.results.rendering import Pictures, render, scales
 from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
 from sobolev_batch.surfaces.names import file_stem
@@ -40,15 +40,18 @@ _NAMES_APART = 0.08
 _LEGEND_ENTRIES = 12
 # Smaller ones are not written into their cells.
 _SMALLEST_SHARE = 0.005
+_MOST_BANDS_LEVEL = 6
 # Of a mesh, one for each of its first orders.
 MOST_VIEWS = 6
 _VIEWS_ABREAST = 3
+# Meshes in one picture.
+_MOST_ABREAST = 9
 
 
 def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """Draw the pictures of an open store into a folder.
 
-    convergence.png, transform.png and, of the first order, spectrum.png; where the study asks for the
+    convergence.png, transform.png and spectrum.png; where the study asks for the
     distances of all pairs, matrix.png and map.png too.
 
     Returns:
@@ -63,20 +66,28 @@ def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     if "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]:
         pictures |= {"matrix.png": matrix_figure(tree), "map.png": map_figure(tree)}
     if "similarity" in tree.attrs and (spectra := Wavelengths.of_store(tree)) is not None:
-        pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders[0])
+        pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders)
     return _write(pictures, folder)
 
 
 def plot_witnesses(
-    tree: xr.DataTree, output: str | Path, folder: str | Path = ".", wanted: Sequence[str] = ()
+    tree: xr.DataTree,
+    output: str | Path,
+    folder: str | Path = ".",
+    wanted: Sequence[str] = (),
+    up: Axis = "z",
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
-    """Draw meshes of an open store, coloured by their witness functions, as witness-*.png into a folder.
+    """Draw meshes of an open store, coloured by their witness functions, into a folder.
+
+    Each as witness-*.png with colours of its own; several also beside each other in witness.png, on one scale of
+    colours, at the study's first order.
 
     Args:
         tree: an open store with tables.
         output: the folder of the pictures.
         folder: where relative paths in the study start; meshes are made again by it.
         wanted: labels; by default those that `make_gallery` chooses.
+        up: the axis that points upwards in the meshes' own coordinates.
 
     Returns:
         The paths of the pictures, and for each mesh without one the reason.
@@ -85,16 +96,20 @@ def plot_witnesses(
         InputError: a label that the store does not have, or too many.
         StoreError: the folder cannot be written.
     """
-    gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, wanted, PICTURES)
+    gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, wanted, PICTURES, up)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
+    abreast = gallery.portraits[:_MOST_ABREAST]
     try:
         rendered = render(gallery.portraits, MOST_VIEWS)
+        on_one_scale = render(abreast, 1, common=True)
     except InputError as error:
         return (), {**gallery.absent, **{portrait.label: str(error) for portrait in gallery.portraits}}
     figures = {
         f"witness-{file_stem(numbers[portrait.label], portrait.label)}.png": witness_figure(portrait, pictures)
         for portrait, pictures in zip(gallery.portraits, rendered, strict=True)
     }
+    if len(abreast) > 1:
+        figures["witness.png"] = witnesses_figure(abreast, [pictures[0] for pictures in on_one_scale])
     return _write(figures, Path(output)), gallery.absent
 
 
@@ -241,23 +256,27 @@ def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figu
     return figure
 
 
-def spectrum_figure(spectra: Wavelengths, order: float) -> Figure:
-    """Which part of each mesh's squared distance lies at which wavelengths, at one order."""
-    shares = spectra.shares[:, spectra.orders.index(order)]
-    figure = Figure(figsize=(_WIDTH_INCHES, 1.6 + 0.24 * len(spectra.labels)), layout="constrained")
-    axes = figure.subplots()
-    image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
-    figure.colorbar(image, ax=axes, label="share of the squared distance", format=PercentFormatter(1.0, 0))
-    for (i, j), share in np.ndenumerate(shares):
-        if share >= _SMALLEST_SHARE:
-            color = "white" if share > 0.6 * np.nanmax(shares) else "black"
-            axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
-    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5)
-    axes.set_yticks(range(len(spectra.labels)), [_plain(_shortened(label)) for label in spectra.labels], fontsize=7.5)
-    axes.set_xlabel("wavelength in the study's unit")
-    axes.set_title(f"where the differences lie, order {order:g}")
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
+def spectrum_figure(spectra: Wavelengths, orders: Sequence[float]) -> Figure:
+    """Which part of each mesh's squared distance lies at which wavelengths, one panel per order."""
+    height = 1.6 + 0.24 * len(spectra.labels)
+    figure = Figure(figsize=(_WIDTH_INCHES, height * len(orders)), layout="constrained")
+    labels = [_plain(_shortened(label)) for label in spectra.labels]
+    for axes, order in zip(figure.subplots(len(orders), 1, squeeze=False)[:, 0], orders, strict=True):
+        shares = spectra.shares[:, spectra.orders.index(order)]
+        image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
+        figure.colorbar(image, ax=axes, label="share of the squared distance", format=PercentFormatter(1.0, 0))
+        for (i, j), share in np.ndenumerate(shares):
+            if share >= _SMALLEST_SHARE:
+                color = "white" if share > 0.6 * np.nanmax(shares) else "black"
+                axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
+        # Long ones would run into each other.
+        turned = {"rotation": 20, "ha": "right"} if len(spectra.bands) > _MOST_BANDS_LEVEL else {}
+        axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, **turned)
+        axes.set_yticks(range(len(labels)), labels, fontsize=7.5)
+        axes.set_xlabel("wavelength in the study's unit")
+        axes.set_title(f"where the differences lie, order {order:g}")
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
     return figure
 
 
@@ -272,24 +291,47 @@ def witness_figure(portrait: Portrait, pictures: Pictures) -> Figure:
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels:
         axes.set_axis_off()
-    for axes, order, values, picture in zip(panels, portrait.orders, portrait.values, pictures, strict=False):
-        largest = float(np.abs(values).max()) or 1.0
+    (limits,) = scales([portrait], common=False)
+    for axes, order, largest, picture in zip(panels, portrait.orders, limits, pictures, strict=False):
         axes.imshow(picture)
-        numbers = ScalarFormatter()
-        numbers.set_powerlimits((-2, 3))
-        bar = figure.colorbar(
-            ScalarMappable(Normalize(-largest, largest), "RdBu_r"),
-            ax=axes,
-            shrink=0.8,
-            orientation="horizontal",
-            ticks=MaxNLocator(4, symmetric=True),
-            format=numbers,
-        )
-        bar.set_label(f"witness, order {order:g}", fontsize="small")
-        bar.ax.tick_params(labelsize="x-small")
-        bar.ax.xaxis.get_offset_text().set_fontsize("x-small")
+        _draw_scale(figure, axes, largest, order)
     figure.suptitle(_plain(portrait.label), fontsize="medium")
     return figure
+
+
+def witnesses_figure(portraits: Sequence[Portrait], pictures: Sequence[np.ndarray]) -> Figure:
+    """Meshes beside each other, coloured by their witness functions of the first order on one scale."""
+    columns = min(_VIEWS_ABREAST, len(portraits))
+    rows = -(-len(portraits) // columns)
+    tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
+    size = (_WIDTH_INCHES, 0.8 + rows * (0.3 + tallest * _WIDTH_INCHES / columns))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.ravel():
+        axes.set_axis_off()
+    for axes, portrait, picture in zip(panels.ravel(), portraits, pictures, strict=False):
+        axes.imshow(picture)
+        axes.set_title(f"{_plain(_shortened(portrait.label))}\n{portrait.whole:,} triangles", fontsize="small")
+    _draw_scale(figure, panels, scales(portraits, common=True)[0][0], portraits[0].orders[0])
+    return figure
+
+
+def _draw_scale(figure: Figure, panels: Axes | np.ndarray, largest: float, order: float) -> None:
+    """What the colours of one panel or of all mean."""
+    numbers = ScalarFormatter()
+    numbers.set_powerlimits((-2, 3))
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(-largest, largest), "RdBu_r"),
+        ax=panels,
+        shrink=0.8,
+        orientation="horizontal",
+        ticks=MaxNLocator(4, symmetric=True),
+        format=numbers,
+        aspect=20 if isinstance(panels, Axes) else 50,
+    )
+    bar.set_label(f"witness, order {order:g}", fontsize="small")
+    bar.ax.tick_params(labelsize="x-small")
+    bar.ax.xaxis.get_offset_text().set_fontsize("x-small")
 
 
 def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:
@@ -351,7 +393,10 @@ def _legend(axes: Axes) -> None:
 
 
 def _shortened(label: str) -> str:
-    return label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
+    """A label cut in its middle: labels of one family differ at their ends."""
+    if len(label) <= _LONGEST_LABEL:
+        return label
+    return f"{label[: _LONGEST_LABEL // 2]}…{label[1 - _LONGEST_LABEL // 2 :]}"
 
 
 def _plain(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import fast_simplification
 import numpy as np
@@ -21,6 +21,9 @@ from sobolev_batch.surfaces.mesh import Mesh
 
 Reals = NDArray[np.float64]
 Corners = NDArray[np.int32]
+
+Axis = Literal["x", "y", "z"]
+_AXES: tuple[Axis, ...] = get_args(Axis)
 
 # Of a store, where none are named.
 _MOST_EXTREMES = 4
@@ -56,7 +59,7 @@ class Portrait:
 
     Attributes:
         label: of the mesh.
-        vertices: (n, 3), in the study's unit of length.
+        vertices: (n, 3), in the study's unit of length, turned so that the third axis points upwards.
         triangles: (m, 3), indices of vertices.
         values: (orders, n), positive where the mesh has area that the reference lacks; in 1 / unit length.
         orders: s, each.
@@ -91,6 +94,7 @@ def make_gallery(
     folder: str | Path,
     wanted: Sequence[str] = (),
     detail: Detail = PAGE,
+    up: Axis = "z",
 ) -> Gallery:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
@@ -100,6 +104,7 @@ def make_gallery(
         folder: where relative paths in it start.
         wanted: labels; by default the closest mesh of each family at the first order, and the farthest ones.
         detail: how much may be shown.
+        up: the axis that points upwards in the meshes' own coordinates.
 
     Raises:
         InputError: a label that the store does not have, or too many.
@@ -119,7 +124,7 @@ def make_gallery(
             mesh = remaker.make(label, _LARGEST_MADE).scaled
             # A closed mesh has half as many vertices as triangles.
             room = 2 * detail.values // (len(labels) * len(orders))
-            portraits.append(_portrait(tree, label, mesh, orders, min(detail.triangles, room)))
+            portraits.append(_portrait(tree, label, mesh, orders, min(detail.triangles, room), up))
         except SobolevBatchError as error:
             absent[label] = str(error)
     return Gallery(tuple(portraits), absent)
@@ -134,7 +139,7 @@ def _extremes(tree: xr.DataTree) -> Iterator[str]:
     yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
-def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int) -> Portrait:
+def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int, up: Axis) -> Portrait:
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
@@ -146,7 +151,9 @@ def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ..
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
         values = witness_at(tree, label, orders, vertices, dtype="complex64")
-    return Portrait(label, vertices, triangles, values, orders, len(corners))
+    # Axes change places in a circle, so that left stays left.
+    upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
+    return Portrait(label, upright, triangles, values, orders, len(corners))
 
 
 def _for_looking(vertices: Reals, triangles: Corners, most: int) -> tuple[Reals, Corners]:

@@ -30,16 +30,17 @@ _REMEDY = (
 )
 
 
-def render(portraits: Sequence[Portrait], orders: int, side: int = 900) -> list[Pictures]:
+def render(portraits: Sequence[Portrait], orders: int, side: int = 900, *, common: bool = False) -> list[Pictures]:
     """Draw each mesh from the front and above, once for each of its first orders.
 
     Red where the witness is positive, blue where it is negative, as matplotlib's "RdBu_r" between plus and
-    minus its largest modulus on the mesh.
+    minus the numbers that `scales` tells.
 
     Args:
         portraits: the meshes.
         orders: of each, at most.
         side: the longer one of each picture, in dots.
+        common: colour all meshes on one scale.
 
     Raises:
         InputError: VTK is not installed, or cannot draw here.
@@ -52,8 +53,9 @@ def render(portraits: Sequence[Portrait], orders: int, side: int = 900) -> list[
             "the extra has it: pip install 'sobolev-batch[vtk]'"
         )
     scene: dict[str, Any] = {"count": np.array(len(portraits)), "side": np.array(side)}
-    for i, portrait in enumerate(portraits):
+    for i, (portrait, limits) in enumerate(zip(portraits, scales(portraits, common), strict=True)):
         scene |= {
+            f"limits_{i}": limits[:orders],
             f"vertices_{i}": portrait.vertices,
             f"triangles_{i}": portrait.triangles,
             f"values_{i}": portrait.values[:orders],
@@ -64,6 +66,14 @@ def render(portraits: Sequence[Portrait], orders: int, side: int = 900) -> list[
         _draw(*files)
         with np.load(files[1]) as found:
             return [found[f"picture_{i}"] for i in range(len(portraits))]
+
+
+def scales(portraits: Sequence[Portrait], common: bool) -> list[NDArray[np.float64]]:
+    """Where the colours of each mesh end, for each order: at its largest modulus, or at that of all meshes."""
+    largest = [np.abs(portrait.values).max(axis=1) for portrait in portraits]
+    if common:
+        largest = [np.max(largest, axis=0)] * len(portraits)
+    return [np.where(limits > 0, limits, 1.0) for limits in largest]
 
 
 def _draw(scene: Path, pictures: Path) -> None:

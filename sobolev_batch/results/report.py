@@ -27,7 +27,7 @@ from sobolev_batch.results.plots import (
     spectrum_figure,
     witness_figure,
 )
-from sobolev_batch.results.portraits import Gallery, make_gallery
+from sobolev_batch.results.portraits import Axis, Gallery, make_gallery
 from sobolev_batch.results.rendering import render
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import finished_group
@@ -36,6 +36,8 @@ from sobolev_batch.results.wavelengths import Wavelengths
 _PAGE = "page"
 # Orders whose pictures are also there as they are printed; more would make the page heavy.
 _MOST_STILL_ORDERS = 6
+# Thousands of points take less room as dots.
+_LARGEST_DRAWING_BYTES = 300_000
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,12 @@ class Still:
 
 
 def write_report(
-    place: str | Path | Location, output: str | Path, *, folder: str | Path = ".", witnesses: Sequence[str] = ()
+    place: str | Path | Location,
+    output: str | Path,
+    *,
+    folder: str | Path = ".",
+    witnesses: Sequence[str] = (),
+    up: Axis = "z",
 ) -> Path:
     """Write the report of a store as one HTML page without links to anything outside it.
 
@@ -61,6 +68,7 @@ def write_report(
         output: the file to write.
         folder: where relative paths in the study start; of meshes that are still there, the witness is shown.
         witnesses: labels of those meshes; by default a few that are chosen by their distances.
+        up: the axis that points upwards in the meshes' own coordinates.
 
     Returns:
         The path of the page.
@@ -71,7 +79,7 @@ def write_report(
         StoreError: no store is there, or the page cannot be written.
     """
     output = Path(output)
-    text = make_report(place, folder=folder, witnesses=witnesses)
+    text = make_report(place, folder=folder, witnesses=witnesses, up=up)
     try:
         output.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -79,7 +87,9 @@ def write_report(
     return output
 
 
-def make_report(place: str | Path | Location, *, folder: str | Path = ".", witnesses: Sequence[str] = ()) -> str:
+def make_report(
+    place: str | Path | Location, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z"
+) -> str:
     """The report of a store as HTML; see `write_report`."""
     try:
         import jinja2
@@ -96,7 +106,7 @@ def make_report(place: str | Path | Location, *, folder: str | Path = ".", witne
     account = Account.of(tree, Status.of(place))
     with fields_read(place):
         spectra = Wavelengths.of_store(tree)
-        gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, witnesses)
+        gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, witnesses, up=up)
     exhibits = make_exhibits(tree, spectra, gallery)
     scripts = [plotly.offline.get_plotlyjs(), _part("tables.js"), _part("charts.js")]
     environment = jinja2.Environment(
@@ -142,7 +152,7 @@ def _stills(tree: xr.DataTree, spectra: Wavelengths | None, gallery: Gallery) ->
         found["matrix"] = _drawn(lambda s: matrix_figure(tree, [s]), "Distances of all pairs", orders)
         found["map"] = _drawn(lambda s: map_figure(tree, [s]), "Map of the meshes", orders)
     if spectra is not None:
-        found["spectrum"] = _drawn(lambda s: spectrum_figure(spectra, s), "Shares of wavelengths", orders)
+        found["spectrum"] = _drawn(lambda s: spectrum_figure(spectra, [s]), "Shares of wavelengths", orders)
     return found
 
 
@@ -162,7 +172,15 @@ def _seen(gallery: Gallery) -> list[Still]:
 
 
 def _source(figure: Figure) -> str:
-    file = io.BytesIO()
     # Without a date, equal stores make equal pages.
-    save(figure, file, format="svg", metadata={"Date": None})
-    return f"data:image/svg+xml;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    drawn = _saved(figure, format="svg", metadata={"Date": None})
+    kind = "svg+xml"
+    if len(drawn) > _LARGEST_DRAWING_BYTES:
+        drawn, kind = _saved(figure, format="png"), "png"
+    return f"data:image/{kind};base64,{base64.b64encode(drawn).decode('ascii')}"
+
+
+def _saved(figure: Figure, **options: object) -> bytes:
+    file = io.BytesIO()
+    save(figure, file, **options)
+    return file.getvalue()

@@ -6,7 +6,7 @@ import shutil
 import sys
 from ctypes.util import find_library
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
 from sobolev_batch.results import rendering
 from sobolev_batch.results.plots import plot_witnesses
-from sobolev_batch.results.portraits import Portrait
+from sobolev_batch.results.portraits import Portrait, make_gallery
 from sobolev_batch.results.rendering import render
 from tests.results.drawing import obstacle
 from tests.results.spheres import LABELS, RIGHT
@@ -60,6 +60,15 @@ def test_red_where_the_witness_is_positive_and_blue_where_it_is_negative() -> No
 
 
 @drawing
+def test_one_scale_of_colours_for_all() -> None:
+    strong, weak = portrait((1.0,)), portrait((0.2,))
+    own, common = (render([strong, weak], 1, side=200, common=common) for common in (False, True))
+    assert redness(own[1][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
+    assert redness(common[0][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
+    assert 0.02 < redness(common[1][0])[100, 170] < 0.6 * redness(common[0][0])[100, 170]
+
+
+@drawing
 def test_what_is_in_front_hides_what_is_behind() -> None:
     eye = np.array([1.25, -1.4, 0.8])
     front, back = 0.5 * icosphere(2).vertices + eye, icosphere(2).vertices - eye
@@ -81,6 +90,28 @@ def test_meshes_seen_from_their_edge_and_no_witness() -> None:
     assert seen.shape[2] < seen.shape[1] == 100
     assert np.abs(redness(white[0])).max() < 0.02
     assert (white < 250).mean() > 0.5
+
+
+@drawing
+def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    paths, _ = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
+    assert [path.name for path in paths][-1] == "witness.png"
+    assert len(paths) == 3
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spheres) -> None:
+    place, folder = spheres
+    tree = open_store(place)
+    plain, turned = (
+        make_gallery(tree, tree.attrs["study"]["table"], folder, [LABELS[1]], up=axis).portraits[0].vertices
+        for axis in ("z", up)
+    )
+    assert (turned[:, 2] == plain[:, "xyz".index(up)]).all()
+    # Turned, not mirrored.
+    volumes = [np.linalg.det(vertices[[0, 100, 300]]) for vertices in (plain, turned)]
+    assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
 
 
 @drawing

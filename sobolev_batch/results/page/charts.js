@@ -11,7 +11,9 @@
 
   // Plotly takes a few tags in any text; names are shown as they are.
   const plain = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
-  const short = (text, most) => plain(text.length > most ? `${text.slice(0, most - 1)}…` : text);
+  // Cut in their middle: labels of one family differ at their ends.
+  const short = (text, most) => plain(
+    text.length > most ? `${text.slice(0, Math.ceil((most - 1) / 2))}…${text.slice(-Math.floor((most - 1) / 2))}` : text);
   const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const series = (family) => color(`series-${data.families.indexOf(family) % 7}`);
   const symbol = (family) => {
