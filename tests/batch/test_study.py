@@ -91,11 +91,14 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
 
 
 def test_its_example_is_valid(tmp_path: Path) -> None:
-    study, lattice = blocks("docs/studies.md", "toml")
+    study, lattice, besides = blocks("docs/studies.md", "toml")
     (tmp_path / "study.toml").write_text(study)
     assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
     (tmp_path / "study.toml").write_text(study.replace("[accuracy]\nrtol = 1e-3\n", lattice))
     assert Study.from_toml(tmp_path / "study.toml").lattice == Lattice(5.0, 64)
+    (tmp_path / "study.toml").write_text(f"{study}\n{besides}")
+    asked = Study.from_toml(tmp_path / "study.toml")
+    assert (asked.witness, asked.proximity) == ((-2.0,), 20_000)
 
 
 @pytest.mark.parametrize("name", ["icosphere", "cortex"])
