@@ -93,7 +93,8 @@ def test_no_name_becomes_markup(reader: Browser) -> None:
     assert reader.texts("#table-convergence tbody th.label")[0] == f"{FAMILY}/0"
     assert reader.tell("[...document.images].filter(e => !e.src.startsWith('data:')).length") == 0
     # Plotly takes some tags for markup.
-    assert f"{FAMILY[:20]}…{FAMILY[-19:]}" in reader.tell("[...document.querySelectorAll('.legendtext')].map(e => e.textContent)")
+    legend = reader.tell("[...document.querySelectorAll('.legendtext')].map(e => e.textContent)")
+    assert f"{FAMILY[:20]}…{FAMILY[-19:]}" in legend
     assert reader.tell("document.querySelectorAll('script:not([type])').length") == 3
 
 
