@@ -267,6 +267,27 @@ def test_a_page_without_rendered_pictures_says_why(
     assert make_report(store, folder=folder).count(note) == 1
 
 
+def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path) -> None:
+    study = {
+        "study": {"name": "near"},
+        "lattice": {"xi_max": 3.0, "M": 16},
+        "norm": {"orders": [-4.0]},
+        "proximity": {"points": 100},
+        "reference": {"source": "icosphere", "levels": [3]},
+        "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+    }
+    place, path = "memory://near.zarr", tmp_path / "report.html"
+    run(Study.from_table(study), place)
+    write_report(place, path)
+    with browser(tmp_path / "profile") as reader:
+        reader.open(path)
+        assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff", "Chamfer"]
+        cells = reader.texts("#table-convergence tbody:not([hidden]) tr:last-child td")
+        assert len(cells) == 9
+        assert "±" in cells[-1]
+        assert "Chamfer the mean distance" in reader.texts("#convergence")[0]
+
+
 def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def damaged(tree: xr.DataTree) -> None:
         raise ValueError("Stored and computed checksum do not match.")

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, StoreError, open_store
+from sobolev_batch.results.account import _tables
 from sobolev_batch.results.plots import convergence_figure, map_figure, matrix_figure, plot_store, transform_figure
 from sobolev_batch.results.tables import convergence_frame, format_table
 
@@ -179,3 +180,42 @@ def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_pa
 def test_opening_nothing(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no store of a study is there"):
         open_store(tmp_path)
+
+
+@pytest.fixture
+def near(tree: xr.DataTree) -> xr.DataTree:
+    """The same, with Hausdorff and Chamfer distances of one mesh; the other's could not be measured."""
+    nan = np.nan
+    columns = {
+        "hausdorff": [0.25, nan, nan, nan],
+        "chamfer": [0.125, nan, nan, nan],
+        "chamfer_error": [1e-3, nan, nan, nan],
+    }
+    proximity = xr.Dataset({name: ("mesh", values) for name, values in columns.items()}, coords={"mesh": MESHES})
+    return xr.DataTree.from_dict({**tree.to_dict(), "/proximity": proximity})
+
+
+def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataTree) -> None:
+    added = [name for name in convergence_frame(near) if name not in convergence_frame(tree)]
+    assert added == ["hausdorff", "chamfer", "chamfer_error"]
+    text = format_table(near).splitlines()
+    assert text[2].split()[-4:] == ["Hausdorff", "Chamfer", "±", "s.e."]
+    assert text[4].split()[-4:] == ["2.5000e-01", "1.2500e-01", "±", "1e-03"]
+    assert "Hausdorff" in "\n".join(text[8:])
+    assert "Hausdorff" not in format_table(tree)
+    for style in ("markdown", "latex"):
+        separator = "|" if style == "markdown" else " & "
+        lines = [line for line in format_table(near, style).splitlines() if line.count(separator) > 4]
+        assert {line.count(separator) for line in lines} == {lines[0].count(separator)}
+        assert lines[0].count(separator) == 2 + max(
+            line.count(separator) for line in format_table(tree, style).splitlines()
+        )
+    first, second = json.loads(format_table(near, "json"))[:2]
+    assert (first["hausdorff"], first["chamfer"], second["hausdorff"]) == (0.25, 0.125, None)
+
+
+def test_proximities_in_a_report(near: xr.DataTree, tree: xr.DataTree) -> None:
+    plain, lines = (_tables(each, ("f_1", "reference"))[0][0].lines for each in (tree, near))
+    assert [len(line.cells) - len(before.cells) for line, before in zip(lines, plain, strict=True)] == [2, 2, 0]
+    assert [cell.text for cell in lines[0].cells[-2:]] == ["0.25", "0.1250 ± 0.0010"]
+    assert [cell.key for cell in lines[1].cells[-2:]] == [None, None]
