@@ -17,8 +17,9 @@ What there is:
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
 - Surfaces: `Mesh`, `read_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two
   `Interval`; a `Similarity` scales and moves them.
+- For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
 - Studies: `Study`, `run` and its `Summary`, `submit` and its `Submission`.
-- Stores: `open_store`, `verify` and its `Verification`, `release`.
+- Stores: `open_store`, `write_witness`, `verify` and its `Verification`, `release`.
 - Errors: all derive from `SobolevBatchError`.
 """
 

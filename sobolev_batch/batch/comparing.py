@@ -18,7 +18,7 @@ from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proxim
 from sobolev_batch.batch.crew import MEMORY, Crew
 from sobolev_batch.batch.dealing import deal, many_in_flight
 from sobolev_batch.batch.layout import LEAST_ROOM_BYTES, MESH_BYTES
-from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes
+from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes, shortcomings
 from sobolev_batch.batch.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.batch.progress import Notify, Progress
@@ -86,7 +86,7 @@ class Comparer:
         """Make the comparisons that the store lacks, and have readers find all.
 
         Returns:
-            Why each mesh could not be compared that could not, by its label.
+            What each mesh lacks that could not be compared, and why, by its label.
 
         Raises:
             DamageError: a field is not what was stored.
@@ -98,23 +98,17 @@ class Comparer:
                 self.store.remove(kind)
                 Notes(self.store, kind).remove()
                 self.store.consolidate()
-        reasons: dict[str, str] = {}
         for kind in self.kinds:
             self._lay_out(kind)
             left = self._left(kind)
             if left:
                 self._make(kind, left, client, crew, notify)
-            notes = Notes(self.store, kind).read()
-            for i in self._wanted:
-                note = notes[i]
-                if note is not None and note.status == "failed":
-                    reasons[self.rows[i].label] = f"{kind}: {note.reason}"
         if "witness" in self.kinds:
             Witnesses(self.store).list_them()
         if "proximity" in self.kinds and not self._is_tabulated(self.store):
             Tables(self.store).write(PROXIMITY, self._proximity_dataset())
             self.store.consolidate()
-        return reasons
+        return shortcomings(self.store, self.kinds, self._wanted)
 
     @cached_property
     def _wanted(self) -> tuple[int, ...]:

@@ -55,8 +55,8 @@ class Summary:
         computed: labels of the meshes whose fields were computed now.
         reused: labels of those that were already there.
         failed: the reason for each mesh that could not be computed.
-        not_compared: the reason for each mesh whose field is there, and whose witness function or Hausdorff and
-            Chamfer distances, which the study asks for, are not.
+        not_compared: for each mesh whose field is there, and whose witness function or Hausdorff and Chamfer
+            distances, which the study asks for, are not: which of them, and why.
     """
 
     store: str

@@ -47,7 +47,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
         time.sleep(_FOLLOW_SECONDS)
         status = Status.of(store)
     click.echo("\n".join(status.lines()))
-    if status.failed:
+    if status.failed or status.not_compared:
         context.exit(EXIT_SOME_FAILED)
     if status.lost or (status.run is not None and status.run.state == "failed"):
         context.exit(EXIT_OTHER)

@@ -66,7 +66,7 @@ def run_command(
     click.echo(format_table(open_store(place)))
     click.echo(_totals(summary))
     for label, reason in summary.not_compared.items():
-        click.echo(f"{label}: no {reason}", err=True)
+        click.echo(f"{label}: {reason}", err=True)
     if summary.failed or summary.not_compared:
         context.exit(EXIT_SOME_FAILED)
 

@@ -99,6 +99,7 @@ class Account:
         meshes: sizes and times of each, in lines of `mesh_columns`.
         left_out: how many meshes the tables leave out, of convergence and of sizes.
         failed: the reason of each mesh that failed, or is missing.
+        not_compared: what was asked of each mesh besides that could not be had, and why.
         accuracy: the rtol that was asked for, None where it was not.
         has_proximity: whether lines of `tables` end with Hausdorff and Chamfer distances.
         run: the latest run, by keyword.
@@ -118,6 +119,7 @@ class Account:
     meshes: tuple[Line, ...]
     left_out: tuple[int, int]
     failed: Mapping[str, str]
+    not_compared: Mapping[str, str]
     accuracy: float | None
     has_proximity: bool
     run: Mapping[str, str]
@@ -151,6 +153,7 @@ class Account:
             meshes=lines[:_MOST_MESHES],
             left_out=(left_out, max(0, len(lines) - _MOST_MESHES)),
             failed=_failures(meshes),
+            not_compared=status.not_compared,
             accuracy=convergence.attrs.get("rtol"),
             has_proximity=has_proximity(tree),
             run=dict(_run(status)),

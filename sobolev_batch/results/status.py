@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sobolev_batch.batch.journal import PATIENCE_SECONDS
 from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.notes import KINDS, Notes, shortcomings
 from sobolev_batch.batch.records import RunRecord, age_seconds
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.tables import Tables
@@ -24,6 +25,8 @@ class Status:
         complete: how many surfaces are computed.
         total: how many there are.
         failed: the reason for each that could not be computed.
+        not_compared: for each that is computed, and lacks its witness function or Hausdorff and Chamfer distances
+            all the same, which of them and why.
         run: the record of the latest run, if there is one.
         reduced: whether there are tables.
         silence_seconds: since the latest sign of life of a run that goes on, else 0.
@@ -33,6 +36,7 @@ class Status:
     complete: int
     total: int
     failed: dict[str, str]
+    not_compared: dict[str, str]
     run: RunRecord | None
     reduced: bool
     silence_seconds: float
@@ -46,15 +50,19 @@ class Status:
         """
         store = Store.open(place)
         labels, records, run = store.labels(), store.records(), store.read_run()
+        # Where a study asks for none, nothing is looked for.
+        asked = [kind for kind in KINDS if Notes(store, kind).name in store.documents]
+        complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
         return cls(
             str(place),
-            sum(record is not None and record.status == "complete" for record in records),
+            len(complete),
             len(labels),
             {
                 label: record.reason
                 for label, record in zip(labels, records, strict=True)
                 if record is not None and record.status == "failed"
             },
+            shortcomings(store, asked, complete),
             run,
             Tables(store).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
@@ -79,6 +87,8 @@ class Status:
         waiting = self.total - self.complete - len(self.failed)
         yield f"{self.store}: {self.complete} of {self.total} complete, {len(self.failed)} failed, {waiting} to go"
         for label, reason in self.failed.items():
+            yield f"{label}: {reason}"
+        for label, reason in self.not_compared.items():
             yield f"{label}: {reason}"
         if self.run is not None:
             yield from self._run_lines(self.run)

@@ -28,6 +28,7 @@ from sobolev_batch.batch.run import Summary
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.cli import cli, studies
+from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table, variable
 from tests.faults.comparing import assert_same_fields, assert_same_tables
 
@@ -324,10 +325,15 @@ def test_too_little_memory_is_foreseen(store: Path, client: Client) -> None:
     small = Crew((CrewMember("tcp://small", 1, 2e8, "cpu", ""),))
     reasons = Comparer.of(here, plan, plan.rows, here.records()).carry_out(client, small, lambda progress: None)
     assert sorted(reasons) == ["ico/0", "ico/1", "ico/2", "ico/3"]
+    assert reasons["ico/0"].startswith("no witness: it takes about")
     assert "start workers with more memory" in reasons["ico/0"]
+    status = Status.of(store)
+    assert sorted(status.not_compared) == sorted(reasons)
+    assert f"ico/0: {reasons['ico/0']}" in list(status.lines())
     # Another run, with the workers that there are, makes up for it.
     _, made = run_and_count(study, store, client)
-    assert len(made) == 4
+    assert sorted(made) == sorted(reasons)
+    assert not Status.of(store).not_compared
     assert_right(store, study)
 
 
@@ -402,7 +408,7 @@ def test_notes_survive_as_text() -> None:
 
 
 def test_what_was_not_compared_gives_status_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    summary = Summary("somewhere", (), ("ico/0",), {}, {"ico/0": "witness: it has changed"})
+    summary = Summary("somewhere", (), ("ico/0",), {}, {"ico/0": "no witness: it has changed"})
     monkeypatch.setattr(studies, "run", lambda *args, **options: summary)
     monkeypatch.setattr(studies, "open_store", lambda place: None)
     monkeypatch.setattr(studies, "format_table", lambda tree: "the table")

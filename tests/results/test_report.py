@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere,
 from sobolev_batch.cli import cli
 from sobolev_batch.results.portraits import make_gallery
 from sobolev_batch.results.report import make_report, write_report
+from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import convergence_frame
 from tests.results.browser import Browser, browser
 
@@ -286,6 +288,15 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
         assert len(cells) == 9
         assert "±" in cells[-1]
         assert "Chamfer the mean distance" in reader.texts("#convergence")[0]
+
+
+def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    status = replace(Status.of(store), not_compared={"files/good": "no witness: <i>changed</i>"})
+    monkeypatch.setattr(Status, "of", lambda _: status)
+    text = make_report(store)
+    assert "1 mesh lacks a comparison" in text
+    assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
+    assert "no witness: &lt;i&gt;changed&lt;/i&gt;" in text
 
 
 def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
