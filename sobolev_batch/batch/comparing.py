@@ -98,11 +98,22 @@ class Comparer:
                 self.store.remove(kind)
                 Notes(self.store, kind).remove()
                 self.store.consolidate()
+        left = {}
         for kind in self.kinds:
             self._lay_out(kind)
-            left = self._left(kind)
-            if left:
-                self._make(kind, left, client, crew, notify)
+            left[kind] = self._left(kind)
+        total, done = sum(map(len, left.values())), 0
+
+        def conclude(i: int) -> None:
+            nonlocal done
+            done += 1
+            notify(Progress("comparisons", done, total, self.rows[i].label))
+
+        if total:
+            notify(Progress("comparisons", 0, total))
+        for kind, rows in left.items():
+            if rows:
+                self._make(kind, rows, client, crew, conclude)
         if "witness" in self.kinds:
             Witnesses(self.store).list_them()
         if "proximity" in self.kinds and not self._is_tabulated(self.store):
@@ -145,18 +156,13 @@ class Comparer:
             Witnesses(self.store).lay_out(labels, self.plan.study.witness, self.plan.reference, vertices)
         Notes(self.store, kind).lay_out(len(self.rows))
 
-    def _make(self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, notify: Notify) -> None:
-        notify(Progress("comparisons", 0, len(left)))
+    def _make(
+        self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, conclude: Callable[[int], None]
+    ) -> None:
         notes = Notes(self.store, kind)
         there = notes.read()
         needed = {i: self._needed_bytes(kind, i) for i in left}
         claims = any(count > crew.share_bytes for count in needed.values())
-        done = 0
-
-        def conclude(i: int) -> None:
-            nonlocal done
-            done += 1
-            notify(Progress("comparisons", done, len(left), self.rows[i].label))
 
         def give_up(i: int, reason: str) -> None:
             _log.error("%s: %s: %s", self.rows[i].label, kind, reason)

@@ -296,6 +296,11 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
         f"(spacing {lattice.spacing:.4g}): wavelengths down to {1 / lattice.xi_max:.4g} units",
     )
     eps = "" if study["eps"] is None else f", accuracy {study['eps']:g} of the nonuniform FFT"
+    if table.get("witness") is not None:
+        chosen = table["witness"].get("orders") or study["orders"]
+        yield "witness", f"of order {minus(', '.join(f'{order:g}' for order in chosen))}, at the vertices of every mesh"
+    if table.get("proximity") is not None:
+        yield "proximity", "Hausdorff and Chamfer distances of every mesh to the reference"
     precision = {"complex128": "double", "complex64": "single"}[study["dtype"]]
     yield "arithmetic", f"{precision} precision{eps}"
     origin = ", ".join(f"{x:.6g}" for x in similarity["origin"])

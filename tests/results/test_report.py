@@ -288,6 +288,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
         assert len(cells) == 9
         assert "±" in cells[-1]
         assert "Chamfer the mean distance" in reader.texts("#convergence")[0]
+        assert "proximity" in reader.texts("#asked dt")
 
 
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
