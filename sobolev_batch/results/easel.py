@@ -28,7 +28,7 @@ _OF_A_MESH = ("vertices", "triangles", "values", "limits")
 
 def main(scene_path: str, pictures_path: str) -> None:
     """Draw all meshes of a scene."""
-    scene = np.load(scene_path)
+    scene = np.load(scene_path, allow_pickle=False)
     side = int(scene["side"])
     pictures = {
         f"picture_{i}": _pictures(*(scene[f"{name}_{i}"] for name in _OF_A_MESH), side=side)

@@ -64,7 +64,7 @@ def render(portraits: Sequence[Portrait], orders: int, side: int = 900, *, commo
         files = Path(folder, "scene.npz"), Path(folder, "pictures.npz")
         np.savez(files[0], **scene)
         _draw(*files)
-        with np.load(files[1]) as found:
+        with np.load(files[1], allow_pickle=False) as found:
             return [found[f"picture_{i}"] for i in range(len(portraits))]
 
 

@@ -153,8 +153,10 @@ if __name__ == "__main__":
 COMMAND = """
 import sys
 from sobolev_batch import cli
+from sobolev_batch.cli import studies
+from sobolev_batch.cli.reporter import Reporter
 
-class Pausing(cli._Reporter):
+class Pausing(Reporter):
     def __call__(self, progress):
         super().__call__(progress)
         if progress.stage == "fields" and progress.done == 1:
@@ -162,7 +164,7 @@ class Pausing(cli._Reporter):
             sys.stdin.readline()
 
 if __name__ == "__main__":
-    cli._Reporter = Pausing
+    studies.Reporter = Pausing
     sys.argv[1:] = ["run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
     cli.main()
 """
