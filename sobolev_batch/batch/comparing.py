@@ -72,7 +72,7 @@ class Comparer:
     @property
     def is_done(self) -> bool:
         """Whether the store holds what the study asks for, and nothing else of the kind."""
-        if any(kind not in self.kinds and kind in self.store.documents for kind in KINDS):
+        if self._left_over():
             return False
         if not self.kinds:
             return True
@@ -93,11 +93,16 @@ class Comparer:
             StoreError: the store could not be read or written.
             ClusterError: the scheduler was lost.
         """
-        for kind in KINDS:
-            if kind not in self.kinds and kind in self.store.documents:
-                self.store.remove(kind)
-                Notes(self.store, kind).remove()
-                self.store.consolidate()
+        left_over = self._left_over()
+        if not self.kinds and not left_over:
+            return {}
+        # Until all are there a reader finds none: rows may be those of other fields, of other orders, or not there.
+        for name in [name for name in self.store.documents if name.split("/")[0] in KINDS]:
+            del self.store.documents[name]
+        self.store.consolidate()
+        for kind in left_over:
+            Notes(self.store, kind).remove()
+            self.store.remove(kind)
         left = {}
         for kind in self.kinds:
             self._lay_out(kind)
@@ -115,11 +120,19 @@ class Comparer:
             if rows:
                 self._make(kind, rows, client, crew, conclude)
         if "witness" in self.kinds:
+            notes = Notes(self.store, "witness").read()
+            made = [i for i in self._wanted if (note := notes[i]) is not None and note.status == "complete"]
+            Witnesses(self.store).sweep({i: self.complete[i].facts.vertices for i in made})
             Witnesses(self.store).list_them()
-        if "proximity" in self.kinds and not self._is_tabulated(self.store):
+        if "proximity" in self.kinds:
             Tables(self.store).write(PROXIMITY, self._proximity_dataset())
-            self.store.consolidate()
+        self.store.consolidate()
         return shortcomings(self.store, self.kinds, self._wanted)
+
+    def _left_over(self) -> list[Kind]:
+        """What the store has, or has begun to have, and the study does not ask for."""
+        there = self.store.location.names()
+        return [kind for kind in KINDS if kind not in self.kinds and kind in there]
 
     @cached_property
     def _wanted(self) -> tuple[int, ...]:
@@ -160,7 +173,6 @@ class Comparer:
         self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, conclude: Callable[[int], None]
     ) -> None:
         notes = Notes(self.store, kind)
-        there = notes.read()
         needed = {i: self._needed_bytes(kind, i) for i in left}
         claims = any(count > crew.share_bytes for count in needed.values())
 
@@ -171,7 +183,7 @@ class Comparer:
 
         def submit(i: int, rank: int) -> Future:
             task, arguments = self._task(kind, crew, needed[i])
-            comparison = self._comparison(kind, i, there[i] is not None)
+            comparison = self._comparison(kind, i)
             resources = {MEMORY: needed[i]} if claims else None
             return client.submit(task, comparison, *arguments, pure=False, resources=resources)
 
@@ -199,9 +211,9 @@ class Comparer:
             return compare_by_witness, (plan.lattice, plan.blocks, plan.study.witness, room)
         return compare_by_proximity, (plan.study.proximity,)
 
-    def _comparison(self, kind: Kind, i: int, again: bool) -> Comparison:
+    def _comparison(self, kind: Kind, i: int) -> Comparison:
         mesh, reference = self._stored(i), self._stored(self.reference)
-        return Comparison(self.store, self._key(kind, i), mesh, reference, self.plan.similarity, again)
+        return Comparison(self.store, self._key(kind, i), mesh, reference, self.plan.similarity)
 
     def _stored(self, i: int) -> Stored:
         row, record = self.rows[i], self.complete[i]

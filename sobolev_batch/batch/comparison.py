@@ -71,7 +71,6 @@ class Comparison:
         key: of its note.
         mesh, reference: the two.
         similarity: of the study.
-        again: whether there is an outcome already, to be replaced.
     """
 
     store: Store
@@ -79,7 +78,6 @@ class Comparison:
     mesh: Stored
     reference: Stored
     similarity: Similarity
-    again: bool
 
 
 def compare_by_witness(
@@ -119,7 +117,7 @@ def compare_by_witness(
                 found += evaluation.of_block(part, difference[part.place_in(block)])
         values = np.full((len(orders), len(mesh.vertices)), np.nan)
         values[:, mesh.used_vertices] = found
-        checksum = Witnesses(comparison.store).write(comparison.mesh.row, values, instead=comparison.again)
+        checksum = Witnesses(comparison.store).write(comparison.mesh.row, values)
         return Note(comparison.key, "complete", checksum=checksum)
 
     return _noted(comparison, "witness", outcome)

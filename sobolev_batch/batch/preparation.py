@@ -18,6 +18,7 @@ from zarr.storage import MemoryStore
 from sobolev_batch.batch.claim import CLAIM_KEYS
 from sobolev_batch.batch.documents import SCHEMA_VERSION
 from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.notes import KINDS, Notes
 from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.store import (
     FIELD,
@@ -207,8 +208,14 @@ def _extend(store: Store, plan: Plan) -> None:
         return
     for name in (RECORD, FIELD, QUALITY, LABELS):
         store.resize(name, (len(there) + len(added), *store.array(name).shape[1:]))
-        if name == LABELS:
-            store.array(name)[len(there) :] = np.array(added, dtype=object)
+        if name in (LABELS, QUALITY):
+            # Not left out: what is not there counts as lost.
+            texts = added if name == LABELS else [""] * len(added)
+            store.array(name)[len(there) :] = np.array(texts, dtype=object)
+    for notes in (Notes(store, kind) for kind in KINDS):
+        # Arrays of one group that differ along `mesh` cannot be read together.
+        if store.has(notes.name):
+            notes.lay_out(len(there) + len(added))
 
 
 def _attributes(plan: Plan) -> dict[str, Any]:

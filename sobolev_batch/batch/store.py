@@ -376,9 +376,8 @@ class Store:
         """An array by the path of its node, for reading and writing."""
         place = StorePath(self.keys(name), name)
         known = zarr.AsyncArray.from_dict(place, self.document(name))
-        # Chunks of zeros are data too: they must exist, or they would read as never computed. Witness functions
-        # are NaN beyond the vertices of their mesh, over any number of chunks.
-        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": name != WITNESS}))
+        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        return zarr.Array(zarr.AsyncArray(known.metadata, place, config={"write_empty_chunks": True}))
 
     def has(self, name: str) -> bool:
         """Whether a node is there, listed at the root or not."""

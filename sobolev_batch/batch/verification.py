@@ -139,7 +139,8 @@ def _damaged_notes(store: Store, kind: Kind, complete: Mapping[int, Record]) -> 
     """What is wrong with the comparison of each row, of one kind."""
     found = Notes(store, kind)
     damaged = {row: f"the note of its {kind} is damaged ({what})" for row, what in found.damaged().items()}
-    if kind == "witness" and Witnesses(store).are_there():
+    # Those that readers do not find are still to be made.
+    if kind == "witness" and Witnesses(store).are_listed():
         for row, note in enumerate(found.read()):
             if note is not None and note.status == "complete" and row in complete:
                 try:

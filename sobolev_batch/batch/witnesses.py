@@ -21,6 +21,7 @@ from sobolev_batch.errors import DamageError
 
 # Vertices of a chunk: coarse meshes waste little room, and fine ones make few chunks.
 _CHUNK = 8192
+_DIMENSIONS = 3
 _AXES = tuple(f"{WITNESS_GROUP}/{name}" for name in ("mesh", "order"))
 
 Reals = NDArray[np.float64]
@@ -87,25 +88,19 @@ class Witnesses:
         self.store.publish(made, last=f"{WITNESS_GROUP}/{ROOT}")
 
     def list_them(self) -> None:
-        """Have readers find them."""
+        """Have readers find them, once the root is written."""
         for name in (WITNESS_GROUP, WITNESS, *_AXES):
             self.store.document(name)
-        self.store.consolidate()
 
-    def write(self, row: int, values: Reals, *, instead: bool) -> int:
-        """Write the functions of a row, (orders, vertices).
-
-        Args:
-            row: of the store.
-            values: at its vertices.
-            instead: whether there may be others, of more vertices.
+    def write(self, row: int, values: Reals) -> int:
+        """Write the functions of a row, (orders, vertices); chunks beyond them are left to `sweep`.
 
         Returns:
             The checksum by which `read` knows them again.
         """
         array = self.store.array(WITNESS)
         count = values.shape[1]
-        width = array.shape[2] if instead else min(_CHUNK * math.ceil(count / _CHUNK), array.shape[2])
+        width = min(_CHUNK * math.ceil(count / _CHUNK), array.shape[2])
         # Whole chunks: a part of one would have the rest of it read.
         padded = np.full((values.shape[0], width), np.nan)
         padded[:, :count] = values
@@ -127,6 +122,20 @@ class Witnesses:
             what = "it is not what was written, or not all of it is there"
             raise DamageError(f"{self.store.path}: {WITNESS} is damaged ({what})", what)
         return values
+
+    def sweep(self, counts: Mapping[int, int]) -> None:
+        """Remove the chunks of rows that have no functions, and those beyond the vertices of others.
+
+        Args:
+            counts: vertices of each row that has functions.
+        """
+        prefix = f"{WITNESS}/c/"
+        for key in self.store.location.sizes(prefix.rstrip("/")):
+            place = key.removeprefix(prefix).split("/")
+            if len(place) == _DIMENSIONS and all(part.isdigit() for part in place):
+                row, _, number = map(int, place)
+                if number >= math.ceil(counts.get(row, 0) / _CHUNK):
+                    self.store.location.discard(key)
 
     def whole_rows(self, counts: Mapping[int, int]) -> set[int]:
         """The rows of which every chunk is there, as long as it should be; nothing is read of them.

@@ -216,7 +216,11 @@ def _line(line: Mapping[str, Any], families: tuple[str, ...]) -> Line:
     )
     if "hausdorff" in line:
         chamfer = Digits.of(line["chamfer"], line["chamfer_error"])
-        cells = (*cells, Cell.number(line["hausdorff"]), Cell.number(line["chamfer"], chamfer.together))
+        cells = (
+            *cells,
+            Cell.number(line["hausdorff"], f"{line['hausdorff']:.3g}"),
+            Cell.number(line["chamfer"], chamfer.together),
+        )
     return Line(*about, cells)
 
 

@@ -39,7 +39,8 @@ class Digits:
             return cls(shown, word, f"{shown} ± {word or '?'}")
         rounded = _rounded_up(error, 2)
         # A value below its error keeps a digit, to be told from zero.
-        last = min(_magnitude(value), max(_magnitude(rounded) - 1, _magnitude(value) - _MOST_DIGITS + 1))
+        top = _magnitude(value or rounded)
+        last = min(top, max(_magnitude(rounded) - 1, top - _MOST_DIGITS + 1))
         shown, shown_error = _shown(value, last), _shown(rounded, _magnitude(rounded) - 1)
         together = f"{shown} ± {shown_error}"
         if _POWER in shown and rounded < value * 1e3 and _magnitude(rounded) - 1 >= last:
@@ -62,6 +63,7 @@ def concise(value: float, error: float) -> str:
     if error == 0:
         return f"{value:.4g}"
     rounded = _rounded_up(error, 1)
+    power = _magnitude(value or rounded)
     last = max(_magnitude(rounded), power - _MOST_DIGITS + 1)
     # Rounding may carry into the next power, or leave nothing of a value below its error.
     power = max(_magnitude(round(value, -last)) if round(value, -last) else last, last)

@@ -20,7 +20,7 @@ _UP = (0.0, 0.0, 1.0)
 _MARGIN = 0.02
 # From above the eye's left shoulder, white: colours are to be told from each other, shapes to be seen.
 _LIGHT = (-0.5, 0.7, 1.5)
-_AMBIENT = 0.45
+_AMBIENT = 0.62
 # Where two faces meet at a larger angle, in degrees, the edge is drawn as one.
 _SHARP = 60.0
 _OF_A_MESH = ("vertices", "triangles", "values", "limits")

@@ -153,7 +153,9 @@ def _rows(here: xr.Dataset, columns: Sequence[int]) -> list[list[str]]:
 def _table(here: xr.Dataset, columns: Sequence[int], style: Format) -> str:
     """One table; of a symmetric matrix the part below the diagonal."""
     labels, others = (here[name].values.tolist() for name in ("mesh", "other"))
-    rows = [row for row in _rows(here, columns) if any(row[1:])]
+    # The mesh of the first column has no cells below the diagonal, and a name all the same.
+    named = columns[:1] if labels == others else []
+    rows = [row for i, row in enumerate(_rows(here, columns)) if any(row[1:]) or i in named]
     return str(
         tabulate(
             rows,

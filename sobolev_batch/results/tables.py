@@ -38,7 +38,7 @@ _NUMBERS = (
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
-_PROXIMITY_HEADERS = ("Hausdorff", "Chamfer ± s.e.")
+_PROXIMITY_HEADERS = ("Hausdorff ≥", "Chamfer ± s.e.")
 _NOTE = """\
 The true distance lies within its error: truncation (beyond xi_max; it can only
 raise the distance), aliasing (spacing of the lattice) and discretisation
@@ -46,8 +46,8 @@ raise the distance), aliasing (spacing of the lattice) and discretisation
 marked * is not larger than its error; no rate is taken from it. The column area
 tells which part of the squared distance a pure change of total area explains."""
 _PROXIMITY_NOTE = """\
-Hausdorff (the largest distance found, from vertices and drawn points to the
-other mesh) and Chamfer (mean distances of drawn points, both ways, with their
+Hausdorff (at least: the largest distance found, from vertices and drawn points
+to the other mesh) and Chamfer (mean distances of drawn points, both ways, with their
 standard error) are for orientation; they know no order."""
 _ACCURACY_NOTE = """\
 The study asks for an error of at most {rtol:g} of each distance; where it is
@@ -123,6 +123,9 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     parts.append("\n".join(f"% {line}" if style == "latex" else line for line in note.split("\n")))
     failures = frame.drop_duplicates("mesh").query("status != 'complete'")
     notes = [f"{line.mesh} is {line.status}: {line.reason}" for line in failures.itertuples(index=False)]
+    if has_proximity(tree):
+        reasons = finished_group(tree, "proximity")["reason"].to_series()
+        notes += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
     if notes:
         parts.append("\n".join(f"% {note}" if style == "latex" else note for note in notes))
     return "\n\n".join(parts)
@@ -172,7 +175,7 @@ def _cells(line: dict[str, Any]) -> list[str]:
         _number(line["relative"], ".5e"),
         _with_error(line["rate"], line["rate_error"], ".3f", ".0e"),
         _area_share(line),
-        _number(line.get("hausdorff", math.nan), ".4e"),
+        _number(line.get("hausdorff", math.nan), ".2e"),
         _with_error(line.get("chamfer", math.nan), line.get("chamfer_error", math.nan), ".4e", ".0e"),
     ]
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import trimesh
 import xarray as xr
 from click.testing import CliRunner
 from distributed import Client
@@ -234,8 +235,6 @@ def test_a_damaged_field_is_found_by_a_comparison(store_path: Path, client: Clie
 
 def test_a_smaller_mesh_leaves_nothing_of_a_larger_one(store_path: Path, tmp_path: Path, client: Client) -> None:
     def write(level: int) -> sb.Study:
-        import trimesh
-
         mesh = sb.icosphere(level)
         trimesh.Trimesh(0.9 * mesh.vertices, mesh.triangles, process=False).export(tmp_path / "a.ply")
         table = small_table(
@@ -279,12 +278,132 @@ def test_blocks_and_parts_of_the_lattice_add_up(
         for i, (row, record) in enumerate(zip(plan.rows, here.records(), strict=True))
         if record is not None
     ]
-    comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity, True)
+    comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity)
     # Here and not on a worker, so that each block is evaluated in parts.
     monkeypatch.setattr("sobolev_batch.spectral.witness.BLOCK_SAMPLES", 300)
     note = compare_by_witness(comparison, plan.lattice, plan.blocks, ORDERS, 1e8)
     assert note.status == "complete", note.reason
     assert_right(store_path, study)
+
+
+def write_sphere(path: Path, level: int, radius: float = 0.9) -> None:
+    mesh = sb.icosphere(level)
+    trimesh.Trimesh(radius * mesh.vertices, mesh.triangles, process=False).export(path)
+
+
+def of_files(folder: Path, names: tuple[str, ...] = ("a.ply", "b.ply"), **changes: Any) -> sb.Study:
+    """A study of files in a unit that is given, so that their fields stay whatever the others do."""
+    family = [{"name": "f", "source": "files", "paths": list(names)}]
+    table = small_table(**{**TO_A_MESH, **ASKED, "family": family, "scaling": {"mode": "none"}, **changes})
+    return sb.Study.from_table(table, folder=folder)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    for name, level in (("a.ply", 2), ("b.ply", 1), ("c.ply", 3)):
+        write_sphere(tmp_path / name, level)
+    return tmp_path
+
+
+class Killed(Exception):  # noqa: N818  # it stands for an end without a word, not for an error
+    """The end of a run, at any of its steps."""
+
+
+CHANGES: dict[str, Any] = {
+    "one more mesh": {"names": ("a.ply", "b.ply", "c.ply")},
+    "fewer orders": {"witness": {"orders": [-3.0]}},
+    "other orders": {"witness": {"orders": [-2.5, -3.0]}},
+    "other points": {"proximity": {"points": 100}},
+    "another reference": {"reference": {"source": "icosphere", "levels": [4]}},
+    "no witness": {"witness": None},
+    "nothing besides": {"witness": None, "proximity": None},
+    "other fields": {"transform": {"eps": 1e-5}},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_store_can_be_read_at_every_step_and_after_an_end_at_any(
+    change: str, files: Path, tmp_path: Path, client: Client
+) -> None:
+    """Whatever is there then is right, and the next run makes it whole."""
+    place = tmp_path / "s.zarr"
+    sb.run(of_files(files), place, client)
+    changed = of_files(files, **CHANGES[change])
+    steps = 0
+
+    def look(progress: Progress) -> None:
+        nonlocal steps
+        steps += 1
+        tree = xr.open_datatree(place, engine="zarr").load()
+        assert sb.open_store(place).children.keys() == tree.children.keys()
+        if "witness" in tree.children and "convergence" in tree.children:
+            assert np.isfinite(variable(tree, "witness", "witness").sel(mesh="f/b")[:, :42]).all()
+        if steps == last:
+            raise Killed
+
+    last = 0
+    copy = tmp_path / "before.zarr"
+    shutil.copytree(place, copy)
+    sb.run(changed, place, client, on_progress=look)
+    total = steps
+    for last in sorted({1, max(1, total // 3), max(1, 2 * total // 3), total}):  # noqa: B007  # `look` reads it
+        shutil.rmtree(place)
+        shutil.copytree(copy, place)
+        steps = 0
+        with pytest.raises(Killed):
+            sb.run(changed, place, client, on_progress=look)
+        assert not sb.verify(place).comparisons
+        steps = total + 1
+        sb.run(changed, place, client)
+        tree = sb.open_store(place)
+        assert ("witness" in tree.children) == bool(changed.witness)
+        assert ("proximity" in tree.children) == (changed.proximity is not None)
+        assert (place / "witness").exists() == (place / "records/witness").exists() == bool(changed.witness)
+        if changed.witness:
+            assert_right(place, changed)
+
+
+def test_nothing_is_left_of_a_mesh_that_fails_later(files: Path, tmp_path: Path, client: Client) -> None:
+    place = tmp_path / "s.zarr"
+    sb.run(of_files(files), place, client)
+    (files / "a.ply").write_text("garbage")
+    summary = sb.run(of_files(files), place, client)
+    assert [*summary.failed] == ["f/a"]
+    tree = sb.open_store(place)
+    assert np.isnan(variable(tree, "witness", "witness").sel(mesh="f/a")).all()
+    assert np.isnan(variable(tree, "proximity", "chamfer").sel(mesh="f/a"))
+    assert np.isfinite(variable(tree, "witness", "witness").sel(mesh="f/b")[:, :42]).all()
+
+
+def test_nothing_is_left_of_a_mesh_whose_comparison_fails_later(
+    files: Path, tmp_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "s.zarr"
+    sb.run(of_files(files), place, client)
+    # Another mesh, of as many vertices.
+    write_sphere(files / "a.ply", 2, radius=0.7)
+    with monkeypatch.context() as patched:
+        patched.setattr(Comparer, "_needed_bytes", lambda self, kind, i: 1e15 if i == 0 else 1.0)
+        summary = sb.run(of_files(files), place, client)
+    assert [*summary.not_compared] == ["f/a"]
+    assert summary.not_compared["f/a"].startswith("no witness: it takes about 1e+06 GB")
+    assert "; no proximity: it takes" in summary.not_compared["f/a"]
+    tree = sb.open_store(place)
+    assert np.isnan(variable(tree, "witness", "witness").sel(mesh="f/a")).all()
+    assert "takes about" in variable(tree, "proximity", "reason").sel(mesh="f/a").item()
+    sb.run(of_files(files), place, client)
+    assert_right(place, of_files(files))
+
+
+def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, client: Client) -> None:
+    """As an end between both leaves them; and then the mesh becomes smaller."""
+    place = tmp_path / "s.zarr"
+    write_sphere(files / "a.ply", 6)
+    sb.run(of_files(files), place, client)
+    Notes(Store.open(place), "witness").write(0, None)
+    write_sphere(files / "a.ply", 2)
+    sb.run(of_files(files), place, client)
+    assert_right(place, of_files(files))
 
 
 def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
@@ -297,7 +416,7 @@ def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
         if record is not None
     ]
     changed = Stored(1, "ico/1", plan.rows[2].member, stored[1].digest, stored[1].checksums)
-    note = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity, True), 100)
+    note = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity), 100)
     assert note.status == "failed"
     assert "is not the mesh whose field is stored" in note.reason
     assert Notes(here, "proximity").read()[1] == note

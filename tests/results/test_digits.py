@@ -24,6 +24,7 @@ _NAN = float("nan")
         (2.6e-9, 9.99e-8, "3 × 10⁻⁹", "1.0 × 10⁻⁷"),
         (0.2654, 0.0994, "0.27", "0.10"),
         (0.0, 0.0, "0", "0"),
+        (0.0, 5.97e-10, "0", "6.0 × 10⁻¹⁰"),
         (12.0, _NAN, "12.00", ""),
         (_NAN, 1.0, "", ""),
     ],
@@ -73,3 +74,8 @@ def test_what_is_shown_keeps_the_promise_of_the_error(value: float, ratio: float
 def _parsed(text: str) -> float:
     number, _, power = text.partition(" × 10")
     return float(number) * 10.0 ** int(power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or 0)
+
+
+def test_zero_has_its_own_error() -> None:
+    assert concise(0.0, 5.97e-10) == concise(1e-12, 5.97e-10) == "0(6)e-10"
+    assert Digits.of(0.0, 5.97e-10).together == "0 ± 6.0 × 10⁻¹⁰"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import xarray as xr
 
 from sobolev_batch import InputError
 from sobolev_batch.results.matrix import Matrix, format_matrix, matrix_frame
+from sobolev_batch.results.tables import Format
 
 ORDERS = [-4.0, -2.0]
 
@@ -116,3 +118,10 @@ def test_unknown_orders_and_unfinished_stores() -> None:
         matrix_frame(made(3), -3.0)
     with pytest.raises(InputError, match="no tables yet"):
         format_matrix(xr.DataTree())
+
+
+@pytest.mark.parametrize("style", ["text", "markdown", "latex"])
+def test_every_mesh_has_its_name(style: Format) -> None:
+    text = format_matrix(made(15, failed=3), style)
+    for number, label in enumerate([*(f"f/{i}" for i in range(15)), "reference"], 1):
+        assert re.search(rf"(^|\W){number} {label}\b", text, re.MULTILINE), label

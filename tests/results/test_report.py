@@ -283,7 +283,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
     write_report(place, path)
     with browser(tmp_path / "profile") as reader:
         reader.open(path)
-        assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff", "Chamfer"]
+        assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff ≥", "Chamfer"]
         cells = reader.texts("#table-convergence tbody:not([hidden]) tr:last-child td")
         assert len(cells) == 9
         assert "±" in cells[-1]

@@ -191,7 +191,9 @@ def near(tree: xr.DataTree) -> xr.DataTree:
         "chamfer": [0.125, nan, nan, nan],
         "chamfer_error": [1e-3, nan, nan, nan],
     }
-    proximity = xr.Dataset({name: ("mesh", values) for name, values in columns.items()}, coords={"mesh": MESHES})
+    reason = ["", "its file has changed", "", ""]
+    variables = {name: ("mesh", values) for name, values in {**columns, "reason": reason}.items()}
+    proximity = xr.Dataset(variables, coords={"mesh": MESHES})
     return xr.DataTree.from_dict({**tree.to_dict(), "/proximity": proximity})
 
 
@@ -199,9 +201,10 @@ def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataT
     added = [name for name in convergence_frame(near) if name not in convergence_frame(tree)]
     assert added == ["hausdorff", "chamfer", "chamfer_error"]
     text = format_table(near).splitlines()
-    assert text[2].split()[-4:] == ["Hausdorff", "Chamfer", "±", "s.e."]
-    assert text[4].split()[-4:] == ["2.5000e-01", "1.2500e-01", "±", "1e-03"]
+    assert text[2].split()[-4:] == ["≥", "Chamfer", "±", "s.e."]
+    assert text[4].split()[-4:] == ["2.50e-01", "1.2500e-01", "±", "1e-03"]
     assert "Hausdorff" in "\n".join(text[8:])
+    assert text[-1] == "f_1/1 has no proximity: its file has changed"
     assert "Hausdorff" not in format_table(tree)
     for style in ("markdown", "latex"):
         separator = "|" if style == "markdown" else " & "
