@@ -173,6 +173,11 @@ class Comparer:
         self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, conclude: Callable[[int], None]
     ) -> None:
         notes = Notes(self.store, kind)
+        there = notes.read()
+        for i in left:
+            # It would speak for the values of another mesh, were that mesh to come back after an end in the middle.
+            if there[i] is not None:
+                notes.write(i, None)
         needed = {i: self._needed_bytes(kind, i) for i in left}
         claims = any(count > crew.share_bytes for count in needed.values())
 

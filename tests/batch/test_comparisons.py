@@ -395,6 +395,24 @@ def test_nothing_is_left_of_a_mesh_whose_comparison_fails_later(
     assert_right(place, of_files(files))
 
 
+def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path: Path, client: Client) -> None:
+    """The old mesh may come back after a run for another one that ended between its values and their note."""
+    place = tmp_path / "s.zarr"
+    sb.run(of_files(files), place, client)
+    old = {note.key for note in Notes(Store.open(place), "witness").read() if note is not None}
+    assert len(old) == 2
+    for name, level in (("a.ply", 2), ("b.ply", 1)):
+        write_sphere(files / name, level, radius=0.7)
+
+    def end(progress: Progress) -> None:
+        if progress.stage == "comparisons" and progress.done == 1:
+            raise Killed
+
+    with pytest.raises(Killed):
+        sb.run(of_files(files), place, client, on_progress=end)
+    assert not old & {note.key for note in Notes(Store.open(place), "witness").read() if note is not None}
+
+
 def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, client: Client) -> None:
     """As an end between both leaves them; and then the mesh becomes smaller."""
     place = tmp_path / "s.zarr"
