@@ -147,8 +147,10 @@ def plot_command(
 
 @cli.command("witness")
 @click.argument("store", type=Location.of)
-@click.option("--mesh", "labels", multiple=True, help="Only this mesh; may be repeated.")
-@click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
+@click.option("--mesh", "labels", multiple=True, metavar="LABEL", help="Only this mesh; may be repeated.")
+@click.option(
+    *("--order", "orders"), type=float, multiple=True, help="Any below -1/2; may be repeated. [default: the study's]"
+)
 @click.option(
     *("--format", "style"),
     type=click.Choice(["ply", "vtp"]),
