@@ -106,6 +106,9 @@ class Comparer:
         left = {}
         for kind in self.kinds:
             self._lay_out(kind)
+            for i, note in enumerate(Notes(self.store, kind).read()):
+                if note is not None and i not in self._wanted:
+                    Notes(self.store, kind).write(i, None)
             left[kind] = self._left(kind)
         total, done = sum(map(len, left.values())), 0
 
@@ -121,7 +124,8 @@ class Comparer:
                 self._make(kind, rows, client, crew, conclude)
         if "witness" in self.kinds:
             notes = Notes(self.store, "witness").read()
-            made = [i for i in self._wanted if (note := notes[i]) is not None and note.status == "complete"]
+            # A task that outlives the run which submitted it may have written others.
+            made = [i for i in self._wanted if (note := notes[i]) and note.completes(self._key("witness", i))]
             Witnesses(self.store).sweep({i: self.complete[i].facts.vertices for i in made})
             Witnesses(self.store).list_them()
         if "proximity" in self.kinds:
@@ -167,6 +171,9 @@ class Comparer:
             labels = [row.label for row in self.rows]
             vertices = max([1, *(self.complete[i].facts.vertices for i in self._wanted)])
             Witnesses(self.store).lay_out(labels, self.plan.study.witness, self.plan.reference, vertices)
+        elif not self.store.has(PROXIMITY):
+            # Before the notes: what is not asked for any more is found by its group.
+            Tables(self.store).write(PROXIMITY, self._proximity_dataset())
         Notes(self.store, kind).lay_out(len(self.rows))
 
     def _make(

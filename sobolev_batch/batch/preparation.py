@@ -29,7 +29,7 @@ from sobolev_batch.batch.store import (
     UNFINISHED,
     Store,
 )
-from sobolev_batch.batch.tables import table_encoding
+from sobolev_batch.batch.tables import Tables, table_encoding
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.similarity import Similarity
@@ -79,6 +79,9 @@ def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
         store.mend_labels()
         _extend(store, plan)
         _mend_axes(store, plan)
+        if store.attributes().get("similarity") != _similarity_entry(plan.similarity):
+            # In another unit of length, and the run may end before there are others.
+            Tables(store).withdraw()
         store.documents[""]["attributes"].update(_attributes(plan))
         # Written even if nothing changed: a place that refuses it must do so before tasks start.
         store.consolidate()

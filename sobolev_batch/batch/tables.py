@@ -77,14 +77,13 @@ class Tables:
     def lost(self) -> tuple[str, ...]:
         """The arrays of tables that are not all there; nothing is read of them."""
         lost = self._lost(self._names(), self._groups())
-        # Errors of norms hang on it, and it is written with them.
-        return (*lost, *self._lost([QUALITY], [QUALITY])) if self._names() else lost
+        # Errors of norms hang on the first, and it is written with them; witness functions on the others.
+        besides = [*([QUALITY] if self._names() else ()), *self._axes_of_witness()]
+        return (*lost, *self._lost(besides, besides))
 
     def damaged(self) -> dict[str, str]:
         """What is wrong with each small array, of tables and coordinates, that cannot be read."""
-        of_witness = [f"{WITNESS_GROUP}/{name}" for name in ("mesh", "order")]
-        of_witness = [name for name in of_witness if name in self.store.documents]
-        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *of_witness]
+        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *self._axes_of_witness()]
         lost = {*self.lost(), *self._lost(coordinates, coordinates)}
         damaged = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
         for name in [*coordinates, QUALITY, *self._names()]:
@@ -94,6 +93,10 @@ class Tables:
                 except DamageError as error:
                     damaged[name] = error.what
         return damaged
+
+    def _axes_of_witness(self) -> list[str]:
+        names = (f"{WITNESS_GROUP}/{name}" for name in ("mesh", "order"))
+        return [name for name in names if name in self.store.documents]
 
     def _groups(self) -> list[str]:
         return sorted({name.split("/")[0] for name in self.store.documents if name} - set(_GROUPS_OF_TASKS))

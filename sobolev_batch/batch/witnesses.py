@@ -35,7 +35,7 @@ class Witnesses:
 
     def are_there(self) -> bool:
         """Whether there is room for them, listed or not."""
-        return self.store.has(WITNESS) and self.store.has(WITNESS_GROUP)
+        return all(self.store.has(name) for name in (WITNESS, WITNESS_GROUP, *_AXES))
 
     def are_listed(self) -> bool:
         """Whether readers find them."""

@@ -22,7 +22,7 @@ from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.crew import Crew, CrewMember
-from sobolev_batch.batch.notes import KINDS, Note, Notes
+from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes
 from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.run import Summary
@@ -36,6 +36,10 @@ from tests.faults.comparing import assert_same_fields, assert_same_tables
 ORDERS = (-2.0, -3.5)
 ASKED: dict[str, Any] = {"witness": {"orders": list(ORDERS)}, "proximity": {"points": 300}}
 TO_A_MESH: dict[str, Any] = {"reference": {"source": "icosphere", "levels": [5]}}
+
+
+class Killed(Exception):  # noqa: N818  # it stands for an end without a word, not for an error
+    """The end of a run, at any of its steps."""
 
 
 def asking(**changes: Any) -> sb.Study:
@@ -209,6 +213,84 @@ def test_damage_is_named_and_repaired(
 
 
 @pytest.mark.parametrize("axis", ["mesh", "order"])
+def test_a_lost_coordinate_of_witness_functions(axis: str, store: Path, client: Client) -> None:
+    (store / f"witness/{axis}/c/0").unlink()
+    with pytest.raises(sb.DamageError, match=f"witness/{axis} is not there"):
+        sb.open_store(store)
+    sb.run(asking(), store, client)
+    assert_right(store, asking())
+
+
+@pytest.mark.parametrize("gone", ["mesh", "order"])
+def test_a_removal_that_was_cut_short(gone: str, store: Path, client: Client) -> None:
+    """Of the group, in whatever order its keys go."""
+    here = Store.open(store)
+    for name in [name for name in here.documents if name.startswith("witness")]:
+        del here.documents[name]
+    here.consolidate()
+    shutil.rmtree(store / "witness" / gone)
+    sb.run(asking(), store, client)
+    assert_right(store, asking())
+
+
+def test_another_member_becomes_the_reference(store_path: Path, client: Client) -> None:
+    """Whose own note, of a failure even, speaks for nothing any more."""
+
+    def study(member: str) -> sb.Study:
+        return asking(reference={"source": "family", "family": "ico", "member": member}, scaling={"mode": "none"})
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Comparer, "_needed_bytes", lambda self, kind, i: 1e15 if i == 0 else 1.0)
+        assert [*sb.run(study("3"), store_path, client).not_compared] == ["ico/0"]
+    for member in ("2", "0", "3"):
+        sb.run(study(member), store_path, client)
+        assert sb.verify(store_path).is_sound
+        assert not Status.of(store_path).not_compared
+        assert_right(store_path, study(member))
+
+
+def test_notes_of_what_is_not_asked_for_any_more_go(store_path: Path, client: Client) -> None:
+    def end(progress: Progress) -> None:
+        if progress.stage == "comparisons" and progress.done == 1:
+            raise Killed
+
+    with pytest.raises(Killed):
+        sb.run(asking(witness=None), store_path, client, on_progress=end)
+    assert (store_path / "records/proximity").exists()
+    sb.run(sb.Study.from_table(small_table(**TO_A_MESH)), store_path, client)
+    assert not (store_path / "records/proximity").exists()
+    assert not (store_path / "proximity").exists()
+
+
+def test_a_task_that_outlives_its_run_is_not_believed(
+    store: Path, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It writes values of other orders into the array of the next run, and a note of its own."""
+    other, straggler = asking(witness={"orders": [-3.0, -5.0]}), Note("of another run", "complete", checksum=1)
+    make = Comparer._make
+
+    def make_and_spoil(self: Comparer, kind: Kind, *arguments: Any) -> None:
+        make(self, kind, *arguments)
+        if kind == "witness":
+            Notes(self.store, kind).write(1, straggler)
+
+    monkeypatch.setattr(Comparer, "_make", make_and_spoil)
+    sb.run(other, store, client)
+    assert np.isnan(variable(sb.open_store(store), "witness", "witness").sel(mesh="ico/1")).all()
+    monkeypatch.undo()
+    sb.run(other, store, client)
+    assert_right(store, other)
+
+
+def test_a_refused_run_in_another_unit_leaves_no_table_of_the_old_one(store: Path, client: Client) -> None:
+    with pytest.raises(sb.ClusterError):
+        sb.run(asking(scaling={"mode": "fixed", "scale": 0.9}, transform={"backend": "gpu"}), store, client)
+    assert not {"convergence", "witness", "proximity"} & set(sb.open_store(store).children)
+    sb.run(asking(), store, client)
+    assert_right(store, asking())
+
+
+@pytest.mark.parametrize("axis", ["mesh", "order"])
 def test_a_damaged_coordinate_of_witness_functions(axis: str, store: Path, client: Client) -> None:
     flip(store / f"witness/{axis}/c/0")
     assert [*sb.verify(store).tables] == [f"witness/{axis}"]
@@ -303,10 +385,6 @@ def files(tmp_path: Path) -> Path:
     for name, level in (("a.ply", 2), ("b.ply", 1), ("c.ply", 3)):
         write_sphere(tmp_path / name, level)
     return tmp_path
-
-
-class Killed(Exception):  # noqa: N818  # it stands for an end without a word, not for an error
-    """The end of a run, at any of its steps."""
 
 
 CHANGES: dict[str, Any] = {
