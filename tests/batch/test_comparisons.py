@@ -33,6 +33,8 @@ from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table, variable
 from tests.faults.comparing import assert_same_fields, assert_same_tables
 
+pytest.importorskip("pyvista", reason="VTK comes with the extra 'vtk'")
+
 ORDERS = (-2.0, -3.5)
 ASKED: dict[str, Any] = {"witness": {"orders": list(ORDERS)}, "proximity": {"points": 300}}
 TO_A_MESH: dict[str, Any] = {"reference": {"source": "icosphere", "levels": [5]}}
@@ -107,7 +109,6 @@ def test_where_a_mesh_has_less_area_they_are_negative(compared: Path) -> None:
 
 
 def test_proximities_are_those_of_the_library(compared: Path) -> None:
-    pytest.importorskip("vtkmodules")
     tree = sb.open_store(compared)
     plan = make_plan(asking())
     reference = plan.similarity.apply(plan.rows[-1].member.load())
