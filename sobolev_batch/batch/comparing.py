@@ -78,8 +78,10 @@ class Comparer:
             return True
         # Of this store some nodes may be known that the root does not list.
         listed = Store.open(self.store.location)
-        return not any(self._left(kind) for kind in self.kinds) and all(
-            Witnesses(listed).are_listed() if kind == "witness" else self._is_tabulated(listed) for kind in self.kinds
+        notes = {kind: Notes(self.store, kind).read() for kind in self.kinds}
+        return not any(self._left(kind, notes[kind]) for kind in self.kinds) and all(
+            Witnesses(listed).are_listed() if kind == "witness" else self._is_tabulated(listed, notes[kind])
+            for kind in self.kinds
         )
 
     def carry_out(self, client: Client, crew: Crew, notify: Notify) -> dict[str, str]:
@@ -106,10 +108,13 @@ class Comparer:
         left = {}
         for kind in self.kinds:
             self._lay_out(kind)
-            for i, note in enumerate(Notes(self.store, kind).read()):
-                if note is not None and i not in self._wanted:
-                    Notes(self.store, kind).write(i, None)
-            left[kind] = self._left(kind)
+            notes = Notes(self.store, kind).read()
+            left[kind] = self._left(kind, notes)
+            # Those of others speak for nothing; those that are to be replaced would speak for the values of another
+            # mesh, were that mesh to come back after an end in the middle.
+            kept = set(self._wanted) - set(left[kind])
+            for i in [i for i, note in enumerate(notes) if note is not None and i not in kept]:
+                Notes(self.store, kind).write(i, None)
         total, done = sum(map(len, left.values())), 0
 
         def conclude(i: int) -> None:
@@ -122,16 +127,17 @@ class Comparer:
         for kind, rows in left.items():
             if rows:
                 self._make(kind, rows, client, crew, conclude)
-        if "witness" in self.kinds:
-            notes = Notes(self.store, "witness").read()
+        found = {kind: Notes(self.store, kind).read() for kind in self.kinds}
+        if "witness" in found:
+            notes = found["witness"]
             # A task that outlives the run which submitted it may have written others.
             made = [i for i in self._wanted if (note := notes[i]) and note.completes(self._key("witness", i))]
             Witnesses(self.store).sweep({i: self.complete[i].facts.vertices for i in made})
             Witnesses(self.store).list_them()
-        if "proximity" in self.kinds:
-            Tables(self.store).write(PROXIMITY, self._proximity_dataset())
+        if "proximity" in found:
+            Tables(self.store).write(PROXIMITY, self._proximity_dataset(found["proximity"]))
         self.store.consolidate()
-        return shortcomings(self.store, self.kinds, self._wanted)
+        return shortcomings([row.label for row in self.rows], found, self._wanted)
 
     def _left_over(self) -> list[Kind]:
         """What the store has, or has begun to have, and the study does not ask for."""
@@ -145,9 +151,8 @@ class Comparer:
             return ()
         return tuple(i for i, record in self.complete.items() if i != self.reference and record.facts.triangles)
 
-    def _left(self, kind: Kind) -> list[int]:
-        """The meshes whose comparison is to be made."""
-        notes = Notes(self.store, kind).read()
+    def _left(self, kind: Kind, notes: Sequence[Note | None]) -> list[int]:
+        """The meshes whose comparison is to be made, given the notes that there are."""
         left = {i for i in self._wanted if (note := notes[i]) is None or not note.completes(self._key(kind, i))}
         if kind == "witness" and len(left) < len(self._wanted):
             witnesses = Witnesses(self.store)
@@ -173,18 +178,13 @@ class Comparer:
             Witnesses(self.store).lay_out(labels, self.plan.study.witness, self.plan.reference, vertices)
         elif not self.store.has(PROXIMITY):
             # Before the notes: what is not asked for any more is found by its group.
-            Tables(self.store).write(PROXIMITY, self._proximity_dataset())
+            Tables(self.store).write(PROXIMITY, self._proximity_dataset([None] * len(self.rows)))
         Notes(self.store, kind).lay_out(len(self.rows))
 
     def _make(
         self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, conclude: Callable[[int], None]
     ) -> None:
         notes = Notes(self.store, kind)
-        there = notes.read()
-        for i in left:
-            # It would speak for the values of another mesh, were that mesh to come back after an end in the middle.
-            if there[i] is not None:
-                notes.write(i, None)
         needed = {i: self._needed_bytes(kind, i) for i in left}
         claims = any(count > crew.share_bytes for count in needed.values())
 
@@ -247,9 +247,9 @@ class Comparer:
         drawn = 2 * POINT_BYTES * (self.plan.study.proximity or 0)
         return making(i) + making(self.reference) + TRIANGLE_BYTES * triangles + drawn
 
-    def _proximity_dataset(self) -> xr.Dataset:
+    def _proximity_dataset(self, notes: Sequence[Note | None]) -> xr.Dataset:
         """`hausdorff`, `chamfer` and `chamfer_error` (mesh), NaN where there is no comparison, and why."""
-        notes = self._current_notes()
+        notes = self._current(notes)
         units = {"units": "unit length"}
         columns = {
             name: ("mesh", np.array([note.numbers[name] if note and note.numbers else np.nan for note in notes]), units)
@@ -262,24 +262,24 @@ class Comparer:
             attrs={
                 "reference": self.plan.reference,
                 "points": self.plan.study.proximity,
-                "digest": self._proximity_digest(),
+                "digest": self._proximity_digest(notes),
             },
         )
 
-    def _current_notes(self) -> list[Note | None]:
-        notes = Notes(self.store, "proximity").read()
+    def _current(self, notes: Sequence[Note | None]) -> list[Note | None]:
+        """The notes of proximities that are those of the meshes and points that there are."""
         wanted = set(self._wanted)
         return [
             note if note is not None and i in wanted and note.key == self._key("proximity", i) else None
             for i, note in enumerate(notes)
         ]
 
-    def _proximity_digest(self) -> str:
-        lines = [None if note is None else note.to_json() for note in self._current_notes()]
+    def _proximity_digest(self, notes: Sequence[Note | None]) -> str:
+        lines = [None if note is None else note.to_json() for note in notes]
         labels = [row.label for row in self.rows]
         return hashlib.sha256(json.dumps([labels, lines]).encode()).hexdigest()
 
-    def _is_tabulated(self, store: Store) -> bool:
+    def _is_tabulated(self, store: Store, notes: Sequence[Note | None]) -> bool:
         """Whether the table of proximities is there, and made from the notes that are."""
         attributes = Tables(store).attributes(PROXIMITY)
-        return attributes is not None and attributes.get("digest") == self._proximity_digest()
+        return attributes is not None and attributes.get("digest") == self._proximity_digest(self._current(notes))

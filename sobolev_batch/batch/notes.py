@@ -6,7 +6,7 @@ Like a completion record, a note is a chunk of its own, replaced as a whole, and
 from __future__ import annotations
 
 import json
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Literal, Self
 
@@ -123,17 +123,19 @@ class Notes:
             return error
 
 
-def shortcomings(store: Store, kinds: Iterable[Kind], rows: Container[int]) -> dict[str, str]:
+def shortcomings(
+    labels: Sequence[str], notes: Mapping[Kind, Sequence[Note | None]], rows: Container[int]
+) -> dict[str, str]:
     """What meshes lack that could not be compared, and why, by their labels.
 
     Args:
-        store: where the notes are.
-        kinds: of comparisons that were asked for.
+        labels: of all rows of a store.
+        notes: of all rows, for each kind of comparison that was asked for.
         rows: of the meshes that there are fields of.
     """
-    labels, found = store.labels(), dict[str, str]()
-    for kind in kinds:
-        for row, note in enumerate(Notes(store, kind).read()):
+    found: dict[str, str] = {}
+    for kind, of_kind in notes.items():
+        for row, note in enumerate(of_kind):
             if note is not None and note.status == "failed" and row in rows:
                 lack = f"no {kind}: {note.reason}"
                 found[labels[row]] = f"{found[labels[row]]}; {lack}" if labels[row] in found else lack

@@ -51,7 +51,8 @@ class Status:
         store = Store.open(place)
         labels, records, run = store.labels(), store.records(), store.read_run()
         # Where a study asks for none, nothing is looked for.
-        asked = [kind for kind in KINDS if Notes(store, kind).name in store.documents]
+        asked = (Notes(store, kind) for kind in KINDS)
+        notes = {each.kind: each.read() for each in asked if each.name in store.documents}
         complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
         return cls(
             str(place),
@@ -62,7 +63,7 @@ class Status:
                 for label, record in zip(labels, records, strict=True)
                 if record is not None and record.status == "failed"
             },
-            shortcomings(store, asked, complete),
+            shortcomings(labels, notes, complete),
             run,
             Tables(store).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,

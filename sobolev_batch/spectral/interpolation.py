@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.budget import AXIS_DIRECTIONS
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.operands import field_of, quality_of
+from sobolev_batch.spectral.operands import field_of, quality_of, triples_of
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -169,12 +169,7 @@ def full_lattice(field: xr.DataArray) -> xr.DataArray:
 
 
 def _frequencies(frequencies: ArrayLike, lattice: Lattice) -> Reals:
-    try:
-        found = np.asarray(frequencies, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"frequencies must be real numbers (n, 3): {error}") from error
-    if found.ndim != 2 or found.shape[1] != 3:
-        raise InputError(f"frequencies must have the shape (n, 3), found {found.shape}")
+    found = triples_of(frequencies, "frequencies")
     if not np.isfinite(found).all():
         raise InputError("frequencies must be finite")
     highest = float(np.abs(found).max(initial=0.0))

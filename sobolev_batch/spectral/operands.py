@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import fourier_transform
@@ -62,6 +63,21 @@ def pair_of(
             raise LatticeError(f"fields on different lattices cannot be compared: {known[0]} and {other}")
     common = known[0] if known else None
     return field_of(a, common, orders), field_of(b, common, orders)
+
+
+def triples_of(values: ArrayLike, what: str) -> Reals:
+    """Values as float64 (n, 3); they may be infinite or NaN.
+
+    Raises:
+        InputError: they are not real, or not of that shape; the message names ``what`` they are.
+    """
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} must be real numbers (n, 3): {error}") from error
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise InputError(f"{what} must have the shape (n, 3), found {found.shape}")
+    return found
 
 
 def check_surface(a: object) -> None:

@@ -14,7 +14,7 @@ from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.division import Division, Load, divide
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import evaluate_at
-from sobolev_batch.spectral.operands import BLOCK_SAMPLES, Operand, pair_of, read_blocks
+from sobolev_batch.spectral.operands import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
 from sobolev_batch.spectral.precision import Precision, item_bytes
 from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
 from sobolev_batch.spectral.transform import DEFAULT_BATCH, Transform, require_points_inside
@@ -150,12 +150,7 @@ def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
     Raises:
         InputError: they are not real, finite or of that shape.
     """
-    try:
-        found = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"points must be real numbers (n, 3): {error}") from error
-    if found.ndim != 2 or found.shape[1] != 3:
-        raise InputError(f"points must have the shape (n, 3), found {found.shape}")
+    found = triples_of(points, "points")
     bad = int(np.count_nonzero(~np.isfinite(found).all(axis=1)))
     if bad:
         raise InputError(f"{bad} of {len(found)} points have NaN or infinite coordinates")
