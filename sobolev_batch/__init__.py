@@ -56,16 +56,16 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.norms import distance, inner_product, norm
     from sobolev_batch.spectral.proportion import proportion
     from sobolev_batch.spectral.witness import witness
-    from sobolev_batch.surfaces.ellipsoid import Ellipsoid
-    from sobolev_batch.surfaces.icosphere import icosphere
-    from sobolev_batch.surfaces.interval import Interval
-    from sobolev_batch.surfaces.mesh import Mesh
-    from sobolev_batch.surfaces.parametrised import ParametrisedSurface
-    from sobolev_batch.surfaces.proximity import Proximity, proximity
     from sobolev_batch.surfaces.readers import read_mesh
-    from sobolev_batch.surfaces.similarity import Similarity
-    from sobolev_batch.surfaces.sphere import Sphere
-    from sobolev_batch.surfaces.torus import Torus
+    from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
+    from sobolev_batch.surfaces.shapes.icosphere import icosphere
+    from sobolev_batch.surfaces.shapes.interval import Interval
+    from sobolev_batch.surfaces.shapes.mesh import Mesh
+    from sobolev_batch.surfaces.shapes.parametrised import ParametrisedSurface
+    from sobolev_batch.surfaces.shapes.proximity import Proximity, proximity
+    from sobolev_batch.surfaces.shapes.similarity import Similarity
+    from sobolev_batch.surfaces.shapes.sphere import Sphere
+    from sobolev_batch.surfaces.shapes.torus import Torus
 
 __all__ = [
     "AccuracyError",
@@ -123,35 +123,35 @@ _MODULES = {
     "ClaimError": "errors",
     "ClusterError": "errors",
     "DamageError": "errors",
-    "Ellipsoid": "surfaces.ellipsoid",
+    "Ellipsoid": "surfaces.shapes.ellipsoid",
     "InputError": "errors",
-    "Interval": "surfaces.interval",
+    "Interval": "surfaces.shapes.interval",
     "Lattice": "spectral.lattice",
     "LatticeError": "errors",
-    "Mesh": "surfaces.mesh",
+    "Mesh": "surfaces.shapes.mesh",
     "MeshError": "errors",
     "OrderError": "errors",
-    "ParametrisedSurface": "surfaces.parametrised",
-    "Proximity": "surfaces.proximity",
-    "Similarity": "surfaces.similarity",
+    "ParametrisedSurface": "surfaces.shapes.parametrised",
+    "Proximity": "surfaces.shapes.proximity",
+    "Similarity": "surfaces.shapes.similarity",
     "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
-    "Sphere": "surfaces.sphere",
+    "Sphere": "surfaces.shapes.sphere",
     "StoreError": "errors",
     "Study": "batch.study",
     "StudyError": "errors",
     "Submission": "batch.submission",
     "Summary": "batch.run",
-    "Torus": "surfaces.torus",
+    "Torus": "surfaces.shapes.torus",
     "Verification": "batch.verification",
     "distance": "spectral.norms",
     "fourier_transform": "spectral.fields",
-    "icosphere": "surfaces.icosphere",
+    "icosphere": "surfaces.shapes.icosphere",
     "inner_product": "spectral.norms",
     "norm": "spectral.norms",
     "open_store": "results.opening",
     "proportion": "spectral.proportion",
-    "proximity": "surfaces.proximity",
+    "proximity": "surfaces.shapes.proximity",
     "read_mesh": "surfaces.readers",
     "release": "batch.release",
     "run": "batch.run",

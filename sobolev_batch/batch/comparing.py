@@ -27,7 +27,7 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import StoreError
-from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES
+from sobolev_batch.surfaces.shapes.proximity import POINT_BYTES, TRIANGLE_BYTES
 
 _log = logging.getLogger(__name__)
 

@@ -21,9 +21,9 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.shells import shell_weights
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.spectral.witness import Evaluation
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.proximity import proximity
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.proximity import proximity
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources import Member
 
 _log = logging.getLogger(__name__)

@@ -25,7 +25,7 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import draws_for
 from sobolev_batch.spectral.transform import Transform, require_inside, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 

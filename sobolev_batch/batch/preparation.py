@@ -32,7 +32,7 @@ from sobolev_batch.batch.store import (
 from sobolev_batch.batch.tables import Tables, table_encoding
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 _log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sobolev_batch.batch.location import Location
 from sobolev_batch.errors import StoreError
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 _log = logging.getLogger(__name__)
 

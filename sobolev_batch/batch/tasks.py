@@ -26,10 +26,10 @@ from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import probe_block
 from sobolev_batch.spectral.transform import Transform, transform_block
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.sources import Member
-from sobolev_batch.surfaces.sphere import Sphere
 
 _log = logging.getLogger(__name__)
 

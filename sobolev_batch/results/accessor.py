@@ -16,7 +16,7 @@ from sobolev_batch.spectral.operands import Operand, pair_of
 from sobolev_batch.spectral.proportion import proportion
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.spectral.witness import witness
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 
 @xr.register_dataarray_accessor("sobolev")  # type: ignore[no-untyped-call]

@@ -17,7 +17,7 @@ from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.remaking import Remaker, require_known
 from sobolev_batch.results.tables import convergence_frame, finished_group
 from sobolev_batch.results.witnesses import witness_at, witness_at_vertices
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
 Corners = NDArray[np.int32]

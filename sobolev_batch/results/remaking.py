@@ -15,8 +15,8 @@ from sobolev_batch.batch.plan import members_of
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.tables import finished_group
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources import Member
 
 

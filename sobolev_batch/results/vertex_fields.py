@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 SUFFIXES = (".ply", ".vtp")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.results.tables import chosen_orders, finished_group
 from sobolev_batch.spectral.bands import spectrum
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 Reals = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.witness import witness
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.operands import Operand, field_of, pair_of, shells_of
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_volumes, shell_weights
-from sobolev_batch.surfaces.similarity import Similarity
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12

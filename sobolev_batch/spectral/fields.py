@@ -20,8 +20,8 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform, transform_block
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 # Where nobody says which orders a field is for.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)

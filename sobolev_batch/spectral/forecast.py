@@ -18,9 +18,9 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature import choose_rules
 from sobolev_batch.spectral.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
 from sobolev_batch.spectral.transform import COARSEST_EPS, FINEST_EPS, Transform
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.smooth import Smooth
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 Reals = NDArray[np.float64]
 

@@ -29,8 +29,8 @@ from sobolev_batch.spectral.operands import (
 from sobolev_batch.spectral.pursuit import pursue
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13

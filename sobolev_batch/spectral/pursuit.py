@@ -20,8 +20,8 @@ from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform import Transform
-from sobolev_batch.surfaces.similarity import Similarity, Surface
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 Reals = NDArray[np.float64]
 

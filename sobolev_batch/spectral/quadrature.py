@@ -24,8 +24,8 @@ from sobolev_batch.spectral.rules import (
     symmetric_rule,
 )
 from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.smooth import Smooth
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 Reals = NDArray[np.float64]
 _Corners = tuple[Array, Array, Array]

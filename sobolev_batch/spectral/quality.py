@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.budget import DIRECTIONS
 from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 Reals = NDArray[np.float64]
 

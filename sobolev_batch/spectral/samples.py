@@ -15,10 +15,10 @@ from sobolev_batch.spectral.resolution import exact_values, resolve
 from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.spectral.triangles import exact_transform
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 Reals = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from scipy.special import gamma, kv
 
 from sobolev_batch.errors import OrderError
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 
 def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -18,10 +18,10 @@ from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
 from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.spheres import sphere_block
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 # Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
 # another version are then computed again instead of being compared with new ones.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral import compensated
 from sobolev_batch.spectral.phases import cosine_and_sine
-from sobolev_batch.surfaces.mesh import Corners, Mesh
+from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources import (
     MOST_ENTRIES,
     Fingerprint,

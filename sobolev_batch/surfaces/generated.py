@@ -13,13 +13,13 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.ellipsoid import Ellipsoid
-from sobolev_batch.surfaces.icosphere import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.similarity import Surface
-from sobolev_batch.surfaces.smooth import Smooth
+from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
+from sobolev_batch.surfaces.shapes.icosphere import FINEST_LEVEL, icosphere
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.torus import MOST_TRIANGLES, Torus
 from sobolev_batch.surfaces.sources import MOST_ENTRIES, Fingerprint, Member, Size, Source, at_most, installed_version
-from sobolev_batch.surfaces.sphere import Sphere
-from sobolev_batch.surfaces.torus import MOST_TRIANGLES, Torus
 
 # Measured peak of the subdivision, for each triangle that it makes.
 _MAKING_BYTES = 140

@@ -23,7 +23,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, fie
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.contents import bounded_length, open_regular
 from sobolev_batch.surfaces.names import shown
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.shapes.similarity import Surface
 
 # Of levels, or of triangle counts of one mesh.
 MOST_ENTRIES = 1000

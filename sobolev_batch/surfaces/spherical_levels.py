@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.decimation import reduced_size
 from sobolev_batch.surfaces.generated import Levels
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, Source, sole_member
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from sobolev_batch.batch import tasks
 from sobolev_batch.batch.tasks import Job
 from sobolev_batch.surfaces.files import FileMember
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.shapes.similarity import Surface
 
 # Dask may load this twice.
 _LOAD = vars(tasks).setdefault("_load_surface_without_gate", tasks.load_surface)

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.decimation import DecimatedMember
 from sobolev_batch.surfaces.files import Files
-from sobolev_batch.surfaces.similarity import Surface
+from sobolev_batch.surfaces.shapes.similarity import Surface
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

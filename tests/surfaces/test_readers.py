@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import Mesh, icosphere, read_mesh
-from sobolev_batch.surfaces.mesh import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 from tests.surfaces.conftest import Read
 from tests.surfaces.formats import BIG, BOXES, LITTLE, Gltf, gifti, obj, off, ply, stl_binary, stl_text
 from tests.surfaces.shapes import (

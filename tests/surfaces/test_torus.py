@@ -11,7 +11,7 @@ import pytest
 
 from sobolev_batch import InputError, Mesh, Similarity, Torus
 from sobolev_batch.spectral.budget import DIRECTIONS
-from sobolev_batch.surfaces.smooth import Smooth
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 TORUS = Torus(1.0, 0.4, (0.1, -0.2, 0.3))
 

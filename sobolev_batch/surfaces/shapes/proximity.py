@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 DEFAULT_POINTS = 10_000
 MOST_POINTS = 10_000_000

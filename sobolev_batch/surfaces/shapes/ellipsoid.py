@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import elliprg
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.icosphere import icosphere
-from sobolev_batch.surfaces.interval import Interval
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import is_finite_number
+from sobolev_batch.surfaces.shapes.icosphere import icosphere
+from sobolev_batch.surfaces.shapes.interval import Interval
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import is_finite_number
 
 Reals = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import roots_legendre
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.sphere import is_finite_number
+from sobolev_batch.surfaces.shapes.sphere import is_finite_number
 
 Reals = NDArray[np.float64]
 

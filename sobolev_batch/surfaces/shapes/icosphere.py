@@ -5,7 +5,7 @@ from __future__ import annotations
 import trimesh
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # 20 * 4^12 is 335 million triangles, some 24 GB of indices and corners: beyond it a level is a typing error.
 FINEST_LEVEL = 12

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.interval import Interval
+from sobolev_batch.surfaces.shapes.interval import Interval
 
 Reals = NDArray[np.float64]
 Counts = tuple[int, int]

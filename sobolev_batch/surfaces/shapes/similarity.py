@@ -9,9 +9,9 @@ from typing import overload
 import numpy as np
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.mesh import Mesh
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import Sphere
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 Surface = Mesh | Sphere | Smooth
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.interval import Interval
-from sobolev_batch.surfaces.smooth import Smooth
-from sobolev_batch.surfaces.sphere import is_finite_number
+from sobolev_batch.surfaces.shapes.interval import Interval
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.sphere import is_finite_number
 
 Reals = NDArray[np.float64]
 # x, y and z at each of some parameters; numbers stand for constant ones.
