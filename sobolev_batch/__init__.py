@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.norms import distance, inner_product, norm
     from sobolev_batch.spectral.proportion import proportion
     from sobolev_batch.spectral.witness import witness
-    from sobolev_batch.surfaces.readers import read_mesh
+    from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
     from sobolev_batch.surfaces.shapes.icosphere import icosphere
     from sobolev_batch.surfaces.shapes.interval import Interval
@@ -152,7 +152,7 @@ _MODULES = {
     "open_store": "results.opening",
     "proportion": "spectral.proportion",
     "proximity": "surfaces.shapes.proximity",
-    "read_mesh": "surfaces.readers",
+    "read_mesh": "surfaces.formats.readers",
     "release": "batch.release",
     "run": "batch.run",
     "spectrum": "spectral.bands",

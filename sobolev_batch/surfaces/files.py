@@ -13,9 +13,9 @@ from typing import Annotated
 from pydantic import Field
 
 from sobolev_batch.errors import StudyError
+from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.globs import expand
 from sobolev_batch.surfaces.names import flaw, folded, shown, twins
-from sobolev_batch.surfaces.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources import Fingerprint, Member, Size, Source, at_most, file_digest
 

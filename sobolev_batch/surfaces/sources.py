@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import MeshError, StudyError
-from sobolev_batch.surfaces.contents import bounded_length, open_regular
+from sobolev_batch.surfaces.formats.contents import bounded_length, open_regular
 from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.shapes.similarity import Surface
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import MeshError, read_mesh
-from sobolev_batch.surfaces.readers import expected_size
+from sobolev_batch.surfaces.formats.readers import expected_size
 from tests.surfaces.formats import BOXES, LITTLE, Content, ply
 from tests.surfaces.shapes import BOX_MIXED, BOX_VERTICES
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.polygons import fans_of_lists
+from sobolev_batch.surfaces.formats.polygons import fans_of_lists
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 

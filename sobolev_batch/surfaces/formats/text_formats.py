@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.polygons import fans
+from sobolev_batch.surfaces.formats.polygons import fans
 
 Raw = tuple[NDArray[np.float64], NDArray[np.int64]]
 

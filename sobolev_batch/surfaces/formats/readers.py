@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.contents import bounded_length, is_gzipped, open_regular, read_bytes, unpacked_limit
-from sobolev_batch.surfaces.gifti import parse_gifti
-from sobolev_batch.surfaces.gltf import buffer_paths, parse_gltf
-from sobolev_batch.surfaces.ply import HEADER_BYTES, announced_sizes, parse_ply
+from sobolev_batch.surfaces.formats.contents import bounded_length, is_gzipped, open_regular, read_bytes, unpacked_limit
+from sobolev_batch.surfaces.formats.gifti import parse_gifti
+from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
+from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply
+from sobolev_batch.surfaces.formats.stl import parse_stl
+from sobolev_batch.surfaces.formats.text_formats import parse_obj, parse_off
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.stl import parse_stl
-from sobolev_batch.surfaces.text_formats import parse_obj, parse_off
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
 
