@@ -23,7 +23,7 @@ from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.pursuit import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
-from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from sobolev_batch.spectral.witness import Evaluation
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.proximity import proximity
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.precision import item_bytes
 from sobolev_batch.spectral.transform import Transform, memory_bytes
-from sobolev_batch.surfaces.sources import Size
+from sobolev_batch.surfaces.sources.registry import Size
 
 # Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
 # cluster, so that the same sums are formed on any; smaller ones only where memory is short. The

@@ -17,11 +17,11 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
 from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
-from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
-from sobolev_batch.surfaces.sources import Member, sole_member
+from sobolev_batch.surfaces.sources.names import shown
+from sobolev_batch.surfaces.sources.registry import Member, sole_member
 
 _log = logging.getLogger(__name__)
 

@@ -22,10 +22,10 @@ from sobolev_batch.spectral.quadrature import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.surfaces.formats.contents import open_regular
-from sobolev_batch.surfaces.names import flaw, folded, shown, twins
 from sobolev_batch.surfaces.shapes.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.sources import Source, at_most, parse_source
+from sobolev_batch.surfaces.sources.names import flaw, folded, shown, twins
+from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_source
 
 REFERENCE_LABEL = "reference"
 

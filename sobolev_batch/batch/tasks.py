@@ -29,7 +29,7 @@ from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
-from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from sobolev_batch.results.tables import finished_group
 from sobolev_batch.results.vertex_fields import SUFFIXES, VertexField
 from sobolev_batch.results.witnesses import witness_at_vertices
 from sobolev_batch.spectral.shells import check_orders
-from sobolev_batch.surfaces.names import file_stem
+from sobolev_batch.surfaces.sources.names import file_stem
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from sobolev_batch.results.portraits import PICTURES, Axis, Portrait, make_galle
 from sobolev_batch.results.rendering import Pictures, render, scales
 from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
-from sobolev_batch.surfaces.names import file_stem
+from sobolev_batch.surfaces.sources.names import file_stem
 
 # P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
 COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#777777")

@@ -17,7 +17,7 @@ from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.tables import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sources.registry import Member
 
 
 @dataclass(frozen=True)

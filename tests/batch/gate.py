@@ -9,8 +9,8 @@ from pathlib import Path
 
 from sobolev_batch.batch import tasks
 from sobolev_batch.batch.tasks import Job
-from sobolev_batch.surfaces.files import FileMember
 from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.sources.files import FileMember
 
 # Dask may load this twice.
 _LOAD = vars(tasks).setdefault("_load_surface_without_gate", tasks.load_surface)

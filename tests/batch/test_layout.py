@@ -11,7 +11,7 @@ from sobolev_batch.spectral.backends import CPU_COSTS
 from sobolev_batch.spectral.division import Load, divide
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform import Transform, memory_bytes
-from sobolev_batch.surfaces.sources import Size
+from sobolev_batch.surfaces.sources.registry import Size
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
 LARGE = Lattice(5.0, 512).split(1 << 24)

@@ -19,7 +19,7 @@ from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.surfaces.sources import Fingerprint, Member
+from sobolev_batch.surfaces.sources.registry import Fingerprint, Member
 from tests.batch.conftest import small_table
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from sobolev_batch import Study, StudyError
 from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.names import flaw, folded, shown
+from sobolev_batch.surfaces.sources.names import flaw, folded, shown
 from tests.batch.conftest import small_table
 from tests.batch.test_study import changed
 from tests.surfaces.formats import off
@@ -148,7 +148,7 @@ def test_no_family_is_called_reference(name: str) -> None:
     [
         "os:system",
         "os.system",
-        "sobolev_batch.surfaces.files:Files",
+        "sobolev_batch.surfaces.sources.files:Files",
         "__import__('os')",
         "../files",
         "files\n",

@@ -15,9 +15,9 @@ from sobolev_batch import Lattice, Mesh, Similarity, Sphere, icosphere
 from sobolev_batch.spectral.budget import support_widths
 from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.surfaces.decimation import DecimatedMember
-from sobolev_batch.surfaces.files import Files
 from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.sources.decimation import DecimatedMember
+from sobolev_batch.surfaces.sources.files import Files
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

@@ -19,8 +19,8 @@ from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
-from sobolev_batch.surfaces.files import Files
 from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.sources.files import Files
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

@@ -91,7 +91,7 @@ def test_the_fingerprint_of_a_reduction_is_that_of_the_original_and_the_count(
     table = {"source": "decimate", "mesh": {"source": "files", "paths": ["box.off"]}, "triangles": [4, 8]}
     assert dict(members(table, tmp_path)[1].fingerprint()) == of("box.off", 8)
     before = of("box.off", 8)
-    monkeypatch.setattr("sobolev_batch.surfaces.decimation.installed_version", lambda name: "99")
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.decimation.installed_version", lambda name: "99")
     assert of("box.off", 8) != before
 
 

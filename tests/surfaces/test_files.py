@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import MeshError, StudyError
-from sobolev_batch.surfaces.sources import file_digest
+from sobolev_batch.surfaces.sources.registry import file_digest
 from tests.surfaces.formats import box_scene, off
 from tests.surfaces.listing import listed, loaded, members
 from tests.surfaces.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import Ellipsoid, Torus
-from sobolev_batch.surfaces.sources import Size
+from sobolev_batch.surfaces.sources.registry import Size
 from tests.surfaces.listing import listed, loaded, members
 
 EGG: dict[str, Any] = {"source": "ellipsoid", "axes": [3, 2, 1], "center": [0.0, 0.5, 0.0]}

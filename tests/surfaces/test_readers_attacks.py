@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import MeshError, read_mesh
-from sobolev_batch.surfaces.files import FileMember
 from sobolev_batch.surfaces.formats.readers import expected_size
+from sobolev_batch.surfaces.sources.files import FileMember
 from tests.surfaces.attacks import ATTACKS
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")

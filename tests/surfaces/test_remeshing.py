@@ -37,7 +37,7 @@ def test_the_fingerprint_of_a_remeshing_names_its_library(monkeypatch: pytest.Mo
     (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
     before = dict(member.fingerprint())
     assert before["triangles"] == 80
-    monkeypatch.setattr("sobolev_batch.surfaces.remeshing.installed_version", lambda name: f"{name} 99")
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.remeshing.installed_version", lambda name: f"{name} 99")
     assert "pyacvd 99" in dict(member.fingerprint()).values()
 
 
@@ -54,7 +54,7 @@ def test_planning_a_remeshing_without_its_library_says_what_to_install(monkeypat
             raise PackageNotFoundError(distribution)
         return "1.0"
 
-    monkeypatch.setattr("sobolev_batch.surfaces.sources.version", version)
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.version", version)
     (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
     with pytest.raises(MeshError, match=re.escape("pip install 'sobolev-batch[studies]'")):
         member.fingerprint()

@@ -13,8 +13,8 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import MeshError, Sphere, StudyError, icosphere
-from sobolev_batch.surfaces import sources
-from sobolev_batch.surfaces.sources import Member, Source, parse_source, sole_member
+from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, sole_member
+from sobolev_batch.surfaces.sources.registry import registry as sources
 from tests.surfaces.formats import off
 from tests.surfaces.listing import BALL, listed, loaded, members
 from tests.surfaces.shapes import BOX_TRIANGLES, BOX_VERTICES
@@ -293,7 +293,7 @@ def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
 def test_the_fingerprint_of_a_generated_mesh_names_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
     (member,) = members(BALL)
     before = dict(member.fingerprint())
-    monkeypatch.setattr("sobolev_batch.surfaces.generated.installed_version", lambda name: f"{name} 99")
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.generated.installed_version", lambda name: f"{name} 99")
     assert "trimesh 99" in dict(member.fingerprint()).values()
     assert member.fingerprint() != before
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh, MeshError, icosphere
-from sobolev_batch.surfaces.sources import Member
+from sobolev_batch.surfaces.sources.registry import Member
 from tests.surfaces.formats import off
 from tests.surfaces.listing import BALL, connectivity, listed, loaded, members
 

@@ -10,7 +10,7 @@ from glob import has_magic
 from pathlib import Path
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.names import shown
+from sobolev_batch.surfaces.sources.names import shown
 
 
 def expand(folder: Path, pattern: str) -> list[Path]:

@@ -9,10 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.decimation import TriangleCounts, reduced_size, whole_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, installed_version, sole_member
+from sobolev_batch.surfaces.sources.decimation import TriangleCounts, reduced_size, whole_mesh
+from sobolev_batch.surfaces.sources.registry import (
+    Fingerprint,
+    Member,
+    NestedSource,
+    Size,
+    installed_version,
+    sole_member,
+)
 
 # Clustering needs several input vertices for each output vertex to make even cells; pyacvd's own
 # advice is to subdivide until there are.

@@ -22,8 +22,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, fie
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.contents import bounded_length, open_regular
-from sobolev_batch.surfaces.names import shown
 from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.sources.names import shown
 
 # Of levels, or of triangle counts of one mesh.
 MOST_ENTRIES = 1000

@@ -10,11 +10,11 @@ from pydantic import SerializeAsAny, field_validator
 from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.decimation import reduced_size
-from sobolev_batch.surfaces.generated import Levels
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
-from sobolev_batch.surfaces.sources import Fingerprint, Member, NestedSource, Size, Source, sole_member
+from sobolev_batch.surfaces.sources.decimation import reduced_size
+from sobolev_batch.surfaces.sources.generated import Levels
+from sobolev_batch.surfaces.sources.registry import Fingerprint, Member, NestedSource, Size, Source, sole_member
 
 
 class SphericalLevels(NestedSource):

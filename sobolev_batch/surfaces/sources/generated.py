@@ -19,7 +19,15 @@ from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.torus import MOST_TRIANGLES, Torus
-from sobolev_batch.surfaces.sources import MOST_ENTRIES, Fingerprint, Member, Size, Source, at_most, installed_version
+from sobolev_batch.surfaces.sources.registry import (
+    MOST_ENTRIES,
+    Fingerprint,
+    Member,
+    Size,
+    Source,
+    at_most,
+    installed_version,
+)
 
 # Measured peak of the subdivision, for each triangle that it makes.
 _MAKING_BYTES = 140
