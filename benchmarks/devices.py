@@ -8,7 +8,7 @@ import sobolev_batch as sb
 from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import XI_MAX, settings_of_the_paper
-from sobolev_batch.spectral.backends import gpu_backend
+from sobolev_batch.spectral.backends.backends import gpu_backend
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.transform import Transform, transform_block
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 from sobolev_batch.errors import BackendError
-from sobolev_batch.spectral.cuda import INSTALL
+from sobolev_batch.spectral.backends.cuda import INSTALL
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 # What this process has: one device at most, since CUDA settles on what it sees at its start.

@@ -14,7 +14,7 @@ from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember, spare_bytes
 from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
 from sobolev_batch.batch.versions import guarded, require_same_versions
 from sobolev_batch.errors import BackendError, ClusterError
-from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
+from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
 
 _log = logging.getLogger(__name__)
 

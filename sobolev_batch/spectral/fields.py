@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.backends import CPU, Backend, backend_named
+from sobolev_batch.spectral.backends.backends import CPU, Backend, backend_named
 from sobolev_batch.spectral.forecast import Goal, settle
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.precision import Complexes, Precision

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.arrays import Array, combine
-from sobolev_batch.spectral.backends import CPU, Backend, Plan, evaluation_plan
+from sobolev_batch.spectral.backends.arrays import Array, combine
+from sobolev_batch.spectral.backends.backends import CPU, Backend, Plan, evaluation_plan
+from sobolev_batch.spectral.backends.phases import cosine_and_sine
 from sobolev_batch.spectral.division import Division, Shape, fastest_oversampling, parts
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.phases import cosine_and_sine
 from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.quadrature import WeightedPoints
 

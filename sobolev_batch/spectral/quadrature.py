@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.arrays import Array, combine
-from sobolev_batch.spectral.backends import CPU, Backend
+from sobolev_batch.spectral.backends.arrays import Array, combine
+from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.resolution import resolve
 from sobolev_batch.spectral.rules import (
     HIGHEST_DEGREE,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.backends.phases import cosine_and_sine
 from sobolev_batch.spectral.budget import DIRECTIONS
-from sobolev_batch.spectral.phases import cosine_and_sine
 from sobolev_batch.surfaces.shapes.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 
 Reals = NDArray[np.float64]

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sobolev_batch.spectral.arrays import Array, sums_of_runs
+from sobolev_batch.spectral.backends.arrays import Array, sums_of_runs
 
 # An edge and its triangle are sorted as one integer: twice the bits of a vertex and those of a triangle.
 _BITS = 63

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.backends import CPU, Backend, Gpu
+from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
 from sobolev_batch.spectral.division import Costs, Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import transform_points

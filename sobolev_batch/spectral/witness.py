@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends import CPU
+from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.division import Division, Load, divide
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import evaluate_at

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral import backends, cuda
-from sobolev_batch.spectral.arrays import combine, sums_of_runs
-from sobolev_batch.spectral.backends import CPU, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral.backends import backends, cuda
+from sobolev_batch.spectral.backends.arrays import combine, sums_of_runs
+from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.forecast import Goal
 from sobolev_batch.spectral.lattice import Block
@@ -413,7 +413,7 @@ def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cu
     code = """
 import sys
 from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends import gpu_backend
+from sobolev_batch.spectral.backends.backends import gpu_backend
 try:
     print("found", gpu_backend().description)
 except BackendError as error:
@@ -428,8 +428,8 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     code = """
-from sobolev_batch.spectral import cuda
-from sobolev_batch.spectral.backends import GPU_COSTS, Gpu
+from sobolev_batch.spectral.backends import cuda
+from sobolev_batch.spectral.backends.backends import GPU_COSTS, Gpu
 cuda._require_device = lambda cupy: None
 backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
 try:
@@ -447,7 +447,7 @@ def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     code = """
 from sobolev_batch import BackendError
-from sobolev_batch.spectral import cuda
+from sobolev_batch.spectral.backends import cuda
 try:
     cuda.load()
 except BackendError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sobolev_batch.spectral.phases import cosine_and_sine
+from sobolev_batch.spectral.backends.phases import cosine_and_sine
 
 
 def test_both_are_as_good_as_the_library_functions() -> None:

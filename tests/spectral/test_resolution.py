@@ -26,7 +26,7 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral import quadrature, resolution
-from sobolev_batch.spectral.backends import CPU
+from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.budget import DIRECTIONS
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.resolution import Resolution, direct_transform, exact_values, resolve

@@ -15,8 +15,8 @@ import finufft
 import numpy as np
 
 from sobolev_batch.errors import BackendError, InputError
-from sobolev_batch.spectral import cuda
-from sobolev_batch.spectral.arrays import Array
+from sobolev_batch.spectral.backends import cuda
+from sobolev_batch.spectral.backends.arrays import Array
 from sobolev_batch.spectral.division import Costs, Shape
 from sobolev_batch.spectral.precision import Precision
 

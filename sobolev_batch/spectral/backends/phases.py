@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sobolev_batch.spectral.arrays import Array
+from sobolev_batch.spectral.backends.arrays import Array
 
 
 def cosine_and_sine(phases: Array) -> tuple[Array, Array]:
