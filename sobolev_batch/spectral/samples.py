@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.exact.spheres import sphere_transform
+from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes
 from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, even_probe, join, measure
 from sobolev_batch.spectral.resolution import exact_values, resolve
-from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform
-from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform
-from sobolev_batch.spectral.spheres import sphere_inner_product
+from sobolev_batch.spectral.exact.spheres import sphere_inner_product
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from tests.coverage.matern import (
     Sides,

@@ -9,9 +9,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
+from sobolev_batch.spectral.exact.spheres import sphere_transform
+from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.interpolation import full_lattice, interpolate
-from sobolev_batch.spectral.spheres import sphere_transform
-from sobolev_batch.spectral.triangles import exact_transform
 
 Reals = NDArray[np.float64]
 

@@ -28,9 +28,9 @@ from sobolev_batch import (
 from sobolev_batch.spectral import quadrature, resolution
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.budget import DIRECTIONS
+from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.resolution import Resolution, direct_transform, exact_values, resolve
-from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.spectral.fake_device import Device

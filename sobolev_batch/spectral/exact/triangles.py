@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral import compensated
 from sobolev_batch.spectral.backends.phases import cosine_and_sine
+from sobolev_batch.spectral.exact import compensated
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]
