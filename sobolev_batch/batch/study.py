@@ -18,7 +18,7 @@ from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.precision import Precision
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform import Transform
 from sobolev_batch.surfaces.formats.contents import open_regular

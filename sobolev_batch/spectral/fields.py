@@ -15,7 +15,7 @@ from sobolev_batch.spectral.forecast import Goal, settle
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.probe import measure
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.shells import check_orders

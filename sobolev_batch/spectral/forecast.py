@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.quadrature import choose_rules
-from sobolev_batch.spectral.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
+from sobolev_batch.spectral.quadrature.meshes import choose_rules
+from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
 from sobolev_batch.spectral.transform import COARSEST_EPS, FINEST_EPS, Transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface

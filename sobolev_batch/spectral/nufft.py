@@ -13,7 +13,7 @@ from sobolev_batch.spectral.backends.phases import cosine_and_sine
 from sobolev_batch.spectral.division import Division, Shape, fastest_oversampling, parts
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes, Precision
-from sobolev_batch.spectral.quadrature import WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 
 
 def transform_points(

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Study, icosphere, open_store, run
 from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.spectral.rules import gauss_rule
+from sobolev_batch.spectral.quadrature.rules import gauss_rule
 from tests.batch.conftest import variable
 
 CORTEX = Study.from_toml(Path(__file__).parents[2] / "workflows" / "cortex.toml")

@@ -175,7 +175,7 @@ def test_a_reference_of_one_s_own(threads: Client, store_path: Path) -> None:
 def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sobolev_batch.spectral.resolution.MOST_NODES", 1 << 14)
+    monkeypatch.setattr("sobolev_batch.spectral.quadrature.smooth.MOST_NODES", 1 << 14)
     side = Interval(-0.9, 1.0)
     rough = ParametrisedSurface(roof, side, side, roof_derivatives)
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]

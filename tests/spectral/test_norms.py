@@ -19,7 +19,7 @@ from sobolev_batch import (
     inner_product,
     norm,
 )
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import shell_sums, shell_weights
 from tests.spectral.test_quadrature import BOX
 

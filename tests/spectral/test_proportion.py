@@ -13,7 +13,7 @@ from scipy.integrate import quad
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, proportion
 from sobolev_batch.spectral import operands
 from sobolev_batch.spectral.exact.spheres import sphere_inner_product
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from tests.spectral.test_norms import full_lattice_norm
 from tests.spectral.test_quadrature import BOX
 

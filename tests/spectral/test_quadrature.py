@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Mesh, icosphere
-from sobolev_batch.spectral.quadrature import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
 
 BOX = Mesh(
     np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.6, 0.6) for z in (-0.7, 0.7)]),

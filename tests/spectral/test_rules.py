@@ -9,7 +9,7 @@ import pytest
 
 from sobolev_batch import Mesh
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
+from sobolev_batch.spectral.quadrature.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
 
 
 def monomial_error(rule: TriangleRule, degree: int) -> float:

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, icosphere
-from sobolev_batch.spectral import shared_nodes
-from sobolev_batch.spectral.rules import TriangleRule, corner_rule, midpoint_rule
-from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
+from sobolev_batch.spectral.quadrature import shared_nodes
+from sobolev_batch.spectral.quadrature.rules import TriangleRule, corner_rule, midpoint_rule
+from sobolev_batch.spectral.quadrature.shared_nodes import merged_corners, merged_midpoints
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

@@ -16,7 +16,7 @@ from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Precision
-from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
 from sobolev_batch.surfaces.shapes.similarity import Similarity

@@ -25,7 +25,7 @@ from sobolev_batch import (
 from sobolev_batch.spectral.division import Division
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.nufft import evaluate_at, transform_points
-from sobolev_batch.spectral.quadrature import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.arrays import Array, combine
 from sobolev_batch.spectral.backends.backends import CPU, Backend
-from sobolev_batch.spectral.resolution import resolve
-from sobolev_batch.spectral.rules import (
+from sobolev_batch.spectral.quadrature.rules import (
     HIGHEST_DEGREE,
     TriangleRule,
     corner_rule,
@@ -23,7 +22,8 @@ from sobolev_batch.spectral.rules import (
     reaches,
     symmetric_rule,
 )
-from sobolev_batch.spectral.shared_nodes import merged_corners, merged_midpoints
+from sobolev_batch.spectral.quadrature.shared_nodes import merged_corners, merged_midpoints
+from sobolev_batch.spectral.quadrature.smooth import resolve
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 
