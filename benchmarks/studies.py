@@ -23,7 +23,7 @@ from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.spectral.shells import shell_weights
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 
 _WORKERS = 2
 _OVERHEAD = at_most(1.15)

@@ -16,7 +16,7 @@ from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.forecast import Goal, settle
 from sobolev_batch.spectral.precision import Precision
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 
 ORDER = -10.0
 XI_MAX = 5.0

@@ -12,7 +12,7 @@ from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.precision import item_bytes
-from sobolev_batch.spectral.transform import Transform, memory_bytes
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes
 from sobolev_batch.surfaces.sources.registry import Size
 
 # Meshes above one and a half times this are cut into parts of about this many triangles, whatever the

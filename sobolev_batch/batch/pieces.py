@@ -24,7 +24,7 @@ from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.probe import Draws, Probe, measure
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import draws_for
-from sobolev_batch.spectral.transform import Transform, require_inside, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Complexes = NDArray[np.complexfloating[Any, Any]]

@@ -16,7 +16,7 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.samples import Sample, draws_for
-from sobolev_batch.spectral.transform import NUMERICS_VERSION, Transform, require_inside
+from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, Transform, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere

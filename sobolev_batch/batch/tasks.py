@@ -25,7 +25,7 @@ from sobolev_batch.spectral.probe import join
 from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import probe_block
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere

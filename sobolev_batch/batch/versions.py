@@ -110,7 +110,7 @@ def _asker(needed: Sequence[str] = ()) -> Callable[[], Versions]:
         numerics = schema = ""
         try:
             from sobolev_batch.batch.documents import SCHEMA_VERSION
-            from sobolev_batch.spectral.transform import NUMERICS_VERSION
+            from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION
 
             numerics, schema = str(NUMERICS_VERSION), str(SCHEMA_VERSION)
         except ImportError:

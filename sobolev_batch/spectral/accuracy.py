@@ -22,7 +22,7 @@ from sobolev_batch.spectral.budget import (
     truncated,
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
-from sobolev_batch.spectral.transform import FINEST_EPS, Transform, memory_bytes
+from sobolev_batch.spectral.transform.transform import FINEST_EPS, Transform, memory_bytes
 
 Reals = NDArray[np.float64]
 

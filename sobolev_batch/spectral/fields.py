@@ -19,7 +19,7 @@ from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.shells import check_orders
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 

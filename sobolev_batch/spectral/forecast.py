@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
-from sobolev_batch.spectral.transform import COARSEST_EPS, FINEST_EPS, Transform
+from sobolev_batch.spectral.transform.transform import COARSEST_EPS, FINEST_EPS, Transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth

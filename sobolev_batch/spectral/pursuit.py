@@ -19,7 +19,7 @@ from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.shells import shell_sums
-from sobolev_batch.spectral.transform import Transform
+from sobolev_batch.spectral.transform.transform import Transform
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 

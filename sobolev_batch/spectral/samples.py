@@ -14,7 +14,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.precision import Complexes
 from sobolev_batch.spectral.probe import Draws, Probe, draw, draw_count, even_probe, join, measure
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolve
-from sobolev_batch.spectral.transform import Transform
+from sobolev_batch.spectral.transform.transform import Transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth

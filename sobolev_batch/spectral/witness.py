@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.division import Division, Load, divide
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.nufft import evaluate_at
 from sobolev_batch.spectral.operands import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
 from sobolev_batch.spectral.precision import Precision, item_bytes
 from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
-from sobolev_batch.spectral.transform import DEFAULT_BATCH, Transform, require_points_inside
+from sobolev_batch.spectral.transform.memory import Division, Load, divide
+from sobolev_batch.spectral.transform.nufft import evaluate_at
+from sobolev_batch.spectral.transform.transform import DEFAULT_BATCH, Transform, require_points_inside
 
 # Of a given memory, what blocks of fields may take; the rest is for the NUFFT.
 _SHARE_OF_BLOCKS = 0.25

@@ -8,9 +8,9 @@ from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.crew import Crew, CrewMember
 from sobolev_batch.batch.layout import lay_out
 from sobolev_batch.spectral.backends.backends import CPU_COSTS
-from sobolev_batch.spectral.division import Load, divide
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform import Transform, memory_bytes
+from sobolev_batch.spectral.transform.memory import Load, divide
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes
 from sobolev_batch.surfaces.sources.registry import Size
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)

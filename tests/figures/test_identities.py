@@ -11,8 +11,8 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch.batch.plan import members_of
 from sobolev_batch.spectral.lattice import AXES
-from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.transform.nufft import transform_points
 
 WORKFLOW = Path(__file__).parents[2] / "workflows/cortex.toml"
 LATTICE = sb.Lattice(5.0, 32)

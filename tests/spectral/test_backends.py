@@ -24,7 +24,7 @@ from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform import Transform, Transformed, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, Transformed, transform_block
 from tests.spectral.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 from tests.test_structure import PACKAGE, imported
 

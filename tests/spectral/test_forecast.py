@@ -11,7 +11,7 @@ import trimesh
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.forecast import Census, Goal, loosest_tolerance, permits_single, settle
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from tests.spectral.test_quadrature import BOX
 
 LATTICE = Lattice(3.0, 32)

@@ -32,7 +32,7 @@ from sobolev_batch.spectral.quadrature import meshes as quadrature
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolve
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.spectral.fake_device import Device
 from tests.spectral.smooth_oracles import ellipsoid_value_along_c, spheroid_value, torus_value

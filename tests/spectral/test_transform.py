@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
+from sobolev_batch.spectral.transform.nufft import transform_points
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.files import Files
 from tests.spectral.test_quadrature import BOX
@@ -150,7 +150,7 @@ def memory_of_a_transform(intervals: int, memory: float | None) -> str:
     code = f"""
 import resource, sys
 import sobolev_batch as sb
-from sobolev_batch.spectral.transform import Transform, memory_bytes, transform_block
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block
 
 mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), Transform()
 mesh.areas, mesh.centroid_radii, mesh.bounds

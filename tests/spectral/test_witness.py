@@ -22,10 +22,10 @@ from sobolev_batch import (
     icosphere,
     witness,
 )
-from sobolev_batch.spectral.division import Division
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.nufft import evaluate_at, transform_points
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.transform.memory import Division
+from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.spectral.test_quadrature import BOX
 
 Reals = NDArray[np.float64]

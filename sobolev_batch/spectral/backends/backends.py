@@ -17,8 +17,8 @@ import numpy as np
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.arrays import Array
-from sobolev_batch.spectral.division import Costs, Shape
 from sobolev_batch.spectral.precision import Precision
+from sobolev_batch.spectral.transform.memory import Costs, Shape
 
 _log = logging.getLogger(__name__)
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
-from sobolev_batch.spectral.division import Costs, Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.transform.memory import Costs, Division, Load, divide, transform_bytes
+from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
