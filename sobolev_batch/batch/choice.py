@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.study import Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.accuracy import Accuracy, lattice_of
-from sobolev_batch.spectral.budget import Assessed, support_widths
+from sobolev_batch.spectral.errors.budget import Assessed, support_widths
+from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.precision import Precision
-from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.pursuit import Pilot, pilot_of, reach_of
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 

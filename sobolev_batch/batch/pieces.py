@@ -19,11 +19,11 @@ from sobolev_batch.batch.equipment import backend_of
 from sobolev_batch.batch.records import Facts
 from sobolev_batch.batch.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
 from sobolev_batch.errors import MeshError, StoreError
+from sobolev_batch.spectral.errors.probe import Draws, Probe, measure
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.errors.samples import draws_for
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.probe import Draws, Probe, measure
-from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.samples import draws_for
 from sobolev_batch.spectral.transform.transform import Transform, require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 

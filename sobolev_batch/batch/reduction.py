@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store import Store
-from sobolev_batch.spectral.budget import Assessed, Sums, add_sums, assess, sums_of_shells
+from sobolev_batch.spectral.errors.budget import Assessed, Sums, add_sums, assess, sums_of_shells
 from sobolev_batch.spectral.gram import Arrangement, differences
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.proportion import Proportion

@@ -32,7 +32,7 @@ from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.tabulation import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verification import damaged_rows
 from sobolev_batch.errors import DamageError
-from sobolev_batch.spectral.budget import Assessed
+from sobolev_batch.spectral.errors.budget import Assessed
 
 _log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import betainc
 
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.spectral.budget import (
+from sobolev_batch.spectral.errors.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,
     Assessed,

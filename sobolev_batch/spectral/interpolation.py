@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.budget import AXIS_DIRECTIONS
+from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.operands import field_of, quality_of, triples_of
 

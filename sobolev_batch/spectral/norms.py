@@ -15,7 +15,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.accuracy import Accuracy
-from sobolev_batch.spectral.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.operands import (

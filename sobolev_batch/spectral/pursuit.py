@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, larger_pilot, refined
-from sobolev_batch.spectral.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
+from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
-from sobolev_batch.spectral.forecast import Goal, permits_single
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.precision import Precision
-from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform.transform import Transform
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface

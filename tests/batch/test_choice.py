@@ -19,7 +19,7 @@ from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.store import stored_choice
 from sobolev_batch.results.tables import format_table
 from sobolev_batch.spectral.accuracy import Accuracy
-from sobolev_batch.spectral.budget import Assessed
+from sobolev_batch.spectral.errors.budget import Assessed
 from sobolev_batch.spectral.pursuit import pilot_of
 from tests.batch.conftest import small_table, variable
 

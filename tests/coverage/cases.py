@@ -12,9 +12,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Sphere, icosphere
-from sobolev_batch.spectral.budget import support_widths
-from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.errors.budget import support_widths
+from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources.decimation import DecimatedMember
 from sobolev_batch.surfaces.sources.files import Files

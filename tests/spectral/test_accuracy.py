@@ -20,9 +20,9 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, good_intervals
-from sobolev_batch.spectral.budget import support_widths
-from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.errors.budget import support_widths
+from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.errors.quality import Quality
 from tests.spectral.test_quadrature import BOX
 
 

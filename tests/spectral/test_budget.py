@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.budget import Sums, truncated
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.errors.budget import Sums, truncated
+from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from tests.spectral.test_quadrature import BOX
 

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
+from sobolev_batch.spectral.errors.a_priori import Census, Goal, loosest_tolerance, permits_single, settle
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.forecast import Census, Goal, loosest_tolerance, permits_single, settle
 from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from tests.spectral.test_quadrature import BOX
 

@@ -26,12 +26,12 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.budget import DIRECTIONS
+from sobolev_batch.spectral.errors.budget import DIRECTIONS
+from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.quadrature import meshes as quadrature
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolve
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.spectral.fake_device import Device
