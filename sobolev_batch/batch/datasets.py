@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.plan import Row
 from sobolev_batch.batch.records import Facts, Record
-from sobolev_batch.spectral.accuracy import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.convergence import observed_rates
 from sobolev_batch.spectral.errors.budget import Assessed
 from sobolev_batch.spectral.proportion import Proportion

@@ -12,10 +12,10 @@ from functools import cached_property
 from sobolev_batch.batch.choice import Choice, basis_of, choose
 from sobolev_batch.batch.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
+from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, Transform, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface

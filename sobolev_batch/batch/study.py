@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.spectral.accuracy import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature

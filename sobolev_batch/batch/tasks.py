@@ -18,13 +18,13 @@ from sobolev_batch.batch.records import Facts, Record, utc_now
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
+from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.a_priori import settle
 from sobolev_batch.spectral.errors.probe import join
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import probe_block
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.pursuit import Aim
 from sobolev_batch.spectral.transform.transform import Transform, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface

@@ -14,7 +14,8 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.accuracy import Accuracy
+from sobolev_batch.spectral.adaptive.solve import pursue
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
@@ -27,7 +28,6 @@ from sobolev_batch.spectral.operands import (
     read_blocks,
     shells_of,
 )
-from sobolev_batch.spectral.pursuit import pursue
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere

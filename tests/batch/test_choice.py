@@ -18,9 +18,9 @@ from sobolev_batch.batch.choice import Choice
 from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.store import stored_choice
 from sobolev_batch.results.tables import format_table
-from sobolev_batch.spectral.accuracy import Accuracy
+from sobolev_batch.spectral.adaptive.solve import pilot_of
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Assessed
-from sobolev_batch.spectral.pursuit import pilot_of
 from tests.batch.conftest import small_table, variable
 
 RTOL = 1e-3

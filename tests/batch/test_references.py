@@ -26,7 +26,7 @@ from sobolev_batch import (
 from sobolev_batch.batch import plan as plan_module
 from sobolev_batch.batch.cluster import thread_client
 from sobolev_batch.batch.plan import make_plan
-from sobolev_batch.spectral.pursuit import Aim
+from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.surfaces.sources.generated import SmoothMember
 from sobolev_batch.surfaces.sources.registry import Member
 from tests.batch.conftest import variable

@@ -19,7 +19,7 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
-from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, good_intervals
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, good_intervals
 from sobolev_batch.spectral.errors.budget import support_widths
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality

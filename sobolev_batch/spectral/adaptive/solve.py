@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.accuracy import Accuracy, first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, refined
 from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
 from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.errors.probe import Probe
