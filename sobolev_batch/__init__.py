@@ -50,12 +50,12 @@ if TYPE_CHECKING:
     from sobolev_batch.results.accessor import SobolevAccessor
     from sobolev_batch.results.export import write_witness
     from sobolev_batch.results.opening import open_store
-    from sobolev_batch.spectral.bands import spectrum
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
-    from sobolev_batch.spectral.norms import distance, inner_product, norm
-    from sobolev_batch.spectral.proportion import proportion
-    from sobolev_batch.spectral.witness import witness
+    from sobolev_batch.spectral.metrics.decomposition import proportion
+    from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
+    from sobolev_batch.spectral.metrics.spectrum import spectrum
+    from sobolev_batch.spectral.metrics.witness import witness
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
     from sobolev_batch.surfaces.shapes.icosphere import icosphere
@@ -144,21 +144,21 @@ _MODULES = {
     "Summary": "batch.run",
     "Torus": "surfaces.shapes.torus",
     "Verification": "batch.verification",
-    "distance": "spectral.norms",
+    "distance": "spectral.metrics.norms",
     "fourier_transform": "spectral.fields",
     "icosphere": "surfaces.shapes.icosphere",
-    "inner_product": "spectral.norms",
-    "norm": "spectral.norms",
+    "inner_product": "spectral.metrics.norms",
+    "norm": "spectral.metrics.norms",
     "open_store": "results.opening",
-    "proportion": "spectral.proportion",
+    "proportion": "spectral.metrics.decomposition",
     "proximity": "surfaces.shapes.proximity",
     "read_mesh": "surfaces.formats.readers",
     "release": "batch.release",
     "run": "batch.run",
-    "spectrum": "spectral.bands",
+    "spectrum": "spectral.metrics.spectrum",
     "submit": "batch.submission",
     "verify": "batch.verification",
-    "witness": "spectral.witness",
+    "witness": "spectral.metrics.witness",
     "write_witness": "results.export",
 }
 # What makes or opens fields registers their accessor `field.sobolev` with xarray, which would be too much

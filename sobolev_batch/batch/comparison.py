@@ -18,9 +18,9 @@ from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.metrics.witness import Evaluation
 from sobolev_batch.spectral.shells import shell_weights
 from sobolev_batch.spectral.transform.transform import Transform
-from sobolev_batch.spectral.witness import Evaluation
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.proximity import proximity
 from sobolev_batch.surfaces.shapes.similarity import Similarity

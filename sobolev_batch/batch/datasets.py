@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.plan import Row
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.convergence import observed_rates
 from sobolev_batch.spectral.errors.budget import Assessed
-from sobolev_batch.spectral.proportion import Proportion
+from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.spectral.metrics.rates import observed_rates
 
 Reals = NDArray[np.float64]
 

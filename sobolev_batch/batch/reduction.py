@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.store import Store
 from sobolev_batch.spectral.errors.budget import Assessed, Sums, add_sums, assess, sums_of_shells
-from sobolev_batch.spectral.gram import Arrangement, differences
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.proportion import Proportion
+from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import shell_sums
 
 Reals = NDArray[np.float64]

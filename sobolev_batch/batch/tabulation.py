@@ -24,7 +24,7 @@ from sobolev_batch.batch.tables import Tables
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.proportion import Proportion
+from sobolev_batch.spectral.metrics.decomposition import Proportion
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made anew.
 TABLES_VERSION = 2

@@ -8,14 +8,14 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.bands import spectrum
-from sobolev_batch.spectral.interpolation import full_lattice, interpolate
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.norms import distance, inner_product, norm
-from sobolev_batch.spectral.operands import Operand, pair_of
-from sobolev_batch.spectral.proportion import proportion
+from sobolev_batch.spectral.metrics.decomposition import proportion
+from sobolev_batch.spectral.metrics.inputs import Operand, pair_of
+from sobolev_batch.spectral.metrics.interpolation import full_lattice, interpolate
+from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
+from sobolev_batch.spectral.metrics.spectrum import spectrum
+from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
-from sobolev_batch.spectral.witness import witness
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.results.tables import chosen_orders, finished_group
-from sobolev_batch.spectral.bands import spectrum
+from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 Reals = NDArray[np.float64]

@@ -363,7 +363,7 @@ def test_blocks_and_parts_of_the_lattice_add_up(
     ]
     comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity)
     # Here and not on a worker, so that each block is evaluated in parts.
-    monkeypatch.setattr("sobolev_batch.spectral.witness.BLOCK_SAMPLES", 300)
+    monkeypatch.setattr("sobolev_batch.spectral.metrics.witness.BLOCK_SAMPLES", 300)
     note = compare_by_witness(comparison, plan.lattice, plan.blocks, ORDERS, 1e8)
     assert note.status == "complete", note.reason
     assert_right(store_path, study)

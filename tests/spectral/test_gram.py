@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.errors.budget import Sums, add_sums, sums_of_shells
-from sobolev_batch.spectral.gram import Arrangement, differences
+from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.surfaces.shapes.similarity import Surface
 

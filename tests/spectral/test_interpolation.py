@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.interpolation import full_lattice, interpolate
+from sobolev_batch.spectral.metrics.interpolation import full_lattice, interpolate
 
 Reals = NDArray[np.float64]
 

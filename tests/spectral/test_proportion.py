@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, proportion
-from sobolev_batch.spectral import operands
 from sobolev_batch.spectral.exact.spheres import sphere_inner_product
+from sobolev_batch.spectral.metrics import inputs as operands
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from tests.spectral.test_norms import full_lattice_norm
 from tests.spectral.test_quadrature import BOX
@@ -171,7 +171,7 @@ def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = proportion(a, b, ORDERS)
     read = operands.read_blocks
     monkeypatch.setattr(
-        "sobolev_batch.spectral.proportion.read_blocks",
+        "sobolev_batch.spectral.metrics.decomposition.read_blocks",
         lambda lattice, *fields: read(lattice, *fields, largest=200),
     )
     in_blocks = proportion(a, b, ORDERS)

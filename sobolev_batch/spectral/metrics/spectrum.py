@@ -9,7 +9,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.operands import Operand, field_of, pair_of, shells_of
+from sobolev_batch.spectral.metrics.inputs import Operand, field_of, pair_of, shells_of
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_volumes, shell_weights
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 

@@ -19,7 +19,7 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.operands import (
+from sobolev_batch.spectral.metrics.inputs import (
     check_surface,
     field_of,
     over_orders,

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.operands import Operand, over_orders, pair_of, read_blocks
+from sobolev_batch.spectral.metrics.inputs import Operand, over_orders, pair_of, read_blocks
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
 
 
