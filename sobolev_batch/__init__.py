@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sobolev_batch.batch.release import release
     from sobolev_batch.batch.run import Summary, run
-    from sobolev_batch.batch.study import Study
+    from sobolev_batch.batch.study.study import Study
     from sobolev_batch.batch.submission import Submission, submit
     from sobolev_batch.batch.verification import Verification, verify
     from sobolev_batch.errors import (
@@ -138,7 +138,7 @@ _MODULES = {
     "SobolevBatchError": "errors",
     "Sphere": "surfaces.shapes.sphere",
     "StoreError": "errors",
-    "Study": "batch.study",
+    "Study": "batch.study.study",
     "StudyError": "errors",
     "Submission": "batch.submission",
     "Summary": "batch.run",

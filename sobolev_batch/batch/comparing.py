@@ -20,10 +20,10 @@ from sobolev_batch.batch.dealing import deal, many_in_flight
 from sobolev_batch.batch.layout import LEAST_ROOM_BYTES, MESH_BYTES
 from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes, shortcomings
 from sobolev_batch.batch.outcomes import DEADLY, is_suspect
-from sobolev_batch.batch.plan import Plan, Row
 from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import StoreError

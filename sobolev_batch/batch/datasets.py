@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.plan import Row
 from sobolev_batch.batch.records import Facts, Record
+from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Assessed
 from sobolev_batch.spectral.metrics.decomposition import Proportion

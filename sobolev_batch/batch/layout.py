@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sobolev_batch.batch.crew import Crew
-from sobolev_batch.batch.plan import Plan, Row
+from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.precision import item_bytes

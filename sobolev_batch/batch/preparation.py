@@ -19,7 +19,6 @@ from sobolev_batch.batch.claim import CLAIM_KEYS
 from sobolev_batch.batch.documents import SCHEMA_VERSION
 from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.notes import KINDS, Notes
-from sobolev_batch.batch.plan import Plan
 from sobolev_batch.batch.store import (
     FIELD,
     LABELS,
@@ -29,6 +28,7 @@ from sobolev_batch.batch.store import (
     UNFINISHED,
     Store,
 )
+from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.batch.tables import Tables, table_encoding
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES

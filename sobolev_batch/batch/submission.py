@@ -17,12 +17,12 @@ from sobolev_batch.batch.claim import Claim, give_up, take
 from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.journal import Journal
 from sobolev_batch.batch.location import Location
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store, require_place
 from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.store import Store, stored_choice
-from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import ClusterError, StoreError
 
 _log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from distributed import Client, Future
 from sobolev_batch.batch.crew import GPU, MEMORY, Crew
 from sobolev_batch.batch.layout import Layout
 from sobolev_batch.batch.pieces import add_partials, cut_mesh, store_block, transform_piece
-from sobolev_batch.batch.study import Backends
+from sobolev_batch.batch.study.study import Backends
 from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 import xarray as xr
 
-from sobolev_batch.batch.study import REFERENCE_LABEL
+from sobolev_batch.batch.study.study import REFERENCE_LABEL
 from sobolev_batch.results.digits import Digits
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables import convergence_frame, finished_group, has_proximity

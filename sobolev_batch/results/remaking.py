@@ -11,8 +11,8 @@ from typing import Any, Self
 
 import xarray as xr
 
-from sobolev_batch.batch.plan import members_of
-from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.tables import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh

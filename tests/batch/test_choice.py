@@ -12,11 +12,11 @@ import trimesh
 from distributed import Client
 
 from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, distance, icosphere, open_store, run
-from sobolev_batch.batch import choice as choice_module
 from sobolev_batch.batch import run as run_module
-from sobolev_batch.batch.choice import Choice
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.store import stored_choice
+from sobolev_batch.batch.study import lattice_choice as choice_module
+from sobolev_batch.batch.study.lattice_choice import Choice
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables import format_table
 from sobolev_batch.spectral.adaptive.solve import pilot_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy

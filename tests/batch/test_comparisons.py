@@ -23,10 +23,10 @@ from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.crew import Crew, CrewMember
 from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.run import Summary
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.cli import cli, studies
 from sobolev_batch.results.status import Status
@@ -351,7 +351,7 @@ def test_blocks_and_parts_of_the_lattice_add_up(
 ) -> None:
     study = asking(proximity=None)
     # Fields of 40 kB in chunks of a few.
-    monkeypatch.setattr("sobolev_batch.batch.plan._LARGEST_CHUNK_BYTES", 16 << 10)
+    monkeypatch.setattr("sobolev_batch.batch.study.plan._LARGEST_CHUNK_BYTES", 16 << 10)
     sb.run(study, store_path, client)
     here, plan = Store.open(store_path), make_plan(study)
     assert len(plan.blocks) > 2

@@ -20,9 +20,9 @@ from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch import patience
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.location import Location
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table
 from tests.batch.failing_storage import GONE, HEALTHY, KINDS, FailingStorage, Kind, Rule, Turn, failing
 from tests.batch.object_storage import BUCKET, IMPATIENT, serving, taken_for_s3

@@ -26,11 +26,11 @@ from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, ru
 from sobolev_batch.batch.claim import CLAIM, Claim, take
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.location import Location
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.tables import Tables
 from tests.batch.conftest import small_table, variable
 from tests.batch.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3

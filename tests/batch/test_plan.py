@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import LatticeError, MeshError, Study, StudyError
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table
 
 

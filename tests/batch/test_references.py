@@ -23,9 +23,9 @@ from sobolev_batch import (
     open_store,
     run,
 )
-from sobolev_batch.batch import plan as plan_module
 from sobolev_batch.batch.cluster import thread_client
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study import plan as plan_module
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.surfaces.sources.generated import SmoothMember
 from sobolev_batch.surfaces.sources.registry import Member

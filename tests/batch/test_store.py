@@ -12,10 +12,10 @@ import pytest
 import zarr
 
 from sobolev_batch import StoreError, Study
-from sobolev_batch.batch.plan import Plan, make_plan
 from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.records import Facts, Record
 from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.batch.conftest import small_table
 
 

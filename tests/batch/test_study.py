@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel
 
 from sobolev_batch import Lattice, Study, StudyError
-from sobolev_batch.batch.study import _Document, _FamilyName, _FamilyReferenceSection
+from sobolev_batch.batch.study.study import _Document, _FamilyName, _FamilyReferenceSection
 from sobolev_batch.surfaces.sources.registry import Source
 from tests.batch.conftest import small_table
 from tests.test_readme import blocks

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import Study, StudyError
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.sources.names import flaw, folded, shown
 from tests.batch.conftest import small_table

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sobolev_batch import Study
-from sobolev_batch.batch.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store
+from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table
 
 KILLS = 60
@@ -31,7 +31,7 @@ import json, os, signal, sys
 from pathlib import Path
 import numpy as np
 from sobolev_batch import Study
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.records import Record
 from tests.batch.conftest import small_table
@@ -91,7 +91,7 @@ KILLED_LAYOUTS = """
 import json, os, signal, sys
 from pathlib import Path
 from sobolev_batch import Study
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.preparation import prepare_store
 from tests.batch.conftest import small_table
 

@@ -28,7 +28,7 @@ def test_workers_and_threads(study: Study, finished_store: Path, tmp_path: Path)
 TWICE = """
 import os, sys
 from sobolev_batch import Study
-from sobolev_batch.batch.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.run import rows_of
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.tasks import Job, compute_mesh

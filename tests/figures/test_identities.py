@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.batch.plan import members_of
+from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points

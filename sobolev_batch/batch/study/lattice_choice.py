@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.study import Study
+from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, lattice_of

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from sobolev_batch.batch.choice import Choice, basis_of, choose
-from sobolev_batch.batch.study import REFERENCE_LABEL, FamilyReference, Study
+from sobolev_batch.batch.study.lattice_choice import Choice, basis_of, choose
+from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
