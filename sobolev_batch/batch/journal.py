@@ -9,8 +9,8 @@ from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Self
 
-from sobolev_batch.batch.claim import Claim, this_process
 from sobolev_batch.batch.records import RunRecord, RunState, utc_now
+from sobolev_batch.batch.storage.lock import Claim, this_process
 from sobolev_batch.batch.store import Store
 from sobolev_batch.errors import ClaimError, StoreError
 

@@ -15,10 +15,10 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.claim import CLAIM_KEYS
 from sobolev_batch.batch.documents import SCHEMA_VERSION
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.notes import KINDS, Notes
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import CLAIM_KEYS
 from sobolev_batch.batch.store import (
     FIELD,
     LABELS,

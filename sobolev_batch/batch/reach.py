@@ -8,8 +8,8 @@ import uuid
 
 from distributed import Client
 
-from sobolev_batch.batch.claim import Claim
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Claim
 from sobolev_batch.errors import StoreError
 
 _log = logging.getLogger(__name__)

@@ -12,18 +12,18 @@ from typing import Self, TypeVar
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.claim import Claim, claimed
 from sobolev_batch.batch.cluster import local_client, thread_client
 from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.computing import compute_fields
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.equipment import enlist, worry_about
 from sobolev_batch.batch.journal import Journal
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.preparation import prepare_store, require_place
 from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Claim, claimed
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan

@@ -12,8 +12,8 @@ from sobolev_batch.batch.cluster import available_cores, remote_client
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.layout import lay_out_rows
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.run import Summary, run
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study

@@ -9,7 +9,7 @@ from typing import Self
 
 import xarray as xr
 
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.remaking import Remaker, require_known

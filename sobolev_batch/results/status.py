@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sobolev_batch.batch.journal import PATIENCE_SECONDS
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.notes import KINDS, Notes, shortcomings
 from sobolev_batch.batch.records import RunRecord, age_seconds
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.tables import Tables
 

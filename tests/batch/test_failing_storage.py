@@ -17,10 +17,10 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch import patience
 from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.preparation import prepare_store
+from sobolev_batch.batch.storage import remote as patience
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import StoreError
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import Store
 
 

@@ -23,12 +23,12 @@ from distributed import Client
 from zarr.storage import FsspecStore
 
 from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
-from sobolev_batch.batch.claim import CLAIM, Claim, take
 from sobolev_batch.batch.cluster import local_client, thread_client
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import CLAIM, Claim, take
 from sobolev_batch.batch.store import Store
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.tables import Tables

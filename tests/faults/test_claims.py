@@ -15,9 +15,9 @@ from threading import Barrier
 import pytest
 
 from sobolev_batch import ClaimError, Study, release, run
-from sobolev_batch.batch.claim import CLAIM, Claim, claimed, take
-from sobolev_batch.batch.location import Location
 from sobolev_batch.batch.records import utc_now
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import CLAIM, Claim, claimed, take
 from sobolev_batch.batch.store import Store
 from tests.faults.commands import command, write_toml
 
@@ -125,8 +125,8 @@ def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
 CLAIMING = """
 import sys
 import threading
-from sobolev_batch.batch.claim import Claim, take
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.lock import Claim, take
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.records import utc_now
 from sobolev_batch.batch.store import Store
 take(Location.of(sys.argv[1]), Claim.of_this_process())
@@ -210,8 +210,8 @@ def test_a_full_disk_leaves_no_claim(tmp_path: Path) -> None:
 FULL = """
 import resource, signal, sys
 from sobolev_batch import StoreError
-from sobolev_batch.batch.claim import Claim, take
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.lock import Claim, take
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.records import utc_now
 from sobolev_batch.batch.store import Store
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch.batch.claim import CLAIM
+from sobolev_batch.batch.storage.lock import CLAIM
 from tests.faults.commands import command, read_until, started, write_toml
 
 # Generous for a machine that does other things too; alone it takes two.

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch import open_store
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import Store
 
 _TABLES = ("norms", "distances", "convergence", "meshes")

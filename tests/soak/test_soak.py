@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
 from tests.soak.havoc import Plan
 from tests.soak.trial import Outcome, soak

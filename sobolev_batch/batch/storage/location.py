@@ -22,8 +22,8 @@ from fsspec.asyn import sync
 from fsspec.core import url_to_fs
 from zarr.abc.store import Store as ZarrStore
 
-from sobolev_batch.batch.containment import ContainedStore, place_of
-from sobolev_batch.batch.patience import PatientKeys, put_all, remove_all
+from sobolev_batch.batch.storage.local import ContainedStore, place_of
+from sobolev_batch.batch.storage.remote import PatientKeys, put_all, remove_all
 from sobolev_batch.errors import SobolevBatchError, StoreError
 
 # Drivers repeat what fails for minutes. That helps a run that is under way; who asks whether a store is

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sobolev_batch.batch.location import Location
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import StoreError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
