@@ -16,7 +16,7 @@ from benchmarks.table import Row
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.progress import Progress
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 
 _WORKERS = 2

@@ -27,8 +27,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sobolev_batch.batch.release import release
     from sobolev_batch.batch.run import Summary, run
+    from sobolev_batch.batch.store.release import release
     from sobolev_batch.batch.study.study import Study
     from sobolev_batch.batch.submission import Submission, submit
     from sobolev_batch.batch.verification import Verification, verify
@@ -153,7 +153,7 @@ _MODULES = {
     "proportion": "spectral.metrics.decomposition",
     "proximity": "surfaces.shapes.proximity",
     "read_mesh": "surfaces.formats.readers",
-    "release": "batch.release",
+    "release": "batch.store.release",
     "run": "batch.run",
     "spectrum": "spectral.metrics.spectrum",
     "submit": "batch.submission",

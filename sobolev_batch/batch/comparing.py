@@ -18,14 +18,14 @@ from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proxim
 from sobolev_batch.batch.crew import MEMORY, Crew
 from sobolev_batch.batch.dealing import deal, many_in_flight
 from sobolev_batch.batch.layout import LEAST_ROOM_BYTES, MESH_BYTES
-from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes, shortcomings
 from sobolev_batch.batch.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.progress import Notify, Progress
-from sobolev_batch.batch.records import Record
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes, shortcomings
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.batch.tables import Tables
-from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.errors import StoreError
 from sobolev_batch.surfaces.shapes.proximity import POINT_BYTES, TRIANGLE_BYTES
 

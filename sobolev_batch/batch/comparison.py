@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.notes import Kind, Note, Notes
-from sobolev_batch.batch.store import Store
-from sobolev_batch.batch.witnesses import Witnesses
+from sobolev_batch.batch.store.comparison_records import Kind, Note, Notes
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation

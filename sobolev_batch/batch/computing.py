@@ -12,8 +12,8 @@ from sobolev_batch.batch.dealing import deal, many_in_flight
 from sobolev_batch.batch.layout import Layout, lay_out_rows
 from sobolev_batch.batch.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.progress import Notify, Progress
-from sobolev_batch.batch.records import Record, utc_now
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import Record, utc_now
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job

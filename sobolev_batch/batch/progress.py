@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.store.records import Record
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.spectral.errors.budget import Assessed, Sums, add_sums, assess, sums_of_shells
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion

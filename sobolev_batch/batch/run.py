@@ -17,18 +17,18 @@ from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.computing import compute_fields
 from sobolev_batch.batch.crew import Crew
 from sobolev_batch.batch.equipment import enlist, worry_about
-from sobolev_batch.batch.journal import Journal
-from sobolev_batch.batch.preparation import prepare_store, require_place
 from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.reach import require_reach
-from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, claimed
-from sobolev_batch.batch.store import Store, stored_choice
+from sobolev_batch.batch.store.create import prepare_store, require_place
+from sobolev_batch.batch.store.heartbeat import Journal
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store, stored_choice
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.batch.tables import Tables
 from sobolev_batch.batch.tabulation import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verification import damaged_rows
 from sobolev_batch.errors import DamageError

@@ -14,13 +14,13 @@ from uuid import uuid4
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.equipment import enlist
-from sobolev_batch.batch.journal import Journal
-from sobolev_batch.batch.preparation import prepare_store, require_place
 from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take
-from sobolev_batch.batch.store import Store, stored_choice
+from sobolev_batch.batch.store.create import prepare_store, require_place
+from sobolev_batch.batch.store.heartbeat import Journal
+from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import ClusterError, StoreError

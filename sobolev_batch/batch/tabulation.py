@@ -16,11 +16,11 @@ from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset,
 from sobolev_batch.batch.dealing import deal
 from sobolev_batch.batch.outcomes import is_suspect
 from sobolev_batch.batch.progress import Notify, Progress
-from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.reduction import Reducer
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.batch.tables import Tables
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, support_widths
 from sobolev_batch.spectral.errors.quality import Quality

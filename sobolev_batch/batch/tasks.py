@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from distributed import get_worker
 
 from sobolev_batch.batch.equipment import backend_of
-from sobolev_batch.batch.records import Facts, Record, utc_now
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import Facts, Record, utc_now
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.study import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
 from sobolev_batch.spectral.adaptive.solve import Aim

@@ -11,14 +11,14 @@ from pathlib import Path
 from distributed import Client, wait
 
 from sobolev_batch.batch.cluster import available_cores
-from sobolev_batch.batch.notes import KINDS, Kind, Notes
 from sobolev_batch.batch.outcomes import outcomes
-from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take
-from sobolev_batch.batch.store import Store
-from sobolev_batch.batch.tables import Tables
-from sobolev_batch.batch.witnesses import Witnesses
+from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Notes
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.errors import ClaimError, DamageError, StoreError
 
 _log = logging.getLogger(__name__)

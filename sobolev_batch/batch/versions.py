@@ -109,7 +109,7 @@ def _asker(needed: Sequence[str] = ()) -> Callable[[], Versions]:
         # One checkout may follow another without a new version.
         numerics = schema = ""
         try:
-            from sobolev_batch.batch.documents import SCHEMA_VERSION
+            from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
             from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION
 
             numerics, schema = str(NUMERICS_VERSION), str(SCHEMA_VERSION)

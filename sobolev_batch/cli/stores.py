@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.batch.release import release
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.release import release
 from sobolev_batch.batch.verification import verify
 from sobolev_batch.cli.group import EXIT_OTHER, EXIT_SOME_FAILED, cli
 from sobolev_batch.errors import SobolevBatchError, StoreError

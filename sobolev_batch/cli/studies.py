@@ -14,7 +14,7 @@ from sobolev_batch.batch.equipment import enlist
 from sobolev_batch.batch.layout import lay_out_rows
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store, stored_choice
+from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.submission import submit

@@ -10,8 +10,8 @@ from typing import Any
 import xarray as xr
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
-from sobolev_batch.batch.tables import Tables
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.errors import DamageError
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import xarray as xr
 from matplotlib.figure import Figure
 
-from sobolev_batch.batch.records import utc_now
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.records import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.exhibits import make_exhibits
 from sobolev_batch.results.opening import fields_read, open_store

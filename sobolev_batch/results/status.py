@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sobolev_batch.batch.journal import PATIENCE_SECONDS
-from sobolev_batch.batch.notes import KINDS, Notes, shortcomings
-from sobolev_batch.batch.records import RunRecord, age_seconds
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
-from sobolev_batch.batch.tables import Tables
+from sobolev_batch.batch.store.comparison_records import KINDS, Notes, shortcomings
+from sobolev_batch.batch.store.heartbeat import PATIENCE_SECONDS
+from sobolev_batch.batch.store.records import RunRecord, age_seconds
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
 
 _SUBMITTED_PATIENCE_SECONDS = 600.0
 

@@ -13,7 +13,7 @@ from distributed import Client
 
 from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, distance, icosphere, open_store, run
 from sobolev_batch.batch import run as run_module
-from sobolev_batch.batch.store import stored_choice
+from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study import lattice_choice as choice_module
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import make_plan

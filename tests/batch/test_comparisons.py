@@ -22,12 +22,12 @@ from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.crew import Crew, CrewMember
-from sobolev_batch.batch.notes import KINDS, Kind, Note, Notes
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.run import Summary
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.witnesses import Witnesses
 from sobolev_batch.cli import cli, studies
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table, variable

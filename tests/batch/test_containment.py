@@ -12,7 +12,7 @@ import pytest
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.storage.local import place_of
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table, variable
 

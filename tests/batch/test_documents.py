@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch import documents
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store import metadata as documents
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table
 

@@ -18,10 +18,10 @@ from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.storage import remote as patience
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table
 from tests.batch.failing_storage import GONE, HEALTHY, KINDS, FailingStorage, Kind, Rule, Turn, failing
@@ -186,8 +186,8 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
 
 FULL = """
 import resource, sys
-from sobolev_batch.batch.preparation import prepare_store
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.store import Store
 import numpy as np
 
 store = Store(sys.argv[1])

@@ -13,7 +13,7 @@ from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster import local_client
 from sobolev_batch.batch.progress import Progress
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import small_table
 from tests.batch.failing_storage import HEALTHY, FailingStorage, Rule, Turn, failing
 from tests.batch.object_storage import BUCKET, IMPATIENT, serving, taken_for_s3

@@ -9,7 +9,7 @@ import pytest
 
 from sobolev_batch import StoreError
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from distributed import Client
 
 from sobolev_batch import ClusterError, Study, run
 from sobolev_batch.batch.progress import Progress
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop

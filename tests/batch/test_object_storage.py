@@ -24,14 +24,14 @@ from zarr.storage import FsspecStore
 
 from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
 from sobolev_batch.batch.cluster import local_client, thread_client
-from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.progress import Progress
-from sobolev_batch.batch.records import Record
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM, Claim, take
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.tables import Tables
 from tests.batch.conftest import small_table, variable
 from tests.batch.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.batch.test_store import READER

@@ -13,8 +13,8 @@ from distributed import Client
 from sobolev_batch import Lattice, Mesh, MeshError, StoreError, Study, icosphere
 from sobolev_batch.batch.layout import Layout
 from sobolev_batch.batch.pieces import Cut, Partial, add_partials, cut_mesh, transform_piece
-from sobolev_batch.batch.preparation import prepare_store
-from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.submitter import Submitter
 from sobolev_batch.batch.tasks import Job

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Sphere, Study, fourier_transform, proportion
 from sobolev_batch.batch import reduction
-from sobolev_batch.batch.preparation import prepare_store
 from sobolev_batch.batch.reduction import Reducer
+from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.shells import shell_sums, shell_weights

@@ -19,7 +19,7 @@ from distributed import Client
 
 from sobolev_batch import Study, icosphere, open_store, run
 from sobolev_batch.batch.progress import Progress
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.batch import gate
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop

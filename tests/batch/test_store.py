@@ -12,9 +12,9 @@ import pytest
 import zarr
 
 from sobolev_batch import StoreError, Study
-from sobolev_batch.batch.preparation import prepare_store
-from sobolev_batch.batch.records import Facts, Record
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Facts, Record
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.batch.conftest import small_table
 

@@ -14,7 +14,7 @@ from distributed import Client, Future
 
 from sobolev_batch import ClusterError, Study, run
 from sobolev_batch.batch.equipment import enlist
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.versions import require_same_versions
 from tests.batch.conftest import small_table
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster

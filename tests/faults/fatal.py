@@ -17,8 +17,8 @@ from typing import Any
 import dask
 import pytest
 
-from sobolev_batch.batch.records import Record
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
 
 _VARIABLE = "FATAL_MOMENT"
 

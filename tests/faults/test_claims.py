@@ -15,17 +15,17 @@ from threading import Barrier
 import pytest
 
 from sobolev_batch import ClaimError, Study, release, run
-from sobolev_batch.batch.records import utc_now
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM, Claim, claimed, take
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.store.store import Store
 from tests.faults.commands import command, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often.
 DRIVER = """
 import sys
 import sobolev_batch as sb
-from sobolev_batch.batch import journal
+from sobolev_batch.batch.store import heartbeat as journal
 
 journal.HEARTBEAT_SECONDS = 0.05
 
@@ -127,8 +127,8 @@ import sys
 import threading
 from sobolev_batch.batch.storage.lock import Claim, take
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.records import utc_now
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.store.store import Store
 take(Location.of(sys.argv[1]), Claim.of_this_process())
 print("taken", flush=True)
 threading.Event().wait()
@@ -212,8 +212,8 @@ import resource, signal, sys
 from sobolev_batch import StoreError
 from sobolev_batch.batch.storage.lock import Claim, take
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.records import utc_now
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.store.store import Store
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
 try:

@@ -14,7 +14,7 @@ from distributed import Client
 
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
 from sobolev_batch.batch.progress import Progress
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import small_table, variable
 from tests.faults.commands import command, write_toml
 from tests.faults.comparing import assert_same_fields, assert_same_tables

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.faults.commands import command, read_until, started, write_toml
 from tests.faults.comparing import assert_same_fields, assert_same_tables
 

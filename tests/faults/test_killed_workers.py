@@ -11,7 +11,7 @@ import pytest
 
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import variable
 from tests.faults.commands import TOML, write_toml
 from tests.faults.comparing import assert_same_fields, assert_same_tables

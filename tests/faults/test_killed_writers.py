@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sobolev_batch import Study
-from sobolev_batch.batch.preparation import prepare_store
+from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
 from tests.batch.conftest import small_table
 
@@ -32,8 +32,8 @@ from pathlib import Path
 import numpy as np
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.preparation import prepare_store
-from sobolev_batch.batch.records import Record
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
 from tests.batch.conftest import small_table
 
 path = Path(sys.argv[1])
@@ -92,7 +92,7 @@ import json, os, signal, sys
 from pathlib import Path
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.preparation import prepare_store
+from sobolev_batch.batch.store.create import prepare_store
 from tests.batch.conftest import small_table
 
 plan = make_plan(Study.from_table(small_table()))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster import local_client, thread_client
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from tests.faults.comparing import assert_same_fields, assert_same_tables
 
 
@@ -30,7 +30,7 @@ import os, sys
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.run import rows_of
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.tasks import Job, compute_mesh
 from tests.batch.conftest import small_table
 

@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.cli import cli
 from sobolev_batch.results.export import Exporter
 from sobolev_batch.results.witnesses import witness_at_vertices

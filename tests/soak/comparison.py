@@ -9,7 +9,7 @@ import xarray as xr
 
 from sobolev_batch import open_store
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.store import Store
 
 _TABLES = ("norms", "distances", "convergence", "meshes")
 # What depends on who did it, and when.

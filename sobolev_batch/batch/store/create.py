@@ -15,11 +15,11 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.documents import SCHEMA_VERSION
-from sobolev_batch.batch.notes import KINDS, Notes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM_KEYS
-from sobolev_batch.batch.store import (
+from sobolev_batch.batch.store.comparison_records import KINDS, Notes
+from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.batch.store.store import (
     FIELD,
     LABELS,
     QUALITY,
@@ -28,8 +28,8 @@ from sobolev_batch.batch.store import (
     UNFINISHED,
     Store,
 )
+from sobolev_batch.batch.store.tables import Tables, table_encoding
 from sobolev_batch.batch.study.plan import Plan
-from sobolev_batch.batch.tables import Tables, table_encoding
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.surfaces.shapes.similarity import Similarity

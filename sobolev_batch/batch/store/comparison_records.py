@@ -10,8 +10,8 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Literal, Self
 
-from sobolev_batch.batch.records import Status
-from sobolev_batch.batch.store import RECORDS, Store
+from sobolev_batch.batch.store.records import Status
+from sobolev_batch.batch.store.store import RECORDS, Store
 from sobolev_batch.errors import DamageError
 
 Kind = Literal["witness", "proximity"]

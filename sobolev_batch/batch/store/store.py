@@ -30,10 +30,10 @@ from zarr.buffer.cpu import NDBuffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore, StorePath
 
-from sobolev_batch.batch.documents import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
-from sobolev_batch.batch.records import Record, RunRecord
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.scratch import Scratch
+from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
+from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.errors import DamageError, StoreError
 

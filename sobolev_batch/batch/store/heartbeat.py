@@ -9,9 +9,9 @@ from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Self
 
-from sobolev_batch.batch.records import RunRecord, RunState, utc_now
 from sobolev_batch.batch.storage.lock import Claim, this_process
-from sobolev_batch.batch.store import Store
+from sobolev_batch.batch.store.records import RunRecord, RunState, utc_now
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import ClaimError, StoreError
 
 _log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.store import CHECKSUM_BYTES, ROOT, WITNESS, WITNESS_GROUP, Store, checksum_of
-from sobolev_batch.batch.tables import table_encoding
+from sobolev_batch.batch.store.store import CHECKSUM_BYTES, ROOT, WITNESS, WITNESS_GROUP, Store, checksum_of
+from sobolev_batch.batch.store.tables import table_encoding
 from sobolev_batch.errors import DamageError
 
 # Vertices of a chunk: coarse meshes waste little room, and fine ones make few chunks.

@@ -14,7 +14,7 @@ from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.store import CHECKSUM_BYTES, LABELS, QUALITY, RECORDS, ROOT, WITNESS_GROUP, Store
+from sobolev_batch.batch.store.store import CHECKSUM_BYTES, LABELS, QUALITY, RECORDS, ROOT, WITNESS_GROUP, Store
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.lattice import AXES
 
