@@ -20,8 +20,8 @@ import sobolev_batch as sb
 from benchmarks.memory import highest_bytes
 from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
-from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.spectral.shells import shell_weights
 from sobolev_batch.spectral.transform.transform import Transform, transform_block
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 from distributed import Client, Future
 
-from sobolev_batch.batch.crew import Crew
-from sobolev_batch.batch.dealing import deal, many_in_flight
+from sobolev_batch.batch.cluster.execution import deal, many_in_flight
+from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
+from sobolev_batch.batch.cluster.progress import Notify, Progress
+from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.layout import Layout, lay_out_rows
-from sobolev_batch.batch.outcomes import DEADLY, is_suspect
-from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.store.records import Record, utc_now
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row

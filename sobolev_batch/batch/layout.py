@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from sobolev_batch.batch.crew import Crew
+from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block

@@ -15,7 +15,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.equipment import backend_of
+from sobolev_batch.batch.cluster.worker_plugin import backend_of
 from sobolev_batch.batch.store.records import Facts
 from sobolev_batch.batch.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
 from sobolev_batch.errors import MeshError, StoreError

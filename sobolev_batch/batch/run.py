@@ -12,13 +12,13 @@ from typing import Self, TypeVar
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
+from sobolev_batch.batch.cluster.progress import Notify, Progress
+from sobolev_batch.batch.cluster.store_access import require_reach
+from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
+from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.computing import compute_fields
-from sobolev_batch.batch.crew import Crew
-from sobolev_batch.batch.equipment import enlist, worry_about
-from sobolev_batch.batch.progress import Notify, Progress
-from sobolev_batch.batch.reach import require_reach
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, claimed
 from sobolev_batch.batch.store.create import prepare_store, require_place

@@ -13,8 +13,8 @@ from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
-from sobolev_batch.batch.equipment import enlist
-from sobolev_batch.batch.reach import require_reach
+from sobolev_batch.batch.cluster.store_access import require_reach
+from sobolev_batch.batch.cluster.worker_plugin import enlist
 from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take

@@ -8,7 +8,7 @@ from typing import Any
 
 from distributed import Client, Future
 
-from sobolev_batch.batch.crew import GPU, MEMORY, Crew
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Crew
 from sobolev_batch.batch.layout import Layout
 from sobolev_batch.batch.pieces import add_partials, cut_mesh, store_block, transform_piece
 from sobolev_batch.batch.study.study import Backends

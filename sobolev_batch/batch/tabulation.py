@@ -11,11 +11,11 @@ import numpy as np
 from distributed import Client, Future
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.crew import MEMORY, Crew
+from sobolev_batch.batch.cluster.execution import deal
+from sobolev_batch.batch.cluster.outcomes import is_suspect
+from sobolev_batch.batch.cluster.progress import Notify, Progress
+from sobolev_batch.batch.cluster.workers import MEMORY, Crew
 from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
-from sobolev_batch.batch.dealing import deal
-from sobolev_batch.batch.outcomes import is_suspect
-from sobolev_batch.batch.progress import Notify, Progress
 from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store

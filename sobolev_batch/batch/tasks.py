@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from distributed import get_worker
 
-from sobolev_batch.batch.equipment import backend_of
+from sobolev_batch.batch.cluster.worker_plugin import backend_of
 from sobolev_batch.batch.store.records import Facts, Record, utc_now
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.study import Backends

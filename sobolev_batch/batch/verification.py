@@ -10,8 +10,8 @@ from pathlib import Path
 
 from distributed import Client, wait
 
-from sobolev_batch.batch.cluster import available_cores
-from sobolev_batch.batch.outcomes import outcomes
+from sobolev_batch.batch.cluster.clients import available_cores
+from sobolev_batch.batch.cluster.outcomes import outcomes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take
 from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Notes

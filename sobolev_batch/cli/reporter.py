@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import click
 
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.progress import Progress
 
 
 class Reporter:

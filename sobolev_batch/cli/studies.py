@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 
-from sobolev_batch.batch.cluster import available_cores, remote_client
-from sobolev_batch.batch.crew import Crew
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.cluster.clients import available_cores, remote_client
+from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.layout import lay_out_rows
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.storage.location import Location

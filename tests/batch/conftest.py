@@ -11,7 +11,7 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Lattice, Study, run
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster.clients import local_client
 
 SMALL_LATTICE = Lattice(3.0, 16)
 

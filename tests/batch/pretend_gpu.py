@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from sobolev_batch.batch import equipment
+from sobolev_batch.batch.cluster import worker_plugin as equipment
 from tests.spectral.fake_device import Device
 
 _DEVICE = Device(capacity=float(os.environ.get("PRETEND_GPU_BYTES", "1e12")))

@@ -16,7 +16,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import AddressError, ClusterError, Study, open_store, run
-from sobolev_batch.batch.cluster import local_client, remote_client
+from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from tests.batch.conftest import variable
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.clusters.recipes import write_study

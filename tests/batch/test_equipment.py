@@ -10,9 +10,9 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import ClusterError, InputError, Study, open_store, run
-from sobolev_batch.batch.cluster import local_client, remote_client
-from sobolev_batch.batch.crew import GPU, MEMORY
-from sobolev_batch.batch.equipment import enlist, worry_about
+from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import tcp_cluster
 

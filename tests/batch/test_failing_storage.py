@@ -17,7 +17,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage import remote as patience
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch.cluster import local_client
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import small_table

@@ -12,7 +12,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Study, icosphere, open_store, run
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.spectral.quadrature.rules import gauss_rule
 from tests.batch.conftest import variable
 

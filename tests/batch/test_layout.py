@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sobolev_batch import ClusterError, Lattice
-from sobolev_batch.batch.crew import Crew, CrewMember
+from sobolev_batch.batch.cluster.workers import Crew, CrewMember
 from sobolev_batch.batch.layout import lay_out
 from sobolev_batch.spectral.backends.backends import CPU_COSTS
 from sobolev_batch.spectral.lattice import Block

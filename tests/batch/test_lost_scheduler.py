@@ -8,7 +8,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import ClusterError, Study, run
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table

@@ -12,9 +12,9 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import ClusterError, Study, open_store, run
-from sobolev_batch.batch.cluster import remote_client
-from sobolev_batch.batch.crew import GPU
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.workers import GPU
 from tests.batch.conftest import small_table, variable
 from tests.batch.processes import tcp_cluster
 

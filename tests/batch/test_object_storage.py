@@ -23,8 +23,8 @@ from distributed import Client
 from zarr.storage import FsspecStore
 
 from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
-from sobolev_batch.batch.cluster import local_client, thread_client
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM, Claim, take
 from sobolev_batch.batch.store.create import prepare_store

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Sphere, Study, fourier_transform, open_store, run
-from sobolev_batch.batch.cluster import thread_client
+from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.surfaces.sources.registry import registry as sources
 from tests.batch.conftest import variable
 

@@ -23,7 +23,7 @@ from sobolev_batch import (
     open_store,
     run,
 )
-from sobolev_batch.batch.cluster import thread_client
+from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.adaptive.solve import Aim

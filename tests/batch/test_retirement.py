@@ -18,7 +18,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import Study, icosphere, open_store, run
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.batch import gate
 from tests.batch.conftest import small_table, variable

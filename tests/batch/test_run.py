@@ -22,7 +22,7 @@ from sobolev_batch import (
     run,
 )
 from sobolev_batch.batch import tabulation
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study import plan as plan_module
 from tests.batch.conftest import SMALL_LATTICE, small_table, variable

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import ClusterError, Study, StudyError, submit
-from sobolev_batch.batch.cluster import remote_client
+from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.batch.conftest import small_table

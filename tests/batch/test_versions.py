@@ -13,9 +13,9 @@ import pytest
 from distributed import Client, Future
 
 from sobolev_batch import ClusterError, Study, run
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.cluster.versions import require_same_versions
+from sobolev_batch.batch.cluster.worker_plugin import enlist
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.versions import require_same_versions
 from tests.batch.conftest import small_table
 from tests.batch.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 
@@ -119,7 +119,7 @@ CLIENT = """
 import sys
 from distributed import Client
 from sobolev_batch import ClusterError
-from sobolev_batch.batch.equipment import enlist
+from sobolev_batch.batch.cluster.worker_plugin import enlist
 
 with Client(sys.argv[1]) as client:
     try:

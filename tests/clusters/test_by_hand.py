@@ -20,8 +20,8 @@ import yaml
 from distributed import Client
 
 from sobolev_batch import ClusterError, open_store
-from sobolev_batch.batch.cluster import remote_client
-from sobolev_batch.batch.connection import check_connection
+from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.cluster.connection import check_connection
 from tests.batch.processes import stop
 from tests.clusters.recipes import CERTIFICATES, TABLE, documented, environment, write_study
 

@@ -13,7 +13,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
-from sobolev_batch.batch.progress import Progress
+from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import small_table, variable
 from tests.faults.commands import command, write_toml

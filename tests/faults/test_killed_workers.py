@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import Study, open_store, run
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.store.store import Store
 from tests.batch.conftest import variable
 from tests.faults.commands import TOML, write_toml

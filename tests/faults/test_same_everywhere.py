@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from sobolev_batch import Study, run
-from sobolev_batch.batch.cluster import local_client, thread_client
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.store.store import Store
 from tests.faults.comparing import assert_same_fields, assert_same_tables
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sobolev_batch import Study, run
-from sobolev_batch.batch.cluster import local_client
+from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage.location import Location
 from tests.batch.failing_storage import HEALTHY, FailingStorage, Kind, Rule, failing
 from tests.batch.object_storage import BUCKET, serving, taken_for_s3

@@ -10,9 +10,9 @@ from typing import Any
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
-from sobolev_batch.batch.crew import GPU, MEMORY, Crew, CrewMember, spare_bytes
-from sobolev_batch.batch.devices import Claim, claim_device, visible_devices
-from sobolev_batch.batch.versions import guarded, require_same_versions
+from sobolev_batch.batch.cluster.gpus import Claim, claim_device, visible_devices
+from sobolev_batch.batch.cluster.versions import guarded, require_same_versions
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Crew, CrewMember, spare_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
 

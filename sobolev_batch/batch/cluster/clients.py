@@ -12,9 +12,9 @@ import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
-from sobolev_batch.batch import quiet
-from sobolev_batch.batch.address import Address
-from sobolev_batch.batch.connection import check_connection
+from sobolev_batch.batch.cluster import worker_preload as quiet
+from sobolev_batch.batch.cluster.address import Address
+from sobolev_batch.batch.cluster.connection import check_connection
 from sobolev_batch.errors import ClusterError, InputError
 
 _CONNECT_SECONDS = 15

@@ -7,8 +7,8 @@ from itertools import islice
 
 from distributed import Client, Future, as_completed
 
-from sobolev_batch.batch.crew import Crew
-from sobolev_batch.batch.outcomes import is_suspect, outcomes
+from sobolev_batch.batch.cluster.outcomes import is_suspect, outcomes
+from sobolev_batch.batch.cluster.workers import Crew
 
 # Tasks that the scheduler knows of at a time: enough to deal out well, while each costs it memory.
 _LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
