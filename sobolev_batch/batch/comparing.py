@@ -19,7 +19,7 @@ from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, Crew
 from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
-from sobolev_batch.batch.layout import LEAST_ROOM_BYTES, MESH_BYTES
+from sobolev_batch.batch.fields.sizing import LEAST_ROOM_BYTES, MESH_BYTES
 from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes, shortcomings
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store

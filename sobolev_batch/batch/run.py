@@ -18,7 +18,7 @@ from sobolev_batch.batch.cluster.store_access import require_reach
 from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
 from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.comparing import Comparer
-from sobolev_batch.batch.computing import compute_fields
+from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, claimed
 from sobolev_batch.batch.store.create import prepare_store, require_place

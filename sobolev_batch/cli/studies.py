@@ -11,7 +11,7 @@ import click
 from sobolev_batch.batch.cluster.clients import available_cores, remote_client
 from sobolev_batch.batch.cluster.worker_plugin import enlist
 from sobolev_batch.batch.cluster.workers import Crew
-from sobolev_batch.batch.layout import lay_out_rows
+from sobolev_batch.batch.fields.sizing import lay_out_rows
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store, stored_choice

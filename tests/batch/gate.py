@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sobolev_batch.batch import tasks
-from sobolev_batch.batch.tasks import Job
+from sobolev_batch.batch.fields import tasks
+from sobolev_batch.batch.fields.tasks import Job
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources.files import FileMember
 

@@ -6,7 +6,7 @@ import pytest
 
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.cluster.workers import Crew, CrewMember
-from sobolev_batch.batch.layout import lay_out
+from sobolev_batch.batch.fields.sizing import lay_out
 from sobolev_batch.spectral.backends.backends import CPU_COSTS
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.memory import Load, divide

@@ -15,7 +15,7 @@ import numpy as np
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.tasks import Job, compute_mesh
+from sobolev_batch.batch.fields.tasks import Job, compute_mesh
 from sobolev_batch.surfaces.sources.registry import Member
 
 

@@ -11,13 +11,13 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import Lattice, Mesh, MeshError, StoreError, Study, icosphere
-from sobolev_batch.batch.layout import Layout
-from sobolev_batch.batch.pieces import Cut, Partial, add_partials, cut_mesh, transform_piece
+from sobolev_batch.batch.fields.graph import Submitter
+from sobolev_batch.batch.fields.large_mesh import Cut, Partial, add_partials, cut_mesh, transform_piece
+from sobolev_batch.batch.fields.sizing import Layout
+from sobolev_batch.batch.fields.tasks import Job
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.batch.submitter import Submitter
-from sobolev_batch.batch.tasks import Job
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member
 from tests.batch.conftest import small_table

@@ -31,7 +31,7 @@ from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.run import rows_of
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.tasks import Job, compute_mesh
+from sobolev_batch.batch.fields.tasks import Job, compute_mesh
 from tests.batch.conftest import small_table
 
 plan = make_plan(Study.from_table(small_table()))

@@ -9,10 +9,10 @@ from typing import Any
 from distributed import Client, Future
 
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Crew
-from sobolev_batch.batch.layout import Layout
-from sobolev_batch.batch.pieces import add_partials, cut_mesh, store_block, transform_piece
+from sobolev_batch.batch.fields.large_mesh import add_partials, cut_mesh, store_block, transform_piece
+from sobolev_batch.batch.fields.sizing import Layout
+from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, finish_mesh
 from sobolev_batch.batch.study.study import Backends
-from sobolev_batch.batch.tasks import Job, compute_blocks, compute_mesh, finish_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,12 @@ from sobolev_batch.batch.cluster.execution import deal, many_in_flight
 from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.workers import Crew
-from sobolev_batch.batch.layout import Layout, lay_out_rows
+from sobolev_batch.batch.fields.graph import Submitter
+from sobolev_batch.batch.fields.sizing import Layout, lay_out_rows
+from sobolev_batch.batch.fields.tasks import Job
 from sobolev_batch.batch.store.records import Record, utc_now
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.batch.submitter import Submitter
-from sobolev_batch.batch.tasks import Job
 from sobolev_batch.errors import StoreError
 
 _log = logging.getLogger(__name__)

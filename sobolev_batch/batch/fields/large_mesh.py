@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.cluster.worker_plugin import backend_of
+from sobolev_batch.batch.fields.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
 from sobolev_batch.batch.store.records import Facts
-from sobolev_batch.batch.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
 from sobolev_batch.errors import MeshError, StoreError
 from sobolev_batch.spectral.errors.probe import Draws, Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
