@@ -12,12 +12,13 @@ from typing import Self, TypeVar
 import numpy as np
 from distributed import Client
 
+from sobolev_batch.batch.analysis.compare import Comparer
+from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_reach
 from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
 from sobolev_batch.batch.cluster.workers import Crew
-from sobolev_batch.batch.comparing import Comparer
 from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, claimed
@@ -29,7 +30,6 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.batch.tabulation import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verification import damaged_rows
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.errors.budget import Assessed

@@ -18,11 +18,11 @@ from click.testing import CliRunner
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch.analysis.compare import Comparer
+from sobolev_batch.batch.analysis.compare_tasks import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.cluster.workers import Crew, CrewMember
-from sobolev_batch.batch.comparing import Comparer
-from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.run import Summary
 from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes
 from sobolev_batch.batch.store.store import Store

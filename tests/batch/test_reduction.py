@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Sphere, Study, fourier_transform, proportion
-from sobolev_batch.batch import reduction
-from sobolev_batch.batch.reduction import Reducer
+from sobolev_batch.batch.analysis import tiles as reduction
+from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan

@@ -21,7 +21,7 @@ from sobolev_batch import (
     proportion,
     run,
 )
-from sobolev_batch.batch import tabulation
+from sobolev_batch.batch.analysis import reduce as tabulation
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study import plan as plan_module

@@ -11,12 +11,12 @@ import numpy as np
 from distributed import Client, Future
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.analysis.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import deal
 from sobolev_batch.batch.cluster.outcomes import is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, Crew
-from sobolev_batch.batch.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
-from sobolev_batch.batch.reduction import Reducer
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables

@@ -14,11 +14,11 @@ import numpy as np
 import xarray as xr
 from distributed import Client, Future
 
+from sobolev_batch.batch.analysis.compare_tasks import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.cluster.execution import deal, many_in_flight
 from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, Crew
-from sobolev_batch.batch.comparison import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.fields.sizing import LEAST_ROOM_BYTES, MESH_BYTES
 from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes, shortcomings
 from sobolev_batch.batch.store.records import Record
