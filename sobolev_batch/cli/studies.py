@@ -21,7 +21,7 @@ from sobolev_batch.batch.submission import submit
 from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.reporter import Reporter
 from sobolev_batch.results.opening import open_store
-from sobolev_batch.results.tables import format_table
+from sobolev_batch.results.tables.convergence import format_table
 
 _DEFAULT_FOLDER = Path("storage")
 

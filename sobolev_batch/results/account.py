@@ -12,9 +12,9 @@ import tomli_w
 import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
-from sobolev_batch.results.digits import Digits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables import convergence_frame, finished_group, has_proximity
+from sobolev_batch.results.tables.convergence import convergence_frame, finished_group, has_proximity
+from sobolev_batch.results.tables.formatting import Digits
 from sobolev_batch.spectral.lattice import Lattice
 
 # Lines of a page in all; browsers become slow beyond.

@@ -17,10 +17,10 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
 
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.arrangement import Map, alike_together
-from sobolev_batch.results.matrix import Matrix
 from sobolev_batch.results.portraits import PICTURES, Axis, Portrait, make_gallery
 from sobolev_batch.results.rendering import Pictures, render, scales
-from sobolev_batch.results.tables import chosen_orders, convergence_frame, finished_group
+from sobolev_batch.results.tables.convergence import chosen_orders, convergence_frame, finished_group
+from sobolev_batch.results.tables.matrix import Matrix
 from sobolev_batch.results.wavelengths import Wavelengths
 from sobolev_batch.surfaces.sources.names import file_stem
 

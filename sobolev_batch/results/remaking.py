@@ -14,7 +14,7 @@ import xarray as xr
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.tables import finished_group
+from sobolev_batch.results.tables.convergence import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.registry import Member

@@ -30,7 +30,7 @@ from sobolev_batch.results.plots import (
 from sobolev_batch.results.portraits import Axis, Gallery, make_gallery
 from sobolev_batch.results.rendering import render
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables import finished_group
+from sobolev_batch.results.tables.convergence import finished_group
 from sobolev_batch.results.wavelengths import Wavelengths
 
 _PAGE = "page"

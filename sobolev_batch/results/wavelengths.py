@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.results.tables import chosen_orders, finished_group
+from sobolev_batch.results.tables.convergence import chosen_orders, finished_group
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 

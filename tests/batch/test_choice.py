@@ -17,7 +17,7 @@ from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study import lattice_choice as choice_module
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.results.tables import format_table
+from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.spectral.adaptive.solve import pilot_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Assessed

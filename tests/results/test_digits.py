@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sobolev_batch.results.digits import Digits, concise
+from sobolev_batch.results.tables.formatting import Digits, concise
 
 _NAN = float("nan")
 

@@ -10,8 +10,8 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError
-from sobolev_batch.results.matrix import Matrix, format_matrix, matrix_frame
-from sobolev_batch.results.tables import Format
+from sobolev_batch.results.tables.convergence import Format
+from sobolev_batch.results.tables.matrix import Matrix, format_matrix, matrix_frame
 
 ORDERS = [-4.0, -2.0]
 

@@ -19,7 +19,7 @@ from sobolev_batch.cli import cli
 from sobolev_batch.results.portraits import make_gallery
 from sobolev_batch.results.report import make_report, write_report
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables import convergence_frame
+from sobolev_batch.results.tables.convergence import convergence_frame
 from tests.results.browser import Browser, browser
 
 SCRIPT = "<script>window.ran=1</script>"

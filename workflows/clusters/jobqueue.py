@@ -27,7 +27,7 @@ from distributed.core import Status
 
 from sobolev_batch import SobolevBatchError, Study, open_store, run
 from sobolev_batch.batch.cluster.progress import Progress
-from sobolev_batch.results.tables import format_table
+from sobolev_batch.results.tables.convergence import format_table
 
 # dask_jobqueue ends the process on Ctrl-C as if all had gone well.
 signal.signal(signal.SIGINT, signal.default_int_handler)

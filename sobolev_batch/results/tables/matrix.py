@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tabulate import tabulate
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.digits import concise
-from sobolev_batch.results.tables import TABULATE_FORMATS, Format, chosen_orders, finished_group
+from sobolev_batch.results.tables.convergence import TABULATE_FORMATS, Format, chosen_orders, finished_group
+from sobolev_batch.results.tables.formatting import concise
 
 Reals = NDArray[np.float64]
 
