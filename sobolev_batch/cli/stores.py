@@ -126,7 +126,7 @@ def plot_command(
     distances, if that can be done.
     """
     # Imported here: it takes as long as everything that the other commands do at their start.
-    from sobolev_batch.results.plots import plot_store, plot_witnesses
+    from sobolev_batch.results.figures.plots import plot_store, plot_witnesses
 
     with fields_read(store):
         tree = open_store(store)

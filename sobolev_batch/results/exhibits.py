@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.results.account import minus
-from sobolev_batch.results.arrangement import Map, alike_together
-from sobolev_batch.results.plots import MOST_MESHES
+from sobolev_batch.results.figures.embedding import Map, alike_together
+from sobolev_batch.results.figures.plots import MOST_MESHES
+from sobolev_batch.results.figures.spectra import Wavelengths
 from sobolev_batch.results.portraits import Gallery, Portrait
 from sobolev_batch.results.tables.convergence import convergence_frame, finished_group
 from sobolev_batch.results.tables.matrix import Matrix
-from sobolev_batch.results.wavelengths import Wavelengths
 
 Exhibit = dict[str, Any]
 

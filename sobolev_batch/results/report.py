@@ -17,8 +17,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.exhibits import make_exhibits
-from sobolev_batch.results.opening import fields_read, open_store
-from sobolev_batch.results.plots import (
+from sobolev_batch.results.figures.plots import (
     MOST_VIEWS,
     convergence_figure,
     map_figure,
@@ -27,11 +26,12 @@ from sobolev_batch.results.plots import (
     spectrum_figure,
     witness_figure,
 )
+from sobolev_batch.results.figures.spectra import Wavelengths
+from sobolev_batch.results.opening import fields_read, open_store
 from sobolev_batch.results.portraits import Axis, Gallery, make_gallery
 from sobolev_batch.results.rendering import render
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import finished_group
-from sobolev_batch.results.wavelengths import Wavelengths
 
 _PAGE = "page"
 # Orders whose pictures are also there as they are printed; more would make the page heavy.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from sobolev_batch.results.arrangement import Map, alike_together
+from sobolev_batch.results.figures.embedding import Map, alike_together
 
 
 def test_groups_stand_together() -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
 from sobolev_batch.results import rendering
-from sobolev_batch.results.plots import plot_witnesses
+from sobolev_batch.results.figures.plots import plot_witnesses
 from sobolev_batch.results.portraits import Portrait, make_gallery
 from sobolev_batch.results.rendering import render
 from tests.results.drawing import obstacle

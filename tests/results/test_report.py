@@ -243,7 +243,7 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
     monkeypatch.setattr("sobolev_batch.results.account._MOST_LINES", 6)
     monkeypatch.setattr("sobolev_batch.results.account._MOST_MESHES", 2)
     monkeypatch.setattr("sobolev_batch.results.exhibits.MOST_MESHES", 3)
-    monkeypatch.setattr("sobolev_batch.results.wavelengths._MOST_MESHES", 2)
+    monkeypatch.setattr("sobolev_batch.results.figures.spectra._MOST_MESHES", 2)
     nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
     monkeypatch.setattr("sobolev_batch.results.report._stills", lambda *_: nothing)
     text = make_report(store, folder=folder)

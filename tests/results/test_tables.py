@@ -11,7 +11,13 @@ import xarray as xr
 
 from sobolev_batch import InputError, StoreError, open_store
 from sobolev_batch.results.account import _tables
-from sobolev_batch.results.plots import convergence_figure, map_figure, matrix_figure, plot_store, transform_figure
+from sobolev_batch.results.figures.plots import (
+    convergence_figure,
+    map_figure,
+    matrix_figure,
+    plot_store,
+    transform_figure,
+)
 from sobolev_batch.results.tables.convergence import convergence_frame, format_table
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
