@@ -48,7 +48,7 @@ if TYPE_CHECKING:
         StudyError,
     )
     from sobolev_batch.results.accessor import SobolevAccessor
-    from sobolev_batch.results.export import write_witness
+    from sobolev_batch.results.meshes.export import write_witness
     from sobolev_batch.results.opening import open_store
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
@@ -159,7 +159,7 @@ _MODULES = {
     "submit": "batch.submission",
     "verify": "batch.verification",
     "witness": "spectral.metrics.witness",
-    "write_witness": "results.export",
+    "write_witness": "results.meshes.export",
 }
 # What makes or opens fields registers their accessor `field.sobolev` with xarray, which would be too much
 # for the import of the package.

@@ -20,7 +20,7 @@ from sobolev_batch.results.tables.convergence import FORMATS, Format, format_tab
 from sobolev_batch.results.tables.matrix import format_matrix
 
 if TYPE_CHECKING:
-    from sobolev_batch.results.portraits import Axis
+    from sobolev_batch.results.meshes.views import Axis
 
 _FOLLOW_SECONDS = 5.0
 
@@ -176,7 +176,7 @@ def witness_command(
     are no longer the ones that were computed, are named.
     """
     # Imported here, as for plots.
-    from sobolev_batch.results.export import Exporter
+    from sobolev_batch.results.meshes.export import Exporter
 
     exporter = Exporter.of(store, orders or None, folder)
     chosen = exporter.labels(labels)

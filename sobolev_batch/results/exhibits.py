@@ -14,7 +14,7 @@ from sobolev_batch.results.account import minus
 from sobolev_batch.results.figures.embedding import Map, alike_together
 from sobolev_batch.results.figures.plots import MOST_MESHES
 from sobolev_batch.results.figures.spectra import Wavelengths
-from sobolev_batch.results.portraits import Gallery, Portrait
+from sobolev_batch.results.meshes.views import Gallery, Portrait
 from sobolev_batch.results.tables.convergence import convergence_frame, finished_group
 from sobolev_batch.results.tables.matrix import Matrix
 

@@ -27,9 +27,9 @@ from sobolev_batch.results.figures.plots import (
     witness_figure,
 )
 from sobolev_batch.results.figures.spectra import Wavelengths
+from sobolev_batch.results.meshes.render import render
+from sobolev_batch.results.meshes.views import Axis, Gallery, make_gallery
 from sobolev_batch.results.opening import fields_read, open_store
-from sobolev_batch.results.portraits import Axis, Gallery, make_gallery
-from sobolev_batch.results.rendering import render
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import finished_group
 

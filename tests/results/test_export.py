@@ -19,8 +19,8 @@ from plyfile import PlyData
 import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.cli import cli
-from sobolev_batch.results.export import Exporter
-from sobolev_batch.results.witnesses import witness_at_vertices
+from sobolev_batch.results.meshes.export import Exporter
+from sobolev_batch.results.meshes.witness import witness_at_vertices
 from tests.results.spheres import CENTER, LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 
 Spheres = tuple[str, Path]
@@ -252,6 +252,6 @@ def test_without_a_reference_there_is_nothing_to_compare_with(
     place, folder = spheres
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    monkeypatch.setattr("sobolev_batch.results.export.open_store", lambda _: tree)
+    monkeypatch.setattr("sobolev_batch.results.meshes.export.open_store", lambda _: tree)
     with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
         Exporter.of(place, folder=folder)

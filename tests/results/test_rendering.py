@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
-from sobolev_batch.results import rendering
 from sobolev_batch.results.figures.plots import plot_witnesses
-from sobolev_batch.results.portraits import Portrait, make_gallery
-from sobolev_batch.results.rendering import render
+from sobolev_batch.results.meshes import render as rendering
+from sobolev_batch.results.meshes.render import render
+from sobolev_batch.results.meshes.views import Portrait, make_gallery
 from tests.results.drawing import obstacle
 from tests.results.spheres import LABELS, RIGHT
 

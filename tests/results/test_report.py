@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.cli import cli
-from sobolev_batch.results.portraits import make_gallery
+from sobolev_batch.results.meshes.views import make_gallery
 from sobolev_batch.results.report import make_report, write_report
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import convergence_frame

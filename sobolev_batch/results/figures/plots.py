@@ -18,8 +18,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.embedding import Map, alike_together
 from sobolev_batch.results.figures.spectra import Wavelengths
-from sobolev_batch.results.portraits import PICTURES, Axis, Portrait, make_gallery
-from sobolev_batch.results.rendering import Pictures, render, scales
+from sobolev_batch.results.meshes.render import Pictures, render, scales
+from sobolev_batch.results.meshes.views import PICTURES, Axis, Portrait, make_gallery
 from sobolev_batch.results.tables.convergence import chosen_orders, convergence_frame, finished_group
 from sobolev_batch.results.tables.matrix import Matrix
 from sobolev_batch.surfaces.sources.names import file_stem

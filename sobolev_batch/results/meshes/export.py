@@ -11,11 +11,11 @@ import xarray as xr
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
+from sobolev_batch.results.meshes.files import SUFFIXES, VertexField
+from sobolev_batch.results.meshes.rebuild import Remaker, require_known
+from sobolev_batch.results.meshes.witness import witness_at_vertices
 from sobolev_batch.results.opening import fields_read, open_store
-from sobolev_batch.results.remaking import Remaker, require_known
 from sobolev_batch.results.tables.convergence import finished_group
-from sobolev_batch.results.vertex_fields import SUFFIXES, VertexField
-from sobolev_batch.results.witnesses import witness_at_vertices
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.surfaces.sources.names import file_stem
 

@@ -14,9 +14,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.remaking import Remaker, require_known
+from sobolev_batch.results.meshes.rebuild import Remaker, require_known
+from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
 from sobolev_batch.results.tables.convergence import convergence_frame, finished_group
-from sobolev_batch.results.witnesses import witness_at, witness_at_vertices
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.portraits import Portrait
+from sobolev_batch.results.meshes.views import Portrait
 
 # (k, height, width, 3), in red, green and blue.
 Pictures = NDArray[np.uint8]
