@@ -208,6 +208,6 @@ def witness_command(
 def report_command(store: Location, output: Path, folder: Path, up: Axis, witnesses: tuple[str, ...]) -> None:
     """Write everything about STORE into one HTML page that needs nothing besides itself."""
     # Imported here, as for plots.
-    from sobolev_batch.results.report import write_report
+    from sobolev_batch.results.report.build import write_report
 
     click.echo(write_report(store, output, folder=folder, witnesses=witnesses, up=up))

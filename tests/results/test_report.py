@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.cli import cli
 from sobolev_batch.results.meshes.views import make_gallery
-from sobolev_batch.results.report import make_report, write_report
+from sobolev_batch.results.report.build import make_report, write_report
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import convergence_frame
 from tests.results.browser import Browser, browser
@@ -240,12 +240,12 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
 
 
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sobolev_batch.results.account._MOST_LINES", 6)
-    monkeypatch.setattr("sobolev_batch.results.account._MOST_MESHES", 2)
-    monkeypatch.setattr("sobolev_batch.results.exhibits.MOST_MESHES", 3)
+    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_LINES", 6)
+    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_MESHES", 2)
+    monkeypatch.setattr("sobolev_batch.results.report.charts.MOST_MESHES", 3)
     monkeypatch.setattr("sobolev_batch.results.figures.spectra._MOST_MESHES", 2)
     nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
-    monkeypatch.setattr("sobolev_batch.results.report._stills", lambda *_: nothing)
+    monkeypatch.setattr("sobolev_batch.results.report.build._stills", lambda *_: nothing)
     text = make_report(store, folder=folder)
     for note in (
         "2 more meshes are left out here; <code>sobolev-batch table --format csv</code>",
@@ -265,7 +265,7 @@ def test_a_page_without_rendered_pictures_says_why(
     def nothing(*_: object) -> None:
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
-    monkeypatch.setattr("sobolev_batch.results.report.render", nothing)
+    monkeypatch.setattr("sobolev_batch.results.report.build.render", nothing)
     assert make_report(store, folder=folder).count(note) == 1
 
 
@@ -304,7 +304,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
     def damaged(tree: xr.DataTree) -> None:
         raise ValueError("Stored and computed checksum do not match.")
 
-    monkeypatch.setattr("sobolev_batch.results.report.Wavelengths.of_store", damaged)
+    monkeypatch.setattr("sobolev_batch.results.report.build.Wavelengths.of_store", damaged)
     with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
         make_report(store)
 
@@ -312,7 +312,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="no store of a study is there"):
         make_report(tmp_path)
-    monkeypatch.setattr("sobolev_batch.results.report.make_report", lambda *_, **__: "")
+    monkeypatch.setattr("sobolev_batch.results.report.build.make_report", lambda *_, **__: "")
     with pytest.raises(StoreError, match="cannot be written there"):
         write_report(store, tmp_path / "nowhere" / "a.html")
 
@@ -321,7 +321,7 @@ def test_what_is_missing_is_said(store: str, monkeypatch: pytest.MonkeyPatch) ->
     empty = xr.DataTree()
     empty.attrs = open_store(store).attrs
     with monkeypatch.context() as patch:
-        patch.setattr("sobolev_batch.results.report.open_store", lambda place: empty)
+        patch.setattr("sobolev_batch.results.report.build.open_store", lambda place: empty)
         with pytest.raises(InputError, match="no tables yet: run the study to its end"):
             make_report(store)
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)

@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, StoreError, open_store
-from sobolev_batch.results.account import _tables
 from sobolev_batch.results.figures.plots import (
     convergence_figure,
     map_figure,
@@ -18,6 +17,7 @@ from sobolev_batch.results.figures.plots import (
     plot_store,
     transform_figure,
 )
+from sobolev_batch.results.report.content import _tables
 from sobolev_batch.results.tables.convergence import convergence_frame, format_table
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]

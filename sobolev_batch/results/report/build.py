@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import utc_now
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.exhibits import make_exhibits
 from sobolev_batch.results.figures.plots import (
     MOST_VIEWS,
     convergence_figure,
@@ -30,6 +29,7 @@ from sobolev_batch.results.figures.spectra import Wavelengths
 from sobolev_batch.results.meshes.render import render
 from sobolev_batch.results.meshes.views import Axis, Gallery, make_gallery
 from sobolev_batch.results.opening import fields_read, open_store
+from sobolev_batch.results.report.charts import make_exhibits
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import finished_group
 
@@ -96,7 +96,7 @@ def make_report(
         import plotly.offline
         from jinja2.utils import htmlsafe_json_dumps
 
-        from sobolev_batch.results.account import Account, moment
+        from sobolev_batch.results.report.content import Account, moment
     except ImportError as error:
         raise InputError(
             f"a report needs the library {error.name}, which is not installed; "

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.results.account import minus
 from sobolev_batch.results.figures.embedding import Map, alike_together
 from sobolev_batch.results.figures.plots import MOST_MESHES
 from sobolev_batch.results.figures.spectra import Wavelengths
 from sobolev_batch.results.meshes.views import Gallery, Portrait
+from sobolev_batch.results.report.content import minus
 from sobolev_batch.results.tables.convergence import convergence_frame, finished_group
 from sobolev_batch.results.tables.matrix import Matrix
 
