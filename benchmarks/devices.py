@@ -9,7 +9,7 @@ from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import XI_MAX, settings_of_the_paper
 from sobolev_batch.spectral.backends.backends import gpu_backend
-from sobolev_batch.spectral.precision import Precision
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.transform.transform import Transform, transform_block
 
 # Level of the icosphere, intervals per axis, seconds to stay below.

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from sobolev_batch.batch.run import Summary, run
     from sobolev_batch.batch.store.release import release
     from sobolev_batch.batch.study.study import Study
-    from sobolev_batch.batch.submission import Submission, submit
-    from sobolev_batch.batch.verification import Verification, verify
+    from sobolev_batch.batch.submit import Submission, submit
+    from sobolev_batch.batch.verify import Verification, verify
     from sobolev_batch.errors import (
         AccuracyError,
         AddressError,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     )
     from sobolev_batch.results.accessor import SobolevAccessor
     from sobolev_batch.results.meshes.export import write_witness
-    from sobolev_batch.results.opening import open_store
+    from sobolev_batch.results.open import open_store
     from sobolev_batch.spectral.fields import fourier_transform
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.decomposition import proportion
@@ -140,24 +140,24 @@ _MODULES = {
     "StoreError": "errors",
     "Study": "batch.study.study",
     "StudyError": "errors",
-    "Submission": "batch.submission",
+    "Submission": "batch.submit",
     "Summary": "batch.run",
     "Torus": "surfaces.shapes.torus",
-    "Verification": "batch.verification",
+    "Verification": "batch.verify",
     "distance": "spectral.metrics.norms",
     "fourier_transform": "spectral.fields",
     "icosphere": "surfaces.shapes.icosphere",
     "inner_product": "spectral.metrics.norms",
     "norm": "spectral.metrics.norms",
-    "open_store": "results.opening",
+    "open_store": "results.open",
     "proportion": "spectral.metrics.decomposition",
     "proximity": "surfaces.shapes.proximity",
     "read_mesh": "surfaces.formats.readers",
     "release": "batch.store.release",
     "run": "batch.run",
     "spectrum": "spectral.metrics.spectrum",
-    "submit": "batch.submission",
-    "verify": "batch.verification",
+    "submit": "batch.submit",
+    "verify": "batch.verify",
     "witness": "spectral.metrics.witness",
     "write_witness": "results.meshes.export",
 }

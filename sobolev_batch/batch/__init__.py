@@ -1,1 +1,4 @@
-"""A study becomes tasks: study file, plan, store, worker tasks, reduction, run."""
+"""Batch: a study as tasks on a Dask cluster, over a zarr store.
+
+In: a study and the place of a store. Out: stored fields, norms, distances and convergence tables.
+"""

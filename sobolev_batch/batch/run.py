@@ -30,7 +30,7 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.lattice_choice import Choice
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.batch.verification import damaged_rows
+from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.errors.budget import Assessed
 

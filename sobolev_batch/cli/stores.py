@@ -11,10 +11,10 @@ import click
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.release import release
-from sobolev_batch.batch.verification import verify
+from sobolev_batch.batch.verify import verify
 from sobolev_batch.cli.group import EXIT_OTHER, EXIT_SOME_FAILED, cli
 from sobolev_batch.errors import SobolevBatchError, StoreError
-from sobolev_batch.results.opening import fields_read, open_store
+from sobolev_batch.results.open import fields_read, open_store
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import FORMATS, Format, format_table
 from sobolev_batch.results.tables.matrix import format_matrix

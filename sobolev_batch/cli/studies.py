@@ -17,10 +17,10 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.batch.submission import submit
+from sobolev_batch.batch.submit import submit
 from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.reporter import Reporter
-from sobolev_batch.results.opening import open_store
+from sobolev_batch.results.open import open_store
 from sobolev_batch.results.tables.convergence import format_table
 
 _DEFAULT_FOLDER = Path("storage")

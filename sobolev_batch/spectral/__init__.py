@@ -1,1 +1,4 @@
-"""Numbers only: lattices, quadrature, the NUFFT primitive, exact transforms, norms. Knows neither dask nor zarr."""
+"""Spectral: Fourier transforms of surfaces on a lattice, and norms of them with their errors.
+
+In: surfaces, a lattice or a tolerance. Out: fields, norms and distances. Knows neither dask nor zarr.
+"""

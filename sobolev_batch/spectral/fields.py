@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.backends.backends import CPU, Backend, backend_named
+from sobolev_batch.spectral.dtypes import Complexes, Precision
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
 from sobolev_batch.spectral.errors.probe import measure
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.transform import Transform, transform_block

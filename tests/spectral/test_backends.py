@@ -18,10 +18,10 @@ from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fouri
 from sobolev_batch.spectral.backends import backends, cuda
 from sobolev_batch.spectral.backends.arrays import combine, sums_of_runs
 from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.errors.a_priori import Goal
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.transform import Transform, Transformed, transform_block

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block

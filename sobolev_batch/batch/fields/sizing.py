@@ -10,8 +10,8 @@ from itertools import pairwise
 from sobolev_batch.batch.cluster.workers import Crew
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
+from sobolev_batch.spectral.dtypes import item_bytes
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.precision import item_bytes
 from sobolev_batch.spectral.transform.transform import Transform, memory_bytes
 from sobolev_batch.surfaces.sources.registry import Size
 

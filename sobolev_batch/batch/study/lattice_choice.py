@@ -17,11 +17,11 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, lattice_of
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.errors.budget import Assessed, support_widths
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 

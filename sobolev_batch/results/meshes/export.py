@@ -14,7 +14,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.meshes.files import SUFFIXES, VertexField
 from sobolev_batch.results.meshes.rebuild import Remaker, require_known
 from sobolev_batch.results.meshes.witness import witness_at_vertices
-from sobolev_batch.results.opening import fields_read, open_store
+from sobolev_batch.results.open import fields_read, open_store
 from sobolev_batch.results.tables.convergence import finished_group
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.surfaces.sources.names import file_stem

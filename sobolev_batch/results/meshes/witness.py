@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.metrics.witness import witness
-from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]

@@ -28,7 +28,7 @@ from sobolev_batch.results.figures.plots import (
 from sobolev_batch.results.figures.spectra import Wavelengths
 from sobolev_batch.results.meshes.render import render
 from sobolev_batch.results.meshes.views import Axis, Gallery, make_gallery
-from sobolev_batch.results.opening import fields_read, open_store
+from sobolev_batch.results.open import fields_read, open_store
 from sobolev_batch.results.report.charts import make_exhibits
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import finished_group

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
 from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
 from sobolev_batch.spectral.errors.probe import Probe
@@ -17,7 +18,6 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.precision import Precision
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform.transform import Transform
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface

@@ -17,7 +17,7 @@ import numpy as np
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.arrays import Array
-from sobolev_batch.spectral.precision import Precision
+from sobolev_batch.spectral.dtypes import Precision
 from sobolev_batch.spectral.transform.memory import Costs, Shape
 
 _log = logging.getLogger(__name__)

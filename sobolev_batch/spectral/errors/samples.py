@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.probe import Draws, Probe, draw, draw_count, even_probe, join, measure
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.precision import Complexes
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolve
 from sobolev_batch.spectral.transform.transform import Transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh

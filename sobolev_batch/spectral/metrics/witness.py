@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU
+from sobolev_batch.spectral.dtypes import Precision, item_bytes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
-from sobolev_batch.spectral.precision import Precision, item_bytes
 from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
 from sobolev_batch.spectral.transform.memory import Division, Load, divide
 from sobolev_batch.spectral.transform.nufft import evaluate_at

@@ -11,8 +11,8 @@ from itertools import product
 from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.dtypes import Precision, item_bytes
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.precision import Precision, item_bytes
 
 Shape = tuple[int, int, int]
 

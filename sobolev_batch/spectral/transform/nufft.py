@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.backends.arrays import Array, combine
 from sobolev_batch.spectral.backends.backends import CPU, Backend, Plan, evaluation_plan
 from sobolev_batch.spectral.backends.phases import cosine_and_sine
+from sobolev_batch.spectral.dtypes import Complexes, Precision
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.precision import Complexes, Precision
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.memory import Division, Shape, fastest_oversampling, parts
 

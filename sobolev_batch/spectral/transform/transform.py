@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
+from sobolev_batch.spectral.dtypes import Complexes, Precision, item_bytes
 from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.precision import Complexes, Precision, item_bytes
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.transform.memory import Costs, Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.transform.nufft import transform_points
