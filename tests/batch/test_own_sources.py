@@ -12,7 +12,7 @@ import pytest
 
 from sobolev_batch import Sphere, Study, fourier_transform, open_store, run
 from sobolev_batch.batch.cluster.clients import thread_client
-from sobolev_batch.surfaces.sources.registry import registry as sources
+from sobolev_batch.surfaces.sources import registry as sources
 from tests.batch.conftest import variable
 
 PAGE = Path(__file__).parents[2] / "docs" / "surfaces.md"

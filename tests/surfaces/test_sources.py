@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from sobolev_batch import MeshError, Sphere, StudyError, icosphere
 from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, sole_member
-from sobolev_batch.surfaces.sources.registry import registry as sources
+from sobolev_batch.surfaces.sources import registry as sources
 from tests.surfaces.formats import off
 from tests.surfaces.listing import BALL, listed, loaded, members
 from tests.surfaces.shapes import BOX_TRIANGLES, BOX_VERTICES

@@ -12,7 +12,7 @@ import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
-from sobolev_batch.batch.cluster import worker_preload as quiet
+from sobolev_batch.batch.cluster import worker_preload
 from sobolev_batch.batch.cluster.address import Address
 from sobolev_batch.batch.cluster.connection import check_connection
 from sobolev_batch.errors import ClusterError, InputError
@@ -52,7 +52,7 @@ def local_client(workers: int | None = None, memory: str | None = None) -> Itera
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
-                "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), quiet.__name__],
+                "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), worker_preload.__name__],
                 "distributed.deploy.lost-worker-timeout": _LOST_WORKER_SECONDS,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,

@@ -1,6 +1,6 @@
 """Draws meshes off screen: a program of its own, since VTK ends the process where it finds no OpenGL.
 
-`rendering` runs it as ``python easel.py SCENE PICTURES``. It imports nothing of the package, whose path it does
+`render` runs it as ``python _render_process.py SCENE PICTURES``. It imports nothing of the package, whose path it does
 not know. SCENE holds the arrays ``count`` and ``side``, and per mesh i ``vertices_i``, ``triangles_i``,
 ``values_i`` (k, vertices) and ``limits_i`` (k,), where colours end; PICTURES gets ``picture_i`` (k, height, width, 3).
 """

@@ -21,7 +21,7 @@ from sobolev_batch.results.meshes.views import Portrait
 # (k, height, width, 3), in red, green and blue.
 Pictures = NDArray[np.uint8]
 
-_EASEL = Path(__file__).with_name("easel.py")
+_EASEL = Path(__file__).with_name("_render_process.py")
 # A processor draws a picture within a second or two.
 _PATIENCE_SECONDS = 300.0
 _REMEDY = (

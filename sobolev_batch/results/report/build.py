@@ -129,7 +129,7 @@ def make_report(
 
 
 def _part(name: str) -> str:
-    return (resources.files("sobolev_batch.results") / _PAGE / name).read_text(encoding="utf-8")
+    return (resources.files("sobolev_batch.results.report") / _PAGE / name).read_text(encoding="utf-8")
 
 
 def _fingerprint(script: str) -> str:
