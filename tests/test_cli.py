@@ -15,23 +15,9 @@ import pytest
 import trimesh
 
 from sobolev_batch import icosphere
-from tests.results.drawing import obstacle
+from tests.support.commands import STUDY
+from tests.support.drawing import obstacle
 
-STUDY = """
-[study]
-name = "cli"
-[lattice]
-xi_max = 3.0
-M = 16
-[norm]
-orders = [-10.0, -3.0]
-[reference]
-source = "sphere"
-[[family]]
-name = "ico"
-source = "icosphere"
-levels = [0, 1]
-"""
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 

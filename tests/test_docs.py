@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import sobolev_batch as sb
-from tests.test_readme import ROOT
+from tests.support.repository import ROOT
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 import sobolev_batch
 from sobolev_batch import Study, StudyError
-from tests.batch.conftest import small_table
+from tests.support.studies import small_table
 
 PACKAGE = Path(sobolev_batch.__file__).parent
 FORBIDDEN_MODULES = {"dill", "joblib", "marshal", "runpy", "shelve", "subprocess", "yaml"}

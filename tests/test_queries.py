@@ -11,11 +11,8 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from tests.batch.conftest import client
-from tests.gallery import run_blocks, run_icospheres
-from tests.test_readme import ROOT, blocks
-
-__all__ = ["client"]  # a fixture
+from tests.support.gallery import run_blocks, run_icospheres
+from tests.support.repository import ROOT, blocks
 
 
 def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

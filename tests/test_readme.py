@@ -8,12 +8,7 @@ import sys
 from pathlib import Path
 
 import sobolev_batch as sb
-
-ROOT = Path(__file__).parents[1]
-
-
-def blocks(path: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / path).read_text(encoding="utf-8"), re.M | re.S)
+from tests.support.repository import ROOT, blocks
 
 
 def test_the_study_file_is_valid(tmp_path: Path) -> None:

@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
-
 import pytest
 
 import sobolev_batch
+from tests.support.repository import PACKAGE, imported
 
-PACKAGE = Path(sobolev_batch.__file__).parent
 ROOMS = ("surfaces", "spectral", "batch", "results")
-
-
-def imported(path: Path) -> set[str]:
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names.add(node.module or "")
-    return names
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -12,11 +12,8 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from tests.batch.conftest import client
-from tests.gallery import run_blocks, run_icospheres
-from tests.test_readme import ROOT, blocks
-
-__all__ = ["client"]  # a fixture
+from tests.support.gallery import run_blocks, run_icospheres
+from tests.support.repository import ROOT, blocks
 
 
 def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

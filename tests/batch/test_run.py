@@ -25,7 +25,7 @@ from sobolev_batch.batch.analysis import reduce as tabulation
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study import plan as plan_module
-from tests.batch.conftest import SMALL_LATTICE, small_table, variable
+from tests.support.studies import SMALL_LATTICE, small_table, variable
 
 
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:

@@ -22,8 +22,8 @@ from distributed import Client
 from sobolev_batch import ClusterError, open_store
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.connection import check_connection
-from tests.batch.processes import stop
-from tests.clusters.recipes import CERTIFICATES, TABLE, documented, environment, write_study
+from tests.support.processes import stop
+from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, write_study
 
 
 def make_certificates(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

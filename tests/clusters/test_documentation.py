@@ -16,7 +16,7 @@ from distributed.cli import dask_scheduler, dask_worker
 
 from sobolev_batch import Study
 from sobolev_batch.cli import cli
-from tests.clusters.recipes import FOLDER, ROOT, documented
+from tests.support.recipes import FOLDER, ROOT, documented
 
 COMMANDS: dict[tuple[str, ...], click.Command] = {
     ("dask", "scheduler"): dask_scheduler.main,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.clusters.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
+from tests.support.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
 
 SETTINGS = FOLDER / "jobqueue.yaml"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from tests.clusters.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
+from tests.support.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
 
 # Options first, then the command, once per task.
 SRUN = """

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources.decimation import DecimatedMember
 from sobolev_batch.surfaces.sources.files import Files
-from tests.spectral.test_quadrature import BOX
+from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
 Pair = tuple[Surface, Surface]

@@ -15,7 +15,7 @@ from tests.coverage.cases import KINDS, ORDERS, all_cases, cases_of
 from tests.coverage.judging import Tally, Verdict, judge
 from tests.coverage.matern import kernel, radial_integral
 from tests.coverage.truth import Truth, closed_within, on_fine_lattice, summed_in_real_space, truths
-from tests.spectral.test_quadrature import BOX
+from tests.support.shapes import CENTRED_BOX as BOX
 
 SMALL = Mesh(0.9 * BOX.vertices, BOX.triangles)
 

@@ -15,7 +15,7 @@ from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.results.status import Status
-from tests.batch.conftest import small_table, variable
+from tests.support.studies import small_table, variable
 
 ALL = ("f/a", "f/b", "reference")
 

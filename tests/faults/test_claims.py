@@ -19,7 +19,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM, Claim, claimed, take
 from sobolev_batch.batch.store.records import utc_now
 from sobolev_batch.batch.store.store import Store
-from tests.faults.commands import command, write_toml
+from tests.support.commands import command, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often.
 DRIVER = """

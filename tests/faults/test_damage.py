@@ -15,9 +15,9 @@ from distributed import Client
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
-from tests.batch.conftest import small_table, variable
-from tests.faults.commands import command, write_toml
-from tests.faults.comparing import assert_same_fields, assert_same_tables
+from tests.support.commands import command, write_toml
+from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.studies import small_table, variable
 
 FIELD = "fourier/fourier/c/{row}/0/0/0"
 

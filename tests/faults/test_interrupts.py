@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch.batch.storage.lock import CLAIM
-from tests.faults.commands import command, read_until, started, write_toml
+from tests.support.commands import command, read_until, started, write_toml
 
 # Generous for a machine that does other things too; alone it takes two.
 _SECONDS = 30

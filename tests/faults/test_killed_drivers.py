@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch.batch.store.store import Store
-from tests.faults.commands import command, read_until, started, write_toml
-from tests.faults.comparing import assert_same_fields, assert_same_tables
+from tests.support.commands import command, read_until, started, write_toml
+from tests.support.stores import assert_same_fields, assert_same_tables
 
 
 @pytest.mark.parametrize("line", ["dashboard:", "[2/5]", "tables reduced"])

@@ -12,10 +12,10 @@ import pytest
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.store.store import Store
-from tests.batch.conftest import variable
-from tests.faults.commands import TOML, write_toml
-from tests.faults.comparing import assert_same_fields, assert_same_tables
 from tests.faults.fatal import Moment, fatal
+from tests.support.commands import TOML, write_toml
+from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.studies import variable
 
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
 

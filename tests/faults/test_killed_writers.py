@@ -11,7 +11,7 @@ from typing import Any
 from sobolev_batch import Study
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
-from tests.batch.conftest import small_table
+from tests.support.studies import small_table
 
 KILLS = 60
 
@@ -34,7 +34,7 @@ from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
-from tests.batch.conftest import small_table
+from tests.support.studies import small_table
 
 path = Path(sys.argv[1])
 plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
@@ -93,7 +93,7 @@ from pathlib import Path
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.store.create import prepare_store
-from tests.batch.conftest import small_table
+from tests.support.studies import small_table
 
 plan = make_plan(Study.from_table(small_table()))
 replace, left = Path.replace, 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.commands import command, write_toml
+from tests.support.commands import command, write_toml
 
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.store.store import Store
-from tests.faults.comparing import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_fields, assert_same_tables
 
 
 def test_workers_and_threads(study: Study, finished_store: Path, tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.run import rows_of
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.fields.tasks import Job, compute_mesh
-from tests.batch.conftest import small_table
+from tests.support.studies import small_table
 
 plan = make_plan(Study.from_table(small_table()))
 store = Store.open(sys.argv[1])

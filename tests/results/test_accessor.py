@@ -14,9 +14,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.results.accessor import SobolevAccessor
-from tests.batch.conftest import SMALL_LATTICE, client, finished_store, variable
-
-__all__ = ["client", "finished_store"]  # fixtures
+from tests.support.studies import SMALL_LATTICE, variable
 
 ORDERS = [-1.5, -7.0]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sobolev_batch import icosphere
-from tests.surfaces.formats import off
+from tests.support.mesh_files import off
 
 STUDY = """
 [study]

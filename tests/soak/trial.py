@@ -13,11 +13,11 @@ from pathlib import Path
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage.location import Location
-from tests.batch.failing_storage import HEALTHY, FailingStorage, Kind, Rule, failing
-from tests.batch.object_storage import BUCKET, serving, taken_for_s3
 from tests.soak.comparison import differences
 from tests.soak.havoc import Havoc, Plan
 from tests.soak.meshes import write_study
+from tests.support.failing_storage import HEALTHY, FailingStorage, Kind, Rule, failing
+from tests.support.object_storage import BUCKET, serving, taken_for_s3
 
 _WORKERS = 2
 # Workers and drivers that are killed leave much to say to those that go on.

@@ -1,0 +1,143 @@
+"""Tiles of rows: that they cover every pair, fit, and measure what pair by pair would give."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import Sphere, Study, fourier_transform, proportion
+from sobolev_batch.batch.analysis import tiles as reduction
+from sobolev_batch.batch.analysis.tiles import Reducer
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.study import plan as planning
+from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.spectral.shells import shell_sums, shell_weights
+from tests.support.studies import SMALL_LATTICE, small_table
+
+ROWS = 11
+CENTER = 4
+TWINS = 2, 9
+
+
+@pytest.fixture
+def fields() -> NDArray[np.complex128]:
+    rng = np.random.default_rng(0)
+    shape = ROWS, *SMALL_LATTICE.shape
+    fields = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    # So near to each other that their distance cannot come from products with the others.
+    fields[TWINS[1]] = fields[TWINS[0]] * (1 + 1e-7)
+    return fields
+
+
+@pytest.fixture
+def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytest.MonkeyPatch) -> Reducer:
+    """Of fields in several chunks, with room for three rows, one that meets them, and one that is read."""
+    monkeypatch.setattr(planning, "_LARGEST_CHUNK_BYTES", 16_000)
+    family = {"name": "ico", "source": "icosphere", "levels": list(range(ROWS - 1))}
+    study = Study.from_table(small_table(family=[family]))
+    plan = make_plan(study)
+    assert len(plan.blocks) > 2
+    store = prepare_store(store_path, plan)
+    checksums: dict[int, tuple[int, ...]] = dict.fromkeys(range(ROWS), ())
+    for block in plan.blocks:
+        place = plan.lattice.place(block)
+        for row, field in enumerate(fields):
+            checksums[row] += (store.write_field(row, place, field[place]),)
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 5 * 16 * plan.blocks[0].size)
+    areas, errors = np.ones(ROWS), np.zeros((2, ROWS))
+    return Reducer(store, plan.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13), checksums)
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 500])
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 11, 200])
+def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int) -> None:
+    rows = list(range(5, 5 + 3 * count, 3))
+    pairs = []
+    for side, others in reducer.tiles(rows, workers):
+        assert len(side) <= 3
+        assert list(others[: len(side)]) == list(side) or not set(side) & set(others)
+        shared = set(side) & set(others)
+        pairs += [(i, j) for i in side for j in others if i <= j or not {i, j} <= shared]
+    assert sorted(pairs) == list(combinations_with_replacement(rows, 2))
+    assert [row for strip in reducer.strips(rows, workers) for row in strip] == rows
+
+
+def test_many_workers_get_smaller_tiles(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 1 << 30)
+    rows = range(500)
+    assert [len(strip) for strip in reducer.strips(rows, 2)] == [125] * 4
+    assert len(list(reducer.tiles(rows, 2))) == 4
+    assert len(list(reducer.tiles(rows, 8))) >= 16
+
+
+def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
+    lattice = reducer.lattice
+    found = np.full((2, ROWS, ROWS), np.nan)
+    for rows, others in reducer.tiles(list(range(ROWS)), 1):
+        values = reducer.tile(rows, others).values
+        found[:, np.array(rows)[:, None], np.array(others)] = values
+        found[:, np.array(others)[:, None], np.array(rows)] = np.swapaxes(values, 1, 2)
+    assert np.array_equal(found, np.swapaxes(found, 1, 2))
+    assert (np.diagonal(found, axis1=1, axis2=2) == 0).all()
+    weights = shell_weights(lattice, reducer.orders)
+    for i in range(ROWS):
+        sums = shell_sums(fields - fields[i], None, lattice, lattice.half)
+        assert found[:, i] == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-10)
+
+
+def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, others = [0, 2, CENTER], [0, 2, CENTER, 7, 9]
+    by_products = reducer.tile(rows, others)
+    monkeypatch.setattr(reduction, "_TILE_BYTES", 3 * 16 * reducer.blocks[0].size)
+    monkeypatch.setattr(Reducer, "_block_sums", None)
+    for found, expected in zip(reducer.tile(rows, others), by_products, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("rows", "others"), [([0, 1], [3, 4, 9]), ([2], [9]), ([5], [6, 7, 8])])
+@pytest.mark.parametrize("fitting", [5, 3])
+def test_tiles_whose_others_are_all_other_rows(
+    reducer: Reducer,
+    fields: NDArray[np.complex128],
+    monkeypatch: pytest.MonkeyPatch,
+    rows: list[int],
+    others: list[int],
+    fitting: int,
+) -> None:
+    monkeypatch.setattr(reduction, "_TILE_BYTES", fitting * 16 * reducer.blocks[0].size)
+    found = reducer.tile(rows, others).values
+    lattice = reducer.lattice
+    differences = (fields[rows][:, None] - fields[others]).reshape(-1, *lattice.shape)
+    sums = shell_sums(differences, None, lattice, lattice.half)
+    expected = np.sqrt(shell_weights(lattice, reducer.orders) @ sums.T).reshape(found.shape)
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
+def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
+    norms, to_center, parts = reducer.norms([1, 3, CENTER])
+    weights = shell_weights(reducer.lattice, reducer.orders)
+    for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
+        sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
+        assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)
+    # The parts of each distance are those of the library, whatever the chunks.
+    for row, area, shape in zip([1, 3], parts.area.T, parts.shape.T, strict=False):
+        known = fourier_transform(Sphere(0.1), reducer.lattice)
+        alone = proportion(known.copy(data=fields[row]), known.copy(data=fields[CENTER]), reducer.orders)
+        assert area == pytest.approx(alone["area_part"].values, rel=1e-10)
+        assert shape == pytest.approx(alone["shape_part"].values, rel=1e-12)
+    assert (parts.area**2 + parts.shape**2)[:, :2] == pytest.approx(to_center.values[:, :2] ** 2, rel=1e-12)
+    assert (parts.area[:, 2] == 0).all()
+    assert (parts.shape[:, 2] == 0).all()
+
+
+def test_without_a_center_there_are_norms_alone(reducer: Reducer) -> None:
+    norms, to_center, parts = replace(reducer, center=None).norms([1, 3])
+    assert norms.values == pytest.approx(reducer.norms([1, 3])[0].values, rel=1e-14)
+    for found in (*to_center, *parts):
+        assert found.shape == norms.values.shape
+        assert np.isnan(found).all()

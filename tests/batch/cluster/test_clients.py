@@ -1,0 +1,192 @@
+"""Real schedulers and workers, as users start them, and the ports that a local cluster opens."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import dask as dask_settings
+import numpy as np
+import psutil
+import pytest
+from distributed import Client
+
+from sobolev_batch import AddressError, ClusterError, Study, open_store, run
+from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.recipes import write_study
+from tests.support.studies import variable
+
+
+@pytest.fixture
+def tcp_scheduler() -> Iterator[str]:
+    """The address of a `dask scheduler` with two `dask worker` processes."""
+    with tcp_cluster([], []) as (address, _):
+        yield address
+
+
+def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
+    tcp_scheduler: str, study: Study, finished_store: Path, store_path: Path
+) -> None:
+    with remote_client(tcp_scheduler) as client:
+        summary = run(study, store_path, client)
+    assert len(summary.computed) == 5
+    ours, theirs = open_store(store_path), open_store(finished_store)
+    assert np.array_equal(variable(ours, "fourier", "fourier").values, variable(theirs, "fourier", "fourier").values)
+    assert np.array_equal(
+        variable(ours, "distances", "distance").values, variable(theirs, "distances", "distance").values
+    )
+    workers = set(variable(ours, "meshes", "worker").values.tolist())
+    assert len(workers) == 2
+
+
+def test_no_scheduler_there() -> None:
+    with (
+        pytest.raises(ClusterError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"),
+        remote_client("tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_a_scheduler_without_workers() -> None:
+    scheduler = dask(*SCHEDULER)
+    try:
+        address = scheduler_address(scheduler)
+        with pytest.raises(ClusterError, match="has no workers; start some with: dask worker"), remote_client(address):
+            pass
+    finally:
+        stop(scheduler)
+
+
+def _die_once(mark: Path) -> int:
+    """End this process the first time; its id the second."""
+    if not mark.exists():
+        mark.touch()
+        os._exit(1)
+    return os.getpid()
+
+
+def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
+    # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
+    with dask_settings.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1) as client:
+        first = client.submit(os.getpid, pure=False).result(timeout=60)
+        assert client.submit(_die_once, tmp_path / "mark").result(timeout=120) != first
+
+
+def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: Path) -> None:
+    """0.0.0.0 leads to loopback, and is not known to: what listens here nobody else reaches."""
+    write_study(tmp_path)
+    with tcp_cluster([]) as (address, _):
+        beyond = address.replace("127.0.0.1", "0.0.0.0")
+        arguments: list[str | Path] = ["plan", tmp_path / "study.toml", "--scheduler", beyond]
+        refused, trusted = cli(*arguments), cli(*arguments, "--trust-network")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"error: the scheduler at {beyond} is neither encrypted nor on loopback (0.0.0.0)")
+    assert trusted.returncode == 0, trusted.stderr
+    assert "1, with 1 threads" in trusted.stdout
+
+
+def test_a_worker_that_others_could_reach_counts_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    listening = ["--listen-address", f"tcp://127.0.0.1:{port}", "--contact-address", f"tcp://0.0.0.0:{port}"]
+    scheduler = dask(*SCHEDULER)
+    processes = [scheduler]
+    try:
+        address = scheduler_address(scheduler)
+        processes.append(dask("worker", address, *WORKER[2:], *listening))
+        with Client(address) as client:
+            client.wait_for_workers(1, timeout=60)
+        with (
+            pytest.raises(AddressError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"),
+            remote_client(address),
+        ):
+            pass
+        with remote_client(address, trust_network=True) as client:
+            assert client.submit(abs, -1).result() == 1
+    finally:
+        for process in reversed(processes):
+            stop(process)
+
+
+def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
+    write_study(tmp_path)
+    done = cli("submit", tmp_path / "study.toml", "--scheduler", "host")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: 'host' is not the address of a scheduler (missing port number")
+    assert done.stderr.count("\n") == 1
+
+
+def listening(*processes: psutil.Process) -> set[tuple[str, int]]:
+    """The addresses that processes and all that they started listen at."""
+    everyone = [one for process in processes for one in (process, *process.children(recursive=True))]
+    return {
+        (connection.laddr.ip, connection.laddr.port)
+        for one in everyone
+        for connection in one.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+RUN = """
+import sys
+import sobolev_batch as sb
+
+def pause(progress):
+    if progress.stage == "fields" and progress.done == 1:
+        print(flush=True)
+        sys.stdin.readline()
+
+if __name__ == "__main__":
+    sb.run(sb.Study.from_toml(sys.argv[1]), sys.argv[2], workers=2, on_progress=pause)
+"""
+# The command itself, stopped where it would draw.
+COMMAND = """
+import sys
+from sobolev_batch import cli
+from sobolev_batch.cli import studies
+from sobolev_batch.cli.reporter import Reporter
+
+class Pausing(Reporter):
+    def __call__(self, progress):
+        super().__call__(progress)
+        if progress.stage == "fields" and progress.done == 1:
+            print(flush=True)
+            sys.stdin.readline()
+
+if __name__ == "__main__":
+    studies.Reporter = Pausing
+    sys.argv[1:] = ["run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
+    cli.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("script", "store", "least"),
+    [(RUN, "of-run.zarr", 4), (COMMAND, "of-command.zarr", 4), (RUN, "memory://of-threads", 2)],
+    ids=["run", "command", "threads"],
+)
+def test_every_port_of_a_run_is_on_loopback(script: str, store: str, least: int, tmp_path: Path) -> None:
+    """Scheduler, its dashboard, each worker with its nanny and web pages; threads have web pages alone."""
+    write_study(tmp_path)
+    (tmp_path / "script.py").write_text(script)
+    command = [sys.executable, "script.py", "study.toml", store]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()  # it computes, and waits
+        found = listening(psutil.Process(process.pid))
+        errors = process.communicate("\n", timeout=120)[1]
+    assert process.returncode == 0, errors
+    assert {ip for ip, _ in found} <= {"127.0.0.1", "::1"}, found
+    assert len(found) >= least, found

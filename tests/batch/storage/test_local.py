@@ -1,0 +1,88 @@
+"""Links in a store: what they lead to beyond it is neither read nor written nor removed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch.batch.storage.local import place_of
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.results.status import Status
+from tests.support.studies import small_table, variable
+
+
+@pytest.fixture
+def copy(finished_store: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_store, tmp_path / "copy.zarr"))
+
+
+def lead_away(path: Path, target: str | Path) -> None:
+    """Put a link in the place of a file or folder."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+    path.symlink_to(target)
+
+
+@pytest.mark.parametrize("key", ["zarr.json", "records/zarr.json", "records/record/c/1", "fourier/mesh/c/0"])
+def test_what_lies_elsewhere_is_not_read(copy: Path, key: str) -> None:
+    # Whoever followed it would read for ever.
+    lead_away(copy / key, "/dev/zero")
+    with pytest.raises(StoreError, match=f"{key}: a link, which may lead out of the store"):
+        Status.of(copy)
+
+
+def test_a_field_that_lies_elsewhere_is_not_read(copy: Path, tmp_path: Path) -> None:
+    chunks = copy / "fourier" / "fourier" / "c"
+    shutil.copytree(chunks, tmp_path / "elsewhere")
+    lead_away(chunks, tmp_path / "elsewhere")
+    tree = open_store(copy)
+    with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+        np.asarray(variable(tree, "fourier", "fourier").values)
+
+
+def test_nothing_is_written_or_removed_elsewhere(copy: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "5").mkdir(parents=True)
+    (elsewhere / "5" / "precious").write_text("text")
+    for key in ("records/record/c", "convergence", "scratch"):
+        store = Path(shutil.copytree(copy, tmp_path / f"{key.replace('/', '-')}.zarr"))
+        (store / key).mkdir(exist_ok=True)
+        lead_away(store / key, elsewhere)
+        location = Location.of(store)
+        with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+            location.write({f"{key}/5/new": b"bytes"})
+        with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+            location.remove(f"{key}/5")
+        with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+            location.remove(key)
+    with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+        run(Study.from_table(small_table()), tmp_path / "records-record-c.zarr")
+    assert [path.name for path in elsewhere.rglob("*")] == ["5", "precious"]
+
+
+def test_keys_that_climb(tmp_path: Path) -> None:
+    for key in ("../other", "/etc/passwd", "a/../../b"):
+        with pytest.raises(StoreError, match="leads out of the store"):
+            place_of(tmp_path / "store.zarr", key)
+    assert place_of(tmp_path, "a/b") == tmp_path / "a" / "b"
+
+
+def test_a_pipe_is_not_waited_for(copy: Path) -> None:
+    (copy / "records" / "record" / "c" / "1").unlink()
+    os.mkfifo(copy / "records" / "record" / "c" / "1")
+    with pytest.raises(StoreError, match="neither a file nor a folder, in a store"):
+        Status.of(copy)
+
+
+def test_the_store_itself_may_be_reached_by_a_link(copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.zarr").symlink_to(copy)
+    assert Status.of(tmp_path / "link.zarr").complete == 5
+    assert Store.open(tmp_path / "link.zarr").labels() == Store.open(copy).labels()

@@ -1,0 +1,462 @@
+"""Stores in object storage, against a server that speaks S3, and in memory."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Barrier
+
+import fsspec
+import numpy as np
+import psutil
+import pytest
+import xarray as xr
+from distributed import Client
+from zarr.storage import FsspecStore
+
+from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
+from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import CLAIM, Claim, take
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.study.plan import make_plan
+from tests.support.commands import STUDY, call
+from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
+from tests.support.stores import READER, assert_same
+from tests.support.studies import small_table, variable
+
+pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
+
+COMMAND = [sys.executable, "-m", "sobolev_batch"]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """A server that this process, and all that it starts, takes for S3."""
+    with serving() as server, taken_for_s3(server.environment()):
+        yield server
+
+
+@pytest.fixture(scope="module")
+def s3_client(server: Server) -> Iterator[Client]:
+    """Two worker processes that know the server."""
+    with local_client(2) as client:
+        yield client
+
+
+@pytest.fixture
+def url(request: pytest.FixtureRequest) -> str:
+    """A place that no other test uses."""
+    return f"s3://{BUCKET}/{re.sub(r'[^a-z0-9]+', '-', request.node.name.lower())}/results.zarr"
+
+
+@pytest.fixture(scope="module")
+def stored(server: Server, s3_client: Client) -> str:
+    """The small study's store after a run; not to be changed."""
+    url = f"s3://{BUCKET}/finished/results.zarr"
+    assert len(run(Study.from_table(small_table()), url, s3_client).computed) == 5
+    return url
+
+
+def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, stored: str, finished_store: Path) -> None:
+    tree = open_store(stored)
+    assert_same(tree, open_store(finished_store))
+    assert len(set(variable(tree, "meshes", "worker").values.tolist())) == 2
+    # What is written is what a folder holds, key for key.
+    assert {key.split("results.zarr/")[1] for key in server.keys("finished/")} == {
+        str(path.relative_to(finished_store)) for path in finished_store.rglob("*") if path.is_file()
+    }
+
+
+def test_a_second_run_reuses_and_writes_no_field(server: Server, s3_client: Client, url: str) -> None:
+    study = Study.from_table(small_table())
+    first = run(study, url, s3_client)
+    server.requests()
+    steps: list[Progress] = []
+    second = run(study, url, s3_client, on_progress=steps.append)
+    assert (second.computed, second.reused) == ((), first.computed)
+    assert steps == []
+    made = server.requests()
+    root = url.replace("s3:/", "")
+    written = {path for method, path in made if method not in ("GET", "HEAD")}
+    assert written == {f"{root}/zarr.json", f"{root}/records/zarr.json", f"{root}/claim.json"}
+    assert len(made) < 36
+
+
+def test_requests_grow_by_six_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
+    counts = []
+    for meshes in (4, 14):
+        family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(meshes)]
+        study = Study.from_table(small_table(family=family))
+        server.requests()
+        run(study, url.replace("results", str(meshes)), s3_client)
+        counts.append(len(server.requests()))
+    # The field and its record written; looks for an older record by driver and task; the field read for norms and
+    # for pairs.
+    assert counts[1] - counts[0] <= 6 * 10 + 4
+    assert counts[0] < 190
+
+
+def test_an_interrupted_run_goes_on_from_what_is_stored(
+    server: Server, s3_client: Client, url: str, stored: str
+) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 2:
+            raise KeyboardInterrupt
+
+    study = Study.from_table(small_table())
+    with pytest.raises(KeyboardInterrupt):
+        run(study, url, s3_client, on_progress=interrupt)
+    again = run(study, url, s3_client)
+    assert len(again.reused) >= 2
+    assert len(again.computed) + len(again.reused) == 5
+    assert_same(open_store(url), open_store(stored))
+
+
+def test_meshes_added_to_a_study_join_its_store(s3_client: Client, url: str) -> None:
+    table = small_table(lattice={"xi_max": 3.0, "M": 40})
+    run(Study.from_table(table), url, s3_client)
+    more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
+    assert run(Study.from_table({**table, "family": more}), url, s3_client).computed == ("late/sphere",)
+    assert variable(open_store(url), "convergence", "distance").sizes["mesh"] == 6
+    assert np.isfinite(variable(open_store(url), "norms", "norm").values).all()
+
+
+def test_comparisons_are_those_of_a_folder(server: Server, s3_client: Client, url: str, tmp_path: Path) -> None:
+    table = small_table(
+        reference={"source": "icosphere", "levels": [4]}, witness={"orders": [-2.0]}, proximity={"points": 100}
+    )
+    fewer = {**table, "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}]}
+    folder = tmp_path / "results.zarr"
+    for place in (url, str(folder)):
+        run(Study.from_table(fewer), place, s3_client)
+        assert not run(Study.from_table(table), place, s3_client).not_compared
+    for group, name in (("witness", "witness"), ("proximity", "hausdorff"), ("proximity", "chamfer")):
+        ours, theirs = (variable(open_store(place), group, name).load() for place in (url, str(folder)))
+        assert np.isfinite(ours.isel(mesh=slice(0, 4))).sum() == np.isfinite(theirs.isel(mesh=slice(0, 4))).sum() > 0
+        xr.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert verify(url).is_sound
+    run(Study.from_table({**table, "witness": {"orders": [-3.0]}}), url, s3_client)
+    assert variable(open_store(url), "witness", "order").values.tolist() == [-3.0]
+    run(Study.from_table(small_table(reference=table["reference"])), url, s3_client)
+    prefix = url.removeprefix(f"s3://{BUCKET}/")
+    assert not [key for key in server.keys(prefix) if "/witness/" in key or "/proximity/" in key]
+
+
+def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
+    table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
+    del table["lattice"]
+    plan = make_plan(Study.from_table(table))
+    store = prepare_store(url, plan)
+    prefix = url.removeprefix(f"s3://{BUCKET}/")
+    empty = server.keys(prefix)
+    store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
+    store.write_record(1, Record("key", "complete"))
+    Tables(store).write("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
+    store.consolidate()
+    assert len(server.keys(prefix)) == len(empty) + 5
+    finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
+    again = prepare_store(url, finer)
+    assert server.keys(prefix) == empty
+    assert again.records() == (None,) * 5
+    assert Tables(again).attributes("norms") is None
+    assert np.isnan(again.read_fields([1], finer.lattice.place(finer.blocks[0]))).all()
+    assert Store.open(url).labels() == store.labels()
+
+
+def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", READER, stored], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert 0.003 < float(done.stdout) < 0.006
+
+
+def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    assert f"{url}, 0 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    done = call("run", "study.toml", "--store", url, "--workers", "2", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
+    assert "botocore" not in done.stderr
+    assert f"{url}, 3 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    status = call("status", url, folder=tmp_path).stdout.splitlines()
+    assert status[0] == f"{url}: 3 of 3 complete, 0 failed, 0 to go"
+    assert status[1].startswith("done; by process ")
+    table = call("table", url, "--format", "csv", folder=tmp_path)
+    assert table.stdout.count("\n") == 5
+    drawn = call("plot", url, folder=tmp_path).stdout.split()
+    assert {"convergence.png", "transform.png"} <= set(drawn)
+    assert {path.name for path in tmp_path.iterdir()} == {"study.toml", *drawn}
+
+
+def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    done = call("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
+    assert done.returncode == 0, done.stderr
+    assert "DEBUG" in done.stderr
+    keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
+    stored = b"".join(server.client().get_object(Bucket=BUCKET, Key=key)["Body"].read() for key in keys)
+    for hidden in (SECRET, TOKEN, "Signature=", "tester", server.url):
+        assert hidden not in done.stdout
+        assert hidden == server.url or hidden not in done.stderr
+        assert hidden.encode() not in stored
+
+
+def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table()))
+    store = prepare_store(url, plan)
+    place = plan.lattice.place(plan.blocks[0])
+    for row, value in ((1, 0), (3, 1)):
+        store.write_field(row, place, np.full(plan.lattice.shape, value, dtype=complex))
+    prefix = url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c"
+    assert server.keys(prefix) == [f"{prefix}/{row}/0/0/0" for row in (1, 3)]
+    fields = Store.open(url).read_fields([0, 1, 3], place)
+    assert np.isnan(fields[0]).all()
+    assert (fields[1] == 0).all()
+    s3 = server.client()
+    data = bytearray(s3.get_object(Bucket=BUCKET, Key=f"{prefix}/3/0/0/0")["Body"].read())
+    data[1000] ^= 4
+    s3.put_object(Bucket=BUCKET, Key=f"{prefix}/3/0/0/0", Body=bytes(data))
+    with pytest.raises(StoreError, match="the field of ico/3 is damaged"):
+        store.read_fields([1, 3], place)
+
+
+def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 240})))
+    store = prepare_store(url, plan)
+    place = plan.lattice.place(plan.blocks[0])
+    values = np.arange(plan.lattice.half.size, dtype=complex).reshape(plan.lattice.shape)
+    assert values.nbytes > 100 << 20
+    server.requests()
+    store.write_field(0, place, values)
+    assert sum("partNumber=" in path for _, path in server.requests()) > 1
+    assert np.array_equal(store.read_fields([0], place)[0], values)
+    # Small keys are read without a look at their size, large ones in parts at once.
+    readers = [store.location.keys(size) for size in (1 << 20, 100 << 20)]
+    assert [reader.fs.max_concurrency > 1 for reader in readers if isinstance(reader, FsspecStore)] == [False, True]
+
+
+def test_places_that_hold_something_else(server: Server, url: str) -> None:
+    plan = make_plan(Study.from_table(small_table()))
+    server.client().put_object(Bucket=BUCKET, Key=url.removeprefix(f"s3://{BUCKET}/") + "/precious.txt", Body=b"text")
+    with pytest.raises(StoreError, match="not empty and holds no store"):
+        prepare_store(url, plan)
+    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == 1
+    prepare_store(url + "/below", plan)
+    with pytest.raises(StoreError, match="a store of another study is there, with the study 'small', not 'other'"):
+        prepare_store(url + "/below", make_plan(Study.from_table(small_table(study={"name": "other"}))))
+
+
+@pytest.fixture
+def deaf() -> Iterator[str]:
+    """An endpoint that takes connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+
+def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path: Path, deaf: str) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    there, nowhere = f"s3://{BUCKET}/nothing.zarr", "s3://no-such-bucket/results.zarr"
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    unknown = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
+    cases: list[tuple[tuple[str, ...], dict[str, str], str]] = [
+        (("status", there), {}, "no store of a study is there"),
+        (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
+        (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
+        (("run", "study.toml", "--store", there), {"AWS_ENDPOINT_URL": deaf}, "nothing answers there within 20 s"),
+        (("table", there), unknown, "no credentials (Unable to locate credentials); set those of s3://"),
+    ]
+    for arguments, environment, message in cases:
+        started = time.monotonic()
+        done = call(*arguments, folder=tmp_path, **environment)
+        assert done.returncode == 2, done.stderr
+        assert message in done.stderr, done.stderr
+        assert done.stderr.startswith("error: ")
+        assert done.stderr.count("\n") == 1
+        assert SECRET not in done.stderr
+        assert done.stdout == ""
+        assert time.monotonic() - started < 90
+    assert server.keys("nothing.zarr") == []
+
+
+def test_a_missing_driver_is_named(tmp_path: Path) -> None:
+    script = "import sys; sys.modules['s3fs'] = None; sys.argv[1:] = ['status', 's3://b/x.zarr']\n"
+    script += "from sobolev_batch.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "pip install 'sobolev-batch[s3]'" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    read = '{"Effect": "Allow", "Action": ["s3:Get*", "s3:List*", "s3:Head*"], "Resource": "*"}'
+    with serving() as server:
+        iam = server.client("iam")
+        iam.create_user(UserName="reader")
+        iam.put_user_policy(
+            UserName="reader", PolicyName="p", PolicyDocument=f'{{"Version": "2012-10-17", "Statement": [{read}]}}'
+        )
+        made = iam.create_access_key(UserName="reader")["AccessKey"]
+        reader = server.environment(made["AccessKeyId"], made["SecretAccessKey"])
+        # Another may write, and has done so.
+        assert (
+            call(
+                "run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **server.environment()
+            ).returncode
+            == 0
+        )
+        before = server.keys("")
+        server.enforce(True)
+        assert call("status", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **reader).returncode == 0
+        for arguments, environment, message in [
+            (("run", "study.toml", "--store", f"s3://{BUCKET}/b.zarr"), reader, "cannot be written: access is denied"),
+            (("run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr"), reader, "cannot be written: access is denied"),
+            (("status", f"s3://{BUCKET}/a.zarr"), server.environment("AKIANOBODY"), "cannot be read: access is denied"),
+            (
+                ("status", f"s3://{BUCKET}/a.zarr"),
+                {**reader, "AWS_SECRET_ACCESS_KEY": SECRET},
+                "cannot be read: access is denied",
+            ),
+        ]:
+            done = call(*arguments, folder=tmp_path, **environment)
+            assert done.returncode == 2, done.stderr
+            assert message in done.stderr, done.stderr
+            assert done.stderr.startswith("error: ")
+            assert done.stderr.count("\n") == 1
+            assert SECRET not in done.stderr
+            assert made["SecretAccessKey"] not in done.stderr
+        server.enforce(False)
+        assert server.keys("") == before
+
+
+def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    def kill(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 1:
+            brief.process.kill()
+
+    with serving() as brief:
+        for name, value in {**brief.environment(), **IMPATIENT}.items():
+            monkeypatch.setenv(name, value)
+        forget_drivers()
+        try:
+            with pytest.raises(
+                StoreError, match=rf"s3://{BUCKET}/x.zarr: the store cannot be (read|written): .*connect"
+            ):
+                run(study, f"s3://{BUCKET}/x.zarr", workers=1, on_progress=kill)
+        finally:
+            forget_drivers()
+
+
+def test_workers_that_do_not_reach_the_store_are_found_at_once(server: Server, url: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
+        with local_client(1) as client:
+            patch.undo()
+            with pytest.raises(
+                StoreError, match=r"the worker tcp://\S+ cannot use the store: s3://.*Could not connect"
+            ):
+                run(Study.from_table(small_table()), url, client)
+    assert server.keys(url.removeprefix(f"s3://{BUCKET}/")) == []
+
+
+def test_a_store_in_memory_is_computed_by_threads(study: Study, finished_store: Path) -> None:
+    place = "memory://a/results.zarr"
+    steps: list[Progress] = []
+    summary = run(study, place, workers=2, on_progress=steps.append)
+    assert (summary.store, len(summary.computed), summary.failed) == (place, 5, {})
+    assert steps[0].label.startswith("http://127.0.0.1:")
+    assert len(run(study, place).reused) == 5
+    assert_same(open_store(place), open_store(finished_store))
+    assert_same(xr.open_datatree(place, engine="zarr"), open_store(finished_store))
+    with thread_client(2) as client:
+        assert len(run(study, "memory://b/results.zarr", client).computed) == 5
+    with pytest.raises(StoreError, match="no store of a study is there"):
+        open_store("memory://c/results.zarr")
+
+
+def test_a_store_in_memory_is_refused_where_workers_are_other_processes(client: Client, study: Study) -> None:
+    steps: list[Progress] = []
+    with pytest.raises(
+        StoreError, match=r"stays in the memory of one process, and the worker tcp://\S+ is another one"
+    ):
+        run(study, "memory://d/results.zarr", client, on_progress=steps.append)
+    assert steps == []
+    assert not fsspec.filesystem("memory").exists("/d")
+
+
+def test_a_cluster_of_threads_listens_on_loopback_only() -> None:
+    before = listening()
+    with thread_client(1) as client:
+        opened = listening() - before
+        assert client.dashboard_link in {f"http://{ip}:{port}/status" for ip, port in opened}
+        assert {ip for ip, _ in opened} == {"127.0.0.1"}
+
+
+def listening() -> set[tuple[str, int]]:
+    """The addresses at which this process takes connections."""
+    found = psutil.Process().net_connections(kind="inet")
+    return {(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
+    location, key = Location.of(url), url.removeprefix(f"s3://{BUCKET}/") + "/a/b"
+    assert location.names() == set()
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"1")
+    assert location.names() == {"a"}
+    assert location.read("a/b") == b"1"
+    server.client().put_object(Bucket=BUCKET, Key=key, Body=b"2")
+    assert location.read("a/b") == b"2"
+    server.client().delete_object(Bucket=BUCKET, Key=key)
+    assert location.names() == set()
+
+
+def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> None:
+    location = Location.of(url)
+    together = Barrier(6)
+
+    def attempt(number: int) -> bool:
+        together.wait()
+        try:
+            take(location, Claim.of_this_process())
+        except ClaimError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(6) as pool:
+        for _ in range(5):
+            assert sum(pool.map(attempt, range(6))) == 1
+            location.discard(CLAIM)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "gone"])
+def test_damage_is_found_and_repaired(server: Server, s3_client: Client, url: str, damage: str, stored: str) -> None:
+    study, there = Study.from_table(small_table()), server.client()
+    run(study, url, s3_client)
+    key = url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c/2/0/0/0"
+    data = bytearray(there.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+    if damage == "gone":
+        there.delete_object(Bucket=BUCKET, Key=key)
+    else:
+        data[100] ^= damage == "flipped"
+        there.put_object(Bucket=BUCKET, Key=key, Body=bytes(data[: -10 if damage == "cut" else None]))
+    assert list(verify(url).fields) == ["ico/2"]
+    assert run(study, url, s3_client).computed == ("ico/2",)
+    assert verify(url).is_sound
+    assert_same(open_store(url), open_store(stored))

@@ -1,0 +1,164 @@
+"""The store's layout, what it refuses, and that it reads without this package."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from sobolev_batch import StoreError, Study
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Facts, Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import Plan, make_plan
+from tests.support.stores import READER
+from tests.support.studies import small_table
+
+
+def small_plan(**changes: object) -> Plan:
+    return make_plan(Study.from_table(small_table(**changes)))
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Path) -> None:
+    store = prepare_store(store_path, small_plan())
+    plan = small_plan()
+    place = plan.lattice.place(plan.blocks[0])
+    store.write_field(1, place, np.zeros(plan.lattice.shape, dtype=complex))
+    fields = store.read_fields([0, 1], place)
+    assert np.isnan(fields[0]).all()
+    assert (fields[1] == 0).all()
+    assert (store_path / "fourier/fourier/c/1/0/0/0").exists()
+
+
+def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None:
+    plan = small_plan()
+    store = prepare_store(store_path, plan)
+    record = Record("key", "complete", facts=Facts(vertices=3, area=1.5, digest="é"), seconds=0.1, worker="w")
+    store.write_record(2, record)
+    again = prepare_store(store_path, plan)
+    assert again.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
+    found = again.records()
+    assert found[:2] == (None, None)
+    assert found[2] is not None
+    assert found[2].facts.area == 1.5
+    assert found[2].completes("key")
+    assert not found[2].completes("other")
+
+
+def test_a_record_that_is_none_counts_as_not_there(store_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = prepare_store(store_path, small_plan())
+    store.write_record(1, Record("k", "complete"))
+    zarr.open_array(str(store_path), path="records/record", mode="r+")[0] = '{"key": "x"}'
+    assert [record is None for record in store.records()] == [True, False, True, True, True]
+    assert "the record of ico/0 is damaged and counts as not there" in caplog.text
+
+
+def test_a_flipped_bit_in_a_field_raises_and_names_the_mesh(store_path: Path) -> None:
+    plan = small_plan()
+    store = prepare_store(store_path, plan)
+    place = plan.lattice.place(plan.blocks[0])
+    store.write_field(3, place, np.ones(plan.lattice.shape, dtype=complex))
+    chunk = store_path / "fourier/fourier/c/3/0/0/0"
+    data = bytearray(chunk.read_bytes())
+    data[1000] ^= 4
+    chunk.write_bytes(data)
+    with pytest.raises(StoreError, match="the field of ico/3 is damaged"):
+        store.read_fields([3], place)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"study": {"name": "other"}}, "the study 'small', not 'other'"),
+        ({"lattice": {"xi_max": 3.0, "M": 18}}, "a lattice of xi_max 3 and M 16, not xi_max 3 and M 18"),
+        ({"transform": {"dtype": "complex64"}}, "dtype 'complex128', not 'complex64'"),
+        ({"family": [{"name": "ico", "source": "icosphere", "levels": [0]}]}, "meshes that this study lacks"),
+    ],
+)
+def test_refuses_the_store_of_another_study_and_leaves_it_alone(
+    store_path: Path, changes: dict[str, object], message: str
+) -> None:
+    prepare_store(store_path, small_plan())
+    before = snapshot(store_path)
+    with pytest.raises(StoreError, match=message):
+        prepare_store(store_path, small_plan(**changes))
+    assert snapshot(store_path) == before
+
+
+def test_new_meshes_become_new_rows(store_path: Path) -> None:
+    store = prepare_store(store_path, small_plan())
+    store.write_record(0, Record("k", "complete"))
+    more = [
+        {"name": "more", "source": "icosphere", "levels": [0, 1]},
+        {"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]},
+    ]
+    grown = prepare_store(store_path, small_plan(family=more))
+    assert grown.labels()[:5] == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
+    assert grown.labels()[5:] == ("more/0", "more/1")
+    assert [record is None for record in grown.records()] == [False, True, True, True, True, True, True]
+
+
+def test_refuses_places_that_hold_something_else(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(StoreError, match="a file is there"):
+        prepare_store(tmp_path / "file", small_plan())
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "precious.txt").write_text("text")
+    with pytest.raises(StoreError, match="not empty and holds no store"):
+        prepare_store(folder, small_plan())
+    assert snapshot(folder) == {"precious.txt": b"text"}
+    zarr.create_group(str(tmp_path / "other.zarr"))
+    with pytest.raises(StoreError, match="not one of a study"):
+        prepare_store(tmp_path / "other.zarr", small_plan())
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that nobody can write to")
+def test_refuses_a_folder_that_cannot_be_written() -> None:
+    with pytest.raises(StoreError, match=r"/proc/results\.zarr: the store cannot be written"):
+        prepare_store("/proc/results.zarr", small_plan())
+
+
+def test_refuses_a_place_below_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(StoreError, match=r"there is no folder .*/file to hold the store; make it first"):
+        prepare_store(tmp_path / "file" / "results.zarr", small_plan())
+
+
+def test_opening_what_is_no_store(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no store of a study is there"):
+        Store.open(tmp_path / "nothing.zarr")
+
+
+def test_a_newer_schema_is_refused(store_path: Path) -> None:
+    prepare_store(store_path, small_plan())
+    zarr.open_group(str(store_path), mode="r+").attrs["schema_version"] = 99
+    with pytest.raises(StoreError, match="its schema has version 99, this program reads 3"):
+        Store.open(store_path)
+
+
+def test_every_array_carries_a_checksum(store_path: Path) -> None:
+    prepare_store(store_path, small_plan())
+    metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
+    arrays = [entry for entry in metadata if entry["node_type"] == "array"]
+    assert len(arrays) >= 6
+    for entry in arrays:
+        assert entry["codecs"][-1]["name"] == "crc32c"
+
+
+def test_plain_xarray_reads_everything_without_this_package(finished_store: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", READER, str(finished_store)], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert 0.003 < float(done.stdout) < 0.006

@@ -1,0 +1,184 @@
+"""Studies that ask for an accuracy: what is chosen, kept, grown, refused and flagged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from distributed import Client
+
+from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, distance, icosphere, open_store, run
+from sobolev_batch.batch import run as run_module
+from sobolev_batch.batch.store.store import stored_choice
+from sobolev_batch.batch.study import lattice_choice as choice_module
+from sobolev_batch.batch.study.lattice_choice import Choice
+from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch.spectral.adaptive.solve import pilot_of
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import Assessed
+from tests.support.studies import small_table, variable
+
+RTOL = 1e-3
+original = pilot_of
+
+
+def asking(rtol: float = RTOL, **changes: Any) -> Study:
+    table = small_table(accuracy={"rtol": rtol}, norm={"orders": [-10.0, -4.0]}, **changes)
+    del table["lattice"]
+    return Study.from_table(table)
+
+
+def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client, store_path: Path) -> None:
+    run(asking(), store_path, client)
+    tree = open_store(store_path)
+    convergence = tree["convergence"].to_dataset().drop_sel(mesh="reference")
+    assert convergence["within"].all()
+    assert (convergence["error"] <= RTOL * convergence["distance"]).all()
+    for level in range(4):
+        truth = distance(icosphere(level), Sphere(), [-10.0, -4.0], rtol=1e-5)
+        here = convergence.sel(mesh=f"ico/{level}")
+        assert (
+            np.abs(here["distance"].values - truth["distance"].values) <= here["error"] + truth["error"].values
+        ).all()
+    assert "!" not in format_table(tree).split("marked !")[0]
+    assert f"at most {RTOL:g} of each distance" in format_table(tree)
+    # Coarse meshes are far from the sphere, so their fields may err more and take fewer points a triangle.
+    meshes = tree["meshes"].to_dataset()
+    assert stored_choice(store_path) is not None
+    assert (meshes["points"].sel(mesh=["ico/0", "ico/3"]) > 0).all()
+
+
+def test_the_choice_is_kept_when_meshes_are_added(client: Client, store_path: Path) -> None:
+    run(asking(), store_path, client)
+    first = stored_choice(store_path)
+    more = [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3, 4]}]
+    summary = run(asking(family=more), store_path, client)
+    assert summary.computed == ("ico/4",)
+    assert stored_choice(store_path) == first
+    again = run(asking(family=more), store_path, client)
+    assert again.computed == ()
+
+
+def test_a_mesh_that_reaches_further_says_what_to_do(client: Client, store_path: Path, tmp_path: Path) -> None:
+    run(asking(), store_path, client)
+    trimesh.creation.box(extents=(20.0, 1.0, 1.0)).export(tmp_path / "far.off")
+    far = {"name": "far", "source": "files", "paths": [str(tmp_path / "far.off")]}
+    summary = run(asking(family=[*small_table()["family"], far]), store_path, client)
+    assert set(summary.failed) == {"far/far"}
+    assert "chosen for surfaces that reach less far: name another store" in summary.failed["far/far"]
+
+
+def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:
+    run(asking(), store_path, client)
+    first = stored_choice(store_path)
+    summary = run(asking(1e-4), store_path, client)
+    second = stored_choice(store_path)
+    assert first is not None
+    assert second is not None
+    assert len(summary.computed) == 5
+    assert second.lattice.xi_max > first.lattice.xi_max
+    assert variable(open_store(store_path), "fourier", "fourier").shape[1:] == second.lattice.shape
+    assert variable(open_store(store_path), "convergence", "within").all()
+
+
+def test_a_lattice_that_turns_out_too_small_grows(
+    client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = make_plan(asking()).choice
+    small = Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
+    monkeypatch.setattr(choice_module, "pilot_of", lambda *_, **__: replace(original(*_, **__), lattice=small))
+    summary = run(asking(), store_path, client)
+    grown = stored_choice(store_path)
+    assert grown is not None
+    assert "grown" in grown.reasons[-1]
+    assert grown.lattice.xi_max > small.xi_max
+    assert variable(open_store(store_path), "convergence", "within").all()
+    assert len(summary.computed) == 5
+
+
+def test_what_falls_short_in_the_end_is_marked(
+    client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
+    monkeypatch.setattr(
+        choice_module, "pilot_of", lambda *_, **__: replace(original(*_, **__), lattice=Lattice(1.2, 12))
+    )
+    run(asking(), store_path, client)
+    convergence = open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/1", order=-4.0)
+    assert not convergence["within"].item()
+    line = next(line for line in format_table(open_store(store_path)).splitlines() if line.startswith("ico/1"))
+    assert "!" in line or "*" in line
+
+
+def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client, store_path: Path) -> None:
+    table = small_table(accuracy={"rtol": 1e-7, "memory_gb": 0.7}, norm={"orders": [-2.0]})
+    del table["lattice"]
+    with pytest.raises(AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2: .* can be reached"):
+        run(Study.from_table(table), store_path, client)
+    assert not store_path.exists()
+
+
+def test_growth_goes_by_what_is_short() -> None:
+    accuracy, orders = Accuracy(1e-3), (-4.0,)
+    choice = Choice(Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
+
+    def grown(truncation: float, aliasing: float) -> Choice | None:
+        parts = [np.array([[value]]) for value in (1.0, truncation, aliasing, 0.0)]
+        return choice.grown(Assessed(*parts), orders, accuracy)
+
+    assert grown(1e-4, 1e-5) is None
+    cut = grown(1e-2, 1e-5)
+    assert cut is not None
+    assert cut.lattice.xi_max > 3.0
+    folded = grown(1e-4, 1e-2)
+    assert folded is not None
+    assert folded.lattice.spacing < choice.lattice.spacing
+    narrow = Accuracy(1e-3, 3.1e8)
+    assert choice.grown(Assessed(*(np.array([[v]]) for v in (1.0, 0.9, 0.9, 0.0))), orders, narrow) is None
+
+
+def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Path) -> None:
+    study = asking(reference={"source": "family", "family": "ico", "member": "3"})
+    run(study, store_path, client)
+    convergence = open_store(store_path)["convergence"].to_dataset()
+    assert convergence["within"].sel(mesh=["ico/0", "ico/1", "ico/2"]).all()
+    assert (convergence["distance"].sel(mesh="ico/3") == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lattice": {"xi_max": 1.0, "M": 8}}, "either a .lattice. or an .accuracy. is needed"),
+        ({"accuracy": {"rtol": 2.0}}, "rtol must lie between 0 and 1, found 2.0"),
+        ({"accuracy": {"rtol": "small"}}, "accuracy.rtol: .*number"),
+        ({"accuracy": {"rtol": 1e-3, "memory_gb": 0}}, "memory must be a positive number"),
+        ({"accuracy": {"rtol": 1e-3, "atol": 1}}, "unknown key accuracy.atol"),
+        ({"transform": {"eps": 1e-9}}, "an .accuracy. chooses eps and quadrature"),
+    ],
+)
+def test_malformed_accuracies_are_refused(changes: dict[str, Any], message: str) -> None:
+    table = {**small_table(), "accuracy": {"rtol": 1e-3}}
+    del table["lattice"]
+    with pytest.raises(StudyError, match=message):
+        Study.from_table({**table, **changes})
+
+
+def test_neither_lattice_nor_accuracy() -> None:
+    table = small_table()
+    del table["lattice"]
+    with pytest.raises(StudyError, match=r"either a \[lattice\] or an \[accuracy\] is needed"):
+        Study.from_table(table)
+
+
+def test_families_of_which_nothing_can_be_made_leave_no_choice(tmp_path: Path) -> None:
+    (tmp_path / "broken.off").write_text("OFF\n1 1 0\n")
+    table = {**small_table(), "accuracy": {"rtol": 1e-3}}
+    table["family"] = [{"name": "bad", "source": "files", "paths": ["broken.off"]}]
+    del table["lattice"]
+    with pytest.raises(StudyError, match="nothing to choose a lattice from"):
+        make_plan(Study.from_table(table, folder=tmp_path))

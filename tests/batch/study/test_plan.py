@@ -1,0 +1,109 @@
+"""Plans: labels, the similarity, what identifies a field, what it costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from sobolev_batch import LatticeError, MeshError, Study, StudyError
+from sobolev_batch.batch.study.plan import make_plan
+from tests.support.studies import small_table
+
+
+def plan_of(**changes: Any):  # type: ignore[no-untyped-def]
+    folder = changes.pop("folder", ".")
+    return make_plan(Study.from_table(small_table(**changes), folder=folder))
+
+
+@pytest.fixture
+def box_file(tmp_path: Path) -> Path:
+    path = tmp_path / "box.off"
+    box = trimesh.creation.box(extents=(2.0, 4.0, 4.0))
+    box.apply_translation((10.0, 0.0, 0.0))
+    box.export(path)
+    return path
+
+
+def test_rows_are_labelled_by_family_and_name() -> None:
+    plan = plan_of()
+    assert [row.label for row in plan.rows] == ["ico/0", "ico/1", "ico/2", "ico/3", "reference"]
+    assert plan.reference == "reference"
+    assert len({row.key for row in plan.rows}) == 5
+    assert plan.field_bytes == 17 * 17 * 9 * 16
+
+
+def test_the_similarity_takes_the_reference_to_the_unit_sphere(box_file: Path) -> None:
+    plan = plan_of(reference={"source": "files", "paths": ["box.off"]}, folder=box_file.parent)
+    assert plan.similarity.scale == pytest.approx(1 / 3)
+    assert plan.similarity.origin == pytest.approx((10.0, 0.0, 0.0))
+
+
+def test_scaling_can_be_fixed_or_left_out() -> None:
+    assert plan_of(scaling={"mode": "none"}, reference={"source": "sphere", "radius": 0.5}).similarity.is_identity
+    fixed = plan_of(scaling={"mode": "fixed", "scale": 0.25, "origin": [1, 0, 0]})
+    assert (fixed.similarity.scale, fixed.similarity.origin) == (0.25, (1.0, 0.0, 0.0))
+
+
+def test_the_finest_level_of_a_family_as_reference() -> None:
+    plan = plan_of(reference={"source": "family", "family": "ico"})
+    assert plan.reference == "ico/3"
+    assert len(plan.rows) == 4
+    assert plan_of(reference={"source": "family", "family": "ico", "member": "1"}).reference == "ico/1"
+    with pytest.raises(StudyError, match="has no member '9'"):
+        plan_of(reference={"source": "family", "family": "ico", "member": "9"})
+
+
+def test_unordered_families_have_no_finest_level(tmp_path: Path) -> None:
+    for name in ("a.off", "b.off"):
+        trimesh.creation.box().export(tmp_path / name)
+    families = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+    with pytest.raises(StudyError, match="no finest level; name one of its members: a, b"):
+        plan_of(family=families, reference={"source": "family", "family": "f"}, folder=tmp_path)
+
+
+def test_keys_follow_what_a_field_depends_on(box_file: Path) -> None:
+    def key(**changes: Any) -> str:
+        family = {"name": "f", "source": "files", "paths": ["box.off"]}
+        reference = {"source": "sphere", "radius": 20.0}
+        plan = plan_of(**{"family": [family], "reference": reference, **changes}, folder=box_file.parent)
+        return str(next(row.key for row in plan.rows if row.label == "f/box"))
+
+    before = key()
+    assert key(norm={"orders": [-7.0]}) == before
+    assert key(study={"name": "small", "title": "other"}) == before
+    assert key(transform={"eps": 1e-6}) != before
+    assert key(lattice={"xi_max": 3.0, "M": 18}) != before
+    assert key(reference={"source": "sphere", "radius": 21.0}) != before
+    box_file.write_text(box_file.read_text() + "\n# one more line\n")
+    assert key() != before
+
+
+def test_a_missing_mesh_is_left_to_its_task_and_a_missing_reference_is_not(tmp_path: Path) -> None:
+    families = [{"name": "f", "source": "files", "paths": ["no.ply"]}]
+    assert plan_of(family=families, folder=tmp_path).rows[0].key == ""
+    with pytest.raises(MeshError, match=r"the reference cannot be made: .*no\.ply: cannot be read"):
+        plan_of(reference={"source": "files", "paths": ["no.ply"]}, folder=tmp_path)
+
+
+def test_refuses_a_reference_beyond_the_half_period() -> None:
+    with pytest.raises(LatticeError, match="take M >= "):
+        plan_of(lattice={"xi_max": 5.0, "M": 16}, reference={"source": "icosphere", "levels": [2]})
+
+
+def test_labels_must_differ(box_file: Path) -> None:
+    plan = plan_of(
+        family=[{"name": "f", "source": "files", "paths": ["box.off", "./box.off", "b*.off"]}], folder=box_file.parent
+    )
+    assert [row.label for row in plan.rows] == ["f/box", "reference"]
+
+
+def test_large_lattices_are_cut_into_chunks() -> None:
+    plan = plan_of(lattice={"xi_max": 20.0, "M": 512})
+    assert len(plan.blocks) == 5
+    assert max(block.size for block in plan.blocks) * 16 <= 256 << 20
+    assert sum(block.size for block in plan.blocks) == 513 * 513 * 257
+    assert np.isclose(plan.field_bytes, 513 * 513 * 257 * 16)

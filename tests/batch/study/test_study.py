@@ -1,0 +1,187 @@
+"""Study files: what is accepted, and that every error names its place in one line."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel
+
+from sobolev_batch import Lattice, Study, StudyError
+from sobolev_batch.batch.study.study import _Document, _FamilyName, _FamilyReferenceSection
+from sobolev_batch.surfaces.sources.registry import Source
+from tests.support.repository import blocks
+from tests.support.studies import changed, small_table
+
+WORKFLOWS = Path(__file__).parents[3] / "workflows"
+
+FULL = """
+[study]
+name = "two words"
+title = "A title"
+[lattice]
+xi_max = 4
+M = 32
+[norm]
+orders = [-2, -3.5, -2]
+pairs = "reference"
+[transform]
+eps = 1e-7
+dtype = "complex64"
+quadrature = 5
+[reference]
+source = "family"
+family = "ico"
+[scaling]
+mode = "fixed"
+scale = 0.5
+[[family]]
+name = "ico"
+source = "icosphere"
+levels = [1, 2]
+[[family]]
+name = "thin"
+source = "decimate"
+mesh = { source = "icosphere", levels = [2] }
+triangles = [100]
+"""
+
+
+def test_reads_every_key(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(FULL.replace("1e-7", "1e-6"))
+    study = Study.from_toml(path)
+    assert (study.name, study.title) == ("two words", "A title")
+    assert study.lattice == Lattice(4.0, 32)
+    assert study.orders == (-2.0, -3.5)
+    assert study.pairs == "reference"
+    assert (study.transform.accuracy, study.transform.precision) == (1e-6, "complex64")
+    assert study.transform.quadrature.method == 5
+    assert study.scaling.fixed.scale == 0.5
+    assert [family.name for family in study.families] == ["ico", "thin"]
+    assert study.folder == tmp_path
+
+
+def keys_of(model: type[BaseModel]) -> set[str]:
+    """Of a section and those below it."""
+    found = set(model.model_fields)
+    for field in model.model_fields.values():
+        for part in (field.annotation, *get_args(field.annotation)):
+            if inspect.isclass(part) and issubclass(part, BaseModel) and not issubclass(part, Source):
+                found |= keys_of(part)
+    return found
+
+
+def test_the_reference_of_study_files_names_every_key_and_source() -> None:
+    text = (WORKFLOWS.parent / "docs" / "studies.md").read_text(encoding="utf-8")
+    keys = keys_of(_Document) | keys_of(_FamilyReferenceSection) | keys_of(_FamilyName)
+    assert {"rtol", "backend", "origin", "member"} < keys
+    rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
+    for key in keys:
+        assert re.search(rf"[`\[]{key}[`\]]", text), key
+    points = {point.name: point for point in entry_points(group="sobolev_batch.sources")}
+    assert "decimate" in points
+    for name, point in points.items():
+        for key in point.load().model_fields:
+            assert f"`{key}`" in rows[name], (name, key)
+
+
+def test_its_example_is_valid(tmp_path: Path) -> None:
+    study, lattice, besides = blocks("docs/studies.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
+    (tmp_path / "study.toml").write_text(study.replace("[accuracy]\nrtol = 1e-3\n", lattice))
+    assert Study.from_toml(tmp_path / "study.toml").lattice == Lattice(5.0, 64)
+    (tmp_path / "study.toml").write_text(f"{study}\n{besides}")
+    asked = Study.from_toml(tmp_path / "study.toml")
+    assert (asked.witness, asked.proximity) == ((-2.0,), 20_000)
+
+
+@pytest.mark.parametrize("name", ["icosphere", "cortex"])
+def test_the_workflows_are_valid(name: str) -> None:
+    assert Study.from_toml(WORKFLOWS / f"{name}.toml").name == name
+
+
+BROKEN = [
+    ("study.nam", "x", "unknown key study.nam"),
+    ("stdy", {}, "unknown key stdy"),
+    (
+        "study.name",
+        "",
+        "study.name: a name is 1 to 100 visible characters, blanks only between them, without / and \\; it is",
+    ),
+    ("study.name", "a/b", "without / and \\; it holds '/', found 'a/b'"),
+    ("study.name", "a\nb", "it holds the character U+000A, which is not seen as what it is"),
+    ("study.name", " a", "it begins or ends with a blank"),
+    ("study.name", "x" * 10_000, "it has 10000 characters, 100 are allowed"),
+    ("study.name", 3, "study.name: input should be a valid string, found 3"),
+    ("lattice.M", 17, "M must be an even integer from 2 to 2048, found 17"),
+    ("lattice.M", 16.0, "lattice.M: input should be a valid integer, found 16.0"),
+    ("lattice.M", "16", "lattice.M: input should be a valid integer, found '16'"),
+    ("lattice.M", True, "lattice.M: input should be a valid integer, found True"),
+    ("lattice.xi_max", -1.0, "xi_max must be positive"),
+    ("lattice.xi_max", float("nan"), "lattice.xi_max: input should be a finite number"),
+    ("norm.orders", [-0.5], "orders below -1/2, found -0.5"),
+    ("norm.orders", [-2.0, 1], "orders below -1/2, found 1"),
+    ("norm.orders", [], "norm.orders: tuple should have at least 1 item"),
+    ("norm.orders", -2.0, "norm.orders: input should be a valid tuple"),
+    ("norm.orders", ["-2"], "norm.orders.0: input should be a valid number"),
+    ("norm.pairs", "some", "norm.pairs: input should be 'all' or 'reference'"),
+    ("transform.eps", 1e-20, "eps must lie between 1e-14 and 0.1"),
+    ("transform.dtype", "float64", "transform.dtype: input should be 'complex128' or 'complex64'"),
+    ("transform.quadrature", "gauss9", "quadrature must be"),
+    ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
+    ("scaling.mode", "fixed", "scale and origin belong to mode = 'fixed'"),
+    ("reference", {}, "reference: no source is named None"),
+    ("reference", {"source": "spere"}, "reference: no source is named 'spere'; known are decimate, ellipsoid, "),
+    ("reference", {"source": "os.system"}, "reference: no source is named 'os.system'"),
+    ("reference", {"source": "sphere", "radius": 0}, "reference: radius: input should be greater than 0"),
+    ("reference", {"source": "sphere", "radius": "1"}, "reference: radius: input should be a valid number"),
+    ("reference", {"source": "family", "family": "no"}, "reference: no family is named 'no'"),
+    ("family", [], "family: list should have at least 1 item"),
+    ("family", {}, "family: input should be a valid list"),
+    ("family.0.name", "reference", "no family can be named 'reference'"),
+    ("family.0.name", "../up", "family '../up': name: a name is 1 to 100 visible characters"),
+    ("family.0.levels", [0, 1.5], "family 'ico': levels.1: input should be a valid integer"),
+    ("family.0.levels", [13], "family 'ico': levels.0: input should be less than or equal to 12"),
+    ("family.0.level", [1], "family 'ico': unknown key level"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), BROKEN)
+def test_broken_studies_name_the_place_on_one_line(path: str, value: Any, message: str) -> None:
+    with pytest.raises(StudyError) as caught:
+        Study.from_table(changed(path, value))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_family_names_that_differ_by_case_only_are_twins() -> None:
+    twins = [{"name": name, "source": "icosphere", "levels": [0]} for name in ("Ico", "ico")]
+    with pytest.raises(StudyError, match="'Ico', 'ico' twice"):
+        Study.from_table(small_table(family=twins))
+
+
+def test_all_offenders_are_listed() -> None:
+    table = changed("lattice.M", "x")
+    table["norm"]["pairs"] = 3
+    del table["reference"]
+    with pytest.raises(StudyError, match=r"lattice\.M.*norm\.pairs.*reference is missing"):
+        Study.from_table(table)
+
+
+@pytest.mark.parametrize("content", [b"[study", b"\xff\xfe", b"a = 1\na = 2\n"])
+def test_files_that_are_not_toml(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(content)
+    with pytest.raises(StudyError, match=r"bad\.toml: not a TOML file"):
+        Study.from_toml(path)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match=r"no\.toml: cannot be read: No such file"):
+        Study.from_toml(tmp_path / "no.toml")

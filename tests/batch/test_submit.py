@@ -1,0 +1,128 @@
+"""Studies that go on without the process that submitted them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sobolev_batch import ClusterError, Study, StudyError, submit
+from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.results.status import Status
+from tests.support.processes import tcp_cluster
+from tests.support.recipes import write_study
+from tests.support.studies import small_table
+
+_POLL_SECONDS = 0.02
+
+# Dies without any farewell as soon as the study is handed over.
+CLIENT = """
+import os, signal, sys
+import sobolev_batch as sb
+from distributed import Client
+
+client = Client(sys.argv[1])
+sb.submit(sb.Study.from_toml(sys.argv[2]), sys.argv[3], client)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture
+def study_path(tmp_path: Path) -> Path:
+    write_study(tmp_path)
+    return tmp_path / "study.toml"
+
+
+def cli(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, _):
+        client = subprocess.run(
+            [sys.executable, "-c", CLIENT, address, str(study_path), str(store_path)],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert client.returncode == -9, client.stderr
+        followed = cli("status", store_path, "--follow")
+    assert followed.returncode == 0, followed.stdout + followed.stderr
+    assert f"{store_path}: 6 of 6 complete, 0 failed, 0 to go" in followed.stdout
+    assert "\ndone; by process" in followed.stdout
+    table = cli("table", store_path)
+    assert "ico/3" in table.stdout
+    assert "nan" not in table.stdout.lower()
+
+
+def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: Path) -> None:
+    store = tmp_path / "with space.zarr"
+    with tcp_cluster([]) as (address, _):
+        submitted = cli("submit", study_path, "--scheduler", address, "--store", store)
+        assert submitted.returncode == 0, submitted.stderr
+        assert submitted.stdout.splitlines() == [
+            f"6 of 6 surfaces to be computed by the cluster at {address}",
+            f"follow it by: sobolev-batch status --follow '{store}'",
+        ]
+        assert cli("status", store, "--follow").returncode == 0
+        again = cli("submit", study_path, "--scheduler", address, "--store", store)
+        assert again.stdout.startswith("0 of 6 surfaces to be computed")
+        assert cli("status", store, "--follow").returncode == 0
+
+
+def test_what_is_wrong_is_said_before_anything_is_handed_over(tmp_path: Path, store_path: Path) -> None:
+    table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
+    gpu = small_table(transform={"backend": "gpu"})
+    with tcp_cluster([]) as (address, _), remote_client(address) as client:
+        with pytest.raises(StudyError, match="matches no file"):
+            submit(Study.from_table(table, folder=tmp_path), store_path, client)
+        with pytest.raises(ClusterError, match="asks for backend 'gpu'"):
+            submit(Study.from_table(gpu), store_path, client)
+    assert not store_path.exists()
+
+
+def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, workers):
+        assert cli("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
+        store = Store.open(store_path)
+        while (record := store.read_run()) is None or record.state == "submitted":
+            time.sleep(_POLL_SECONDS)
+        driver = next(worker for worker in workers if f"process {worker.pid} " in record.driver)
+        driver.kill()
+        while (record := store.read_run()) is None or record.state != "done" or f" {driver.pid} " in record.driver:
+            assert record is None or record.state != "failed", record
+            if record is not None and record.state == "done":
+                break  # it was quicker than the signal
+            time.sleep(_POLL_SECONDS)
+    status = Status.of(store_path)
+    assert (status.complete, status.total, status.failed) == (6, 6, {})
+
+
+def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, store_path: Path) -> None:
+    """A file that the client sees and the workers do not: here, one that goes away."""
+    mesh = study_path.with_name("mesh.off")
+    mesh.write_text("OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n3 0 2 3\n3 1 2 3\n")
+    table = small_table(reference={"source": "files", "paths": ["mesh.off"]})
+    with tcp_cluster([]) as (address, _), remote_client(address) as client:
+        study = Study.from_table(table, folder=mesh.parent)
+        # Holds the only thread until the file is gone.
+        blocked = client.submit(_remove, str(mesh), pure=False, priority=10)
+        submit(study, store_path, client)
+        blocked.result()
+        followed = cli("status", store_path, "--follow")
+    assert followed.returncode == 1
+    assert "the latest run failed: the reference cannot be made" in followed.stdout
+
+
+def _remove(path: str) -> None:
+    # The study must have been planned by the client: its store says so.
+    store = Path(path).parent / "results.zarr" / "records" / "zarr.json"
+    while not store.exists():
+        time.sleep(_POLL_SECONDS)
+    Path(path).unlink()

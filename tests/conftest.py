@@ -1,0 +1,61 @@
+"""Clusters, stores and files that tests of several folders share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from sobolev_batch import Mesh, Study, read_mesh, run
+from sobolev_batch.batch.cluster.clients import local_client
+from tests.support.mesh_files import Read
+from tests.support.spheres import make_study
+from tests.support.studies import small_table
+
+
+@pytest.fixture(scope="session")
+def client() -> Iterator[Client]:
+    """Two worker processes, shared by all tests that only submit to them."""
+    with local_client(2) as client:
+        yield client
+
+
+@pytest.fixture
+def study() -> Study:
+    return Study.from_table(small_table())
+
+
+@pytest.fixture
+def store_path(tmp_path: Path) -> Path:
+    return tmp_path / "results.zarr"
+
+
+@pytest.fixture(scope="session")
+def finished_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store of the small study after a run; not to be changed."""
+    path = tmp_path_factory.mktemp("finished") / "results.zarr"
+    run(Study.from_table(small_table()), path, client)
+    return path
+
+
+@pytest.fixture(scope="session")
+def spheres(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """The store of a study of spheres, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("spheres")
+    place = "memory://spheres.zarr"
+    make_study(folder, place)
+    return place, folder
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Read:
+    """Write a file whose name has this ending, and read it."""
+
+    def write_and_read(ending: str, content: bytes) -> Mesh:
+        path = tmp_path / f"mesh{ending}"
+        path.write_bytes(content)
+        return read_mesh(path)
+
+    return write_and_read

@@ -1,0 +1,257 @@
+"""Witness functions in files, read back by other programs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import xarray as xr
+from click.testing import CliRunner, Result
+from plyfile import PlyData
+
+import sobolev_batch as sb
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.cli import cli
+from sobolev_batch.results.meshes.export import Exporter
+from sobolev_batch.results.meshes.witness import witness_at_vertices
+from tests.support.spheres import CENTER, LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
+
+Spheres = tuple[str, Path]
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["witness", *map(str, arguments)])
+
+
+def read_ply(path: Path) -> Any:
+    # In memory: the next file may have the same name.
+    return PlyData.read(path, mmap=False)
+
+
+def evaluated(place: str, label: str, points: np.ndarray) -> np.ndarray:
+    """By the public function, from the stored fields, at points in the meshes' own unit."""
+    tree = sb.open_store(place)
+    fields = tree["fourier"].to_dataset()["fourier"]
+    found = tree.attrs["similarity"]
+    scaled = found["scale"] * (points - np.array(found["origin"]))
+    return np.asarray(sb.witness(fields.sel(mesh=label), fields.sel(mesh="reference"), ORDERS, scaled).values)
+
+
+def test_ply_holds_the_mesh_of_the_file_and_its_witness(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    for label in LABELS:
+        path = sb.write_witness(place, label, tmp_path / "a.ply", folder=folder)
+        there = trimesh.load(path, process=False)
+        own = sb.read_mesh(folder / f"{label.removeprefix('files/')}.obj")
+        assert (there.vertices == own.vertices).all()
+        assert (there.faces == own.triangles).all()
+        columns = read_ply(path)["vertex"].data
+        expected = evaluated(place, label, own.vertices)
+        for name, values in zip(("witness_minus_4", "witness_minus_2_5"), expected, strict=True):
+            assert columns[name].dtype == np.dtype("<f8")
+            assert columns[name] == pytest.approx(values, rel=1e-9, abs=1e-9 * np.abs(values).max())
+        assert columns["quality"] == pytest.approx(columns["witness_minus_4"], rel=1e-6)
+        assert (sb.read_mesh(path).vertices == own.vertices).all()
+
+
+def test_the_header_tells_what_the_numbers_are(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    path = sb.write_witness(place, LABELS[0], tmp_path / "a.ply", [-2.5], folder)
+    header = path.read_bytes().partition(b"end_header")[0].decode("ascii")
+    assert "format binary_little_endian 1.0" in header
+    for comment in (
+        r"mesh files/Gr\xf6\xdfe $ % \xfc against reference, study Kugeln gr\xf6\xdfer",
+        "positive where the mesh has area that the reference lacks",
+        "in 1 / unit length of the study, orders -2.5",
+        "quality repeats witness_minus_2_5",
+    ):
+        assert comment in header
+    assert "witness_minus_4" not in header
+    unit = re.search(r"one unit of the study has (\S+)", header)
+    assert unit is not None
+    assert float(unit[1]) == pytest.approx(RADIUS)
+
+
+def test_signs_of_spheres_within_around_and_beside(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    inner, beside, outer = (
+        read_ply(sb.write_witness(place, label, tmp_path / "a.ply", folder=folder))["vertex"].data for label in LABELS
+    )
+    # Each has its area where the reference has none.
+    assert (inner["witness_minus_2_5"] > 0).all()
+    assert (outer["witness_minus_2_5"] > 0).all()
+    assert (evaluated(place, LABELS[0], sb.read_mesh(folder / "large.obj").vertices) < 0).all()
+    places = np.stack([beside[axis] for axis in "xyz"], axis=1) - CENTER
+    along = places @ RIGHT / RADIUS
+    assert (beside["witness_minus_2_5"][along > 1] > 0.1).all()
+    # Where both spheres cross.
+    assert np.abs(beside["witness_minus_2_5"][np.abs(along - 0.15) < 0.02]).max() < 0.05
+
+
+def test_its_integral_against_the_difference_is_the_squared_distance(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    tree = sb.open_store(place)
+    for label in LABELS:
+        columns = read_ply(sb.write_witness(place, label, tmp_path / "a.ply", folder=folder))["vertex"].data
+        mesh, other = sb.read_mesh(tmp_path / "a.ply"), sb.read_mesh(folder / "large.obj")
+        on_other = evaluated(place, label, other.vertices)
+        for order, name, there in zip(ORDERS, ("witness_minus_4", "witness_minus_2_5"), on_other, strict=True):
+            found = (vertex_areas(mesh) @ columns[name] - vertex_areas(other) @ there) / RADIUS**2
+            distance = tree["convergence"]["distance"].sel(mesh=label, order=order).item()
+            assert found == pytest.approx(distance**2, rel=0.02)
+
+
+def vertex_areas(mesh: sb.Mesh) -> Any:
+    """A third of each triangle at each of its corners: the integral of what is linear on triangles."""
+    return np.bincount(mesh.triangles.ravel(), np.repeat(mesh.areas / 3, 3), len(mesh.vertices))
+
+
+def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista", reason="pyvista, of the extra vtk, is not installed")
+    place, folder = spheres
+    columns = read_ply(sb.write_witness(place, LABELS[1], tmp_path / "a.ply", folder=folder))
+    there = pyvista.read(sb.write_witness(place, LABELS[1], tmp_path / "a.vtp", folder=folder))
+    assert (there.points == np.stack([columns["vertex"][axis] for axis in "xyz"], axis=1)).all()
+    assert (there.faces.reshape(-1, 4)[:, 1:] == np.vstack(columns["face"]["vertex_indices"])).all()
+    assert (there.point_data["witness, order -4"] == columns["vertex"]["witness_minus_4"]).all()
+    assert (there.point_data["witness, order -2.5"] == columns["vertex"]["witness_minus_2_5"]).all()
+    assert there.active_scalars_name == "witness, order -4"
+    assert there.field_data["notes"][0] == "witness function of the mesh files/beside against reference, study " + (
+        r"Kugeln gr\xf6\xdfer"
+    )
+
+
+def test_stored_values_are_taken(spheres: Spheres) -> None:
+    place, folder = spheres
+    exporter = Exporter.of(place, folder=folder)
+    first, second, _ = LABELS
+    values = np.full((2, 1, 700), np.nan)
+    values[0, 0, :642] = np.arange(642)
+    stored = xr.Dataset(
+        {"witness": (("mesh", "order", "vertex"), values)}, coords={"mesh": [first, second], "order": [-2.5]}
+    )
+    tree = xr.DataTree.from_dict({**exporter.tree.to_dict(), "/witness": stored})
+    tree.attrs = exporter.tree.attrs
+    exporter = replace(exporter, tree=tree)
+    field = exporter.field(first)
+    assert (field.values[1] == np.arange(642)).all()
+    # Another order, and a mesh that nobody asked for.
+    expected = evaluated(place, first, field.mesh.vertices)
+    assert field.values[0] == pytest.approx(expected[0], rel=1e-9)
+    other = exporter.field(second)
+    expected = evaluated(place, second, other.mesh.vertices)
+    assert other.values == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
+    table = {
+        "study": {"name": "stored"},
+        "lattice": {"xi_max": 3.0, "M": 16},
+        "norm": {"orders": list(ORDERS)},
+        "witness": {},
+        "reference": {"source": "sphere"},
+        "family": [{"name": "ico", "source": "icosphere", "levels": [1, 2]}],
+    }
+    place = "memory://stored.zarr"
+    sb.run(sb.Study.from_table(table), place)
+    label, path = "ico/2", tmp_path / "a.ply"
+    tree = sb.open_store(place)
+    expected = tree["witness"].to_dataset()["witness"].sel(mesh=label).to_numpy()[:, :162]
+    fresh = witness_at_vertices(tree.drop_nodes("witness"), label, sb.icosphere(2), ORDERS)
+    assert expected == pytest.approx(fresh, rel=1e-7)
+    # No evaluation finds these.
+    Store.open(place).array("witness/witness")[1, :, :162] = 2 * expected
+    sb.write_witness(place, label, path)
+    vertices = PlyData.read(path)["vertex"]
+    for name, row in zip(("witness_minus_4", "witness_minus_2_5"), expected, strict=True):
+        assert (vertices[name] == 2 * row).all()
+    sb.write_witness(place, label, path, [-3.0])
+    assert np.isfinite(PlyData.read(path)["vertex"]["witness_minus_3"]).all()
+
+
+def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
+    place, folder = spheres
+    exporter = Exporter.of(place, folder=folder)
+    scaled = exporter.remaker.make(LABELS[1]).scaled
+    mesh = sb.Mesh(np.vstack([scaled.vertices, [[1e6, 0, 0], [0, 0, 0]]]), scaled.triangles)
+    values = witness_at_vertices(exporter.tree, LABELS[1], mesh, ORDERS)
+    assert np.isnan(values[:, -2:]).all()
+    assert np.isfinite(values[:, :-2]).all()
+
+
+def test_the_command_writes_all_meshes_into_one_folder(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    done = call(place, "--output", tmp_path / "out", "--folder", folder)
+    assert done.exit_code == 0
+    assert done.stderr == ""
+    names = [Path(line).name for line in done.stdout.splitlines()]
+    assert names == ["0000-files-Groe-u.ply", "0002-files-beside.ply", f"0003-files-{LONG}"[:65] + ".ply"]
+    assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in tmp_path.rglob("*.ply")) == names
+    chosen = call(
+        *(place, "--output", tmp_path, "--folder", folder, "--order", "-2.5", "--mesh", LABELS[1], "--mesh", LABELS[1])
+    )
+    assert chosen.stdout == f"{tmp_path}/0002-files-beside.ply\n"
+    assert "witness_minus_4" not in read_ply(tmp_path / "0002-files-beside.ply")["vertex"].data.dtype.names
+
+
+def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "beside.obj").write_text((copy / "large.obj").read_text())
+    (copy / f"{STRANGE}.obj").unlink()
+    done = call(place, "--output", tmp_path, "--folder", copy)
+    assert done.exit_code == 3
+    lost, changed = done.stderr.splitlines()
+    assert lost.startswith(f"{LABELS[0]}: ")
+    assert "No such file" in lost
+    assert changed == (
+        "files/beside: what the study makes here is not the mesh that was computed; its files may have changed"
+    )
+    assert [Path(line).name[:4] for line in done.stdout.splitlines()] == ["0003"]
+    failed = call(place, "--output", tmp_path, "--folder", folder, "--mesh", "files/bad", "--mesh", "closed/sphere")
+    assert failed.exit_code == 3
+    assert failed.stderr == "files/bad: it is failed\nclosed/sphere: a surface in closed form has no triangles\n"
+
+
+def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, folder = spheres
+    refused: list[tuple[str, str, list[float] | None, str]] = [
+        ("files/besides", "a.ply", None, "no mesh 'files/besides', did you mean 'files/beside'"),
+        ("nobody", "a.ply", None, "no mesh 'nobody', only such as 'files/"),
+        ("reference", "a.ply", None, "'reference' is the reference"),
+        ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),
+        ("files/beside", "a.ply", [-0.5], "below -1/2, found -0.5"),
+        ("files/beside", "a.ply", [], "at least one order"),
+        ("files/bad", "a.ply", None, "it is failed"),
+    ]
+    for label, name, orders, message in refused:
+        with pytest.raises(sb.InputError, match=message):
+            sb.write_witness(place, label, tmp_path / name, orders, folder)
+    with pytest.raises(sb.StoreError, match="cannot be written there: No such file"):
+        sb.write_witness(place, "files/beside", tmp_path / "nowhere" / "a.ply", folder=folder)
+    (tmp_path / "taken").write_text("")
+    done = call(place, "--output", tmp_path / "taken", "--folder", folder)
+    assert isinstance(done.exception, sb.StoreError)
+    assert "no files can be written there" in str(done.exception)
+    monkeypatch.setitem(__import__("sys").modules, "pyvista", None)
+    with pytest.raises(sb.InputError, match=r"library pyvista.*pip install 'sobolev-batch\[vtk\]'"):
+        sb.write_witness(place, "files/beside", tmp_path / "a.vtp", folder=folder)
+    assert os.listdir(tmp_path) == ["taken"]
+
+
+def test_without_a_reference_there_is_nothing_to_compare_with(
+    spheres: Spheres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, folder = spheres
+    tree = sb.open_store(place).load()
+    tree["convergence"].attrs["reference"] = "files/bad"
+    monkeypatch.setattr("sobolev_batch.results.meshes.export.open_store", lambda _: tree)
+    with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
+        Exporter.of(place, folder=folder)

@@ -1,0 +1,193 @@
+"""Pictures of meshes, drawn by VTK: what they show, and what is said where nothing can be drawn."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from ctypes.util import find_library
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+from numpy.typing import NDArray
+
+from sobolev_batch import InputError, icosphere, open_store
+from sobolev_batch.cli import cli
+from sobolev_batch.results.figures.plots import plot_witnesses
+from sobolev_batch.results.meshes import render as rendering
+from sobolev_batch.results.meshes.render import render
+from sobolev_batch.results.meshes.views import Portrait, make_gallery
+from tests.support.drawing import obstacle
+from tests.support.spheres import LABELS, RIGHT
+
+Spheres = tuple[str, Path]
+drawing = pytest.mark.skipif(obstacle() is not None, reason=str(obstacle()))
+
+
+def portrait(factors: tuple[float, ...] = (1.0,)) -> Portrait:
+    """A sphere that is red to the right and blue to the left."""
+    ball = icosphere(3)
+    along = ball.vertices @ RIGHT
+    values = np.outer(factors, along)
+    return Portrait("a", ball.vertices, ball.triangles.astype(np.int32), values, (-2.0, -4.0), len(ball.triangles))
+
+
+def redness(picture: NDArray[Any]) -> NDArray[np.float64]:
+    """Red less blue, from -1 to 1."""
+    scale = 255.0 if picture.dtype == np.uint8 else 1.0
+    found = (picture[..., 0].astype(float) - picture[..., 2].astype(float)) / scale
+    return np.asarray(found)
+
+
+@drawing
+def test_red_where_the_witness_is_positive_and_blue_where_it_is_negative() -> None:
+    (pictures,) = render([portrait((1.0, -1e-6))], 6, side=200)
+    assert pictures.shape == (2, 200, 200, 3)
+    drawn = (pictures[0] < 250).any(axis=-1)
+    # A disc, but for its margin and what is nearly white.
+    assert drawn.mean() == pytest.approx(np.pi / 4 * 0.96**2, abs=0.05)
+    first, second = map(redness, pictures)
+    assert first[100, 170] > 0.3
+    assert first[100, 30] < -0.3
+    assert abs(first[100, 100]) < 0.1
+    assert first[:, 101:][drawn[:, 101:]].min() > -0.1
+    # Colours are relative to the largest modulus.
+    assert second[100, 170] < -0.3
+    assert second[100, 30] > 0.3
+
+
+@drawing
+def test_one_scale_of_colours_for_all() -> None:
+    strong, weak = portrait((1.0,)), portrait((0.2,))
+    own, common = (render([strong, weak], 1, side=200, common=common) for common in (False, True))
+    assert redness(own[1][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
+    assert redness(common[0][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
+    assert 0.02 < redness(common[1][0])[100, 170] < 0.6 * redness(common[0][0])[100, 170]
+
+
+@drawing
+def test_what_is_in_front_hides_what_is_behind() -> None:
+    eye = np.array([1.25, -1.4, 0.8])
+    front, back = 0.5 * icosphere(2).vertices + eye, icosphere(2).vertices - eye
+    triangles = np.vstack([icosphere(2).triangles + len(front), icosphere(2).triangles]).astype(np.int32)
+    values = np.repeat([1.0, -1.0], len(front))[None]
+    (pictures,) = render([Portrait("a", np.vstack([front, back]), triangles, values, (-2.0,), 640)], 1, side=200)
+    found = redness(pictures[0])
+    assert found[100, 100] > 0.2
+    assert found[100, 30] < -0.2
+
+
+@drawing
+def test_meshes_seen_from_their_edge_and_no_witness() -> None:
+    up, towards = np.array([0.0, 0.0, 1.0]), np.array([1.25, -1.4, 0.0])
+    corners = np.array([0 * up, up, towards])
+    edge = Portrait("edge", corners, np.array([[0, 1, 2]], np.int32), np.ones((1, 3)), (-2.0,), 1)
+    zero = Portrait("zero", portrait().vertices, portrait().triangles, np.zeros((1, 642)), (-2.0,), 1280)
+    seen, white = render([edge, zero], 1, side=100)
+    assert seen.shape[2] < seen.shape[1] == 100
+    assert np.abs(redness(white[0])).max() < 0.02
+    assert (white < 250).mean() > 0.5
+
+
+@drawing
+def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    paths, _ = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
+    assert [path.name for path in paths][-1] == "witness.png"
+    assert len(paths) == 3
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spheres) -> None:
+    place, folder = spheres
+    tree = open_store(place)
+    plain, turned = (
+        make_gallery(tree, tree.attrs["study"]["table"], folder, [LABELS[1]], up=axis).portraits[0].vertices
+        for axis in ("z", up)
+    )
+    assert (turned[:, 2] == plain[:, "xyz".index(up)]).all()
+    # Turned, not mirrored.
+    volumes = [np.linalg.det(vertices[[0, 100, 300]]) for vertices in (plain, turned)]
+    assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
+
+
+@drawing
+def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Path) -> None:
+    place, folder = spheres
+    options = ["plot", place, "--output", str(tmp_path), "--folder", str(folder)]
+    done = CliRunner().invoke(cli, [*options, "--witness", LABELS[1], "--witness", "closed/sphere"])
+    assert done.exit_code == 3
+    assert done.stderr == (
+        "not drawn with their witness functions: closed/sphere: a surface in closed form has no triangles\n"
+    )
+    path = Path(done.stdout.splitlines()[-1])
+    assert path == tmp_path / "witness-0002-files-beside.png"
+    picture = imread(path)[..., :3]
+    # Two panels, in each of which the sphere is red to the right, towards which it is shifted.
+    left, right, left_too, right_too = (part.mean() for part in np.array_split(redness(picture), 4, axis=1))
+    assert right > left + 0.1
+    assert right_too > left_too + 0.1
+    assert len(list(tmp_path.glob("witness-*"))) == 1
+
+
+def test_plot_does_without_what_cannot_be_drawn(
+    spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, folder = spheres
+    elsewhere = CliRunner().invoke(cli, ["plot", place, "--output", str(tmp_path), "--folder", str(tmp_path)])
+    assert elsewhere.exit_code == 0
+    assert elsewhere.stderr.count("\n") == 1
+    assert "No such file" in elsewhere.stderr
+    assert not list(tmp_path.glob("witness-*"))
+    monkeypatch.setattr(rendering, "find_spec", lambda _: None)
+    paths, absent = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
+    assert paths == ()
+    assert list(absent) == list(LABELS[:2])
+    for reason in absent.values():
+        assert "pip install 'sobolev-batch[vtk]'" in reason
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("import os; os.abort()", r"VTK crashed \(Aborted\); .* apt-get install libegl1"),
+        ("raise ValueError('no such thing')", r"VTK failed \(ValueError: no such thing\)"),
+        ("raise SystemExit(7)", r"VTK failed \(exit status 7\)"),
+        ("import time; time.sleep(60)", r"VTK took more than 0.5 s"),
+    ],
+    ids=["crash", "error", "status", "hang"],
+)
+def test_whatever_happens_to_the_process_that_draws_is_said(
+    program: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "easel.py").write_text(program)
+    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    monkeypatch.setattr(rendering, "find_spec", lambda _: True)
+    if "sleep" in program:
+        monkeypatch.setattr(rendering, "_PATIENCE_SECONDS", 0.5)
+    with pytest.raises(InputError, match=f"meshes cannot be drawn here: {reason}"):
+        render([portrait()], 1)
+
+
+@drawing
+@pytest.mark.skipif(sys.platform != "linux" or find_library("OSMesa") is not None, reason="VTK finds OSMesa here")
+def test_a_machine_without_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
+    with pytest.raises(InputError, match=r"cannot be drawn here: VTK (crashed|failed) .*libgl1-mesa-dri libx11-6"):
+        render([portrait()], 1)
+
+
+@drawing
+def test_neither_a_display_that_is_gone_nor_what_lies_around_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DISPLAY", "203.0.113.1:0")
+    shutil.copy(rendering._EASEL, tmp_path)
+    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    (tmp_path / "pyvista.py").write_text("raise ImportError('not the library')")
+    monkeypatch.chdir(tmp_path)
+    render([portrait()], 1, side=50)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,334 @@
+"""The report of a small study with a failed mesh and hostile names, in a real browser."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import xarray as xr
+from click.testing import CliRunner
+
+from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
+from sobolev_batch.cli import cli
+from sobolev_batch.results.meshes.views import make_gallery
+from sobolev_batch.results.report.build import make_report, write_report
+from sobolev_batch.results.status import Status
+from sobolev_batch.results.tables.convergence import convergence_frame
+from tests.support.browser import Browser, browser
+
+SCRIPT = "<script>window.ran=1</script>"
+IMAGE = '"><img src=x onerror="window.ran=2">'
+# A slash is no part of a name, so that of a family the script stays open.
+FAMILY = 'ico <script>window.ran=3 "><img src=x onerror=window.ran=4> $^$ %{x}'
+
+
+def table(folder: Path) -> dict[str, Any]:
+    """Three icospheres, a file that is one, and one that is no mesh."""
+    mesh = icosphere(1)
+    lines = [
+        *(f"v {x} {y} {z}" for x, y, z in mesh.vertices),
+        *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.triangles),
+    ]
+    (folder / "good.obj").write_text("\n".join(lines))
+    (folder / "<b>bad<.ply").write_text(f"ply\nformat {IMAGE}{SCRIPT}\n")
+    return {
+        "study": {"name": "hostile", "title": f"Title {SCRIPT}{IMAGE}"},
+        "lattice": {"xi_max": 3.0, "M": 16},
+        "norm": {"orders": [-10.0, -3.0]},
+        "reference": {"source": "sphere"},
+        "family": [
+            {"name": FAMILY, "source": "icosphere", "levels": [0, 1, 2]},
+            {"name": "files", "source": "files", "paths": ["*.obj", "*.ply"]},
+        ],
+    }
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def store(folder: Path) -> str:
+    place = "memory://hostile.zarr"
+    assert len(run(Study.from_table(table(folder), folder=folder), place).failed) == 1
+    return place
+
+
+@pytest.fixture(scope="module")
+def page(store: str, folder: Path) -> Path:
+    """What the command writes."""
+    path = folder / "report.html"
+    done = CliRunner().invoke(cli, ["report", store, "--output", str(path), "--folder", str(folder)])
+    assert done.output.strip() == str(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def reader(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The page on a desktop; tests that change it leave it as they found it."""
+    with browser(tmp_path_factory.mktemp("profile")) as found:
+        found.open(page)
+        yield found
+
+
+def test_page_loads_without_complaint_or_request(reader: Browser, page: Path) -> None:
+    assert reader.requests() == [page.as_uri()]
+    assert reader.complaints() == []
+    drawn = reader.tell(
+        "[...document.querySelectorAll('.chart')].map(e => [e.id, e.querySelectorAll('svg').length > 0])"
+    )
+    assert drawn == [[f"chart-{name}", True] for name in ("convergence", "matrix", "map", "spectrum", "witness")]
+    assert page.stat().st_size < 15e6
+
+
+def test_no_name_becomes_markup(reader: Browser) -> None:
+    assert reader.tell("window.ran === undefined")
+    assert reader.tell("document.title").startswith(f"Title {SCRIPT}{IMAGE}")
+    assert reader.texts("h1") == [f"Title {SCRIPT}{IMAGE}"]
+    assert reader.texts("#table-convergence tbody th.label")[0] == f"{FAMILY}/0"
+    assert reader.tell("[...document.images].filter(e => !e.src.startsWith('data:')).length") == 0
+    # Plotly takes some tags for markup.
+    legend = reader.tell("[...document.querySelectorAll('.legendtext')].map(e => e.textContent)")
+    assert f"{FAMILY[:20]}…{FAMILY[-19:]}" in legend
+    assert reader.tell("document.querySelectorAll('script:not([type])').length") == 3
+
+
+def test_failures_are_shown_with_their_reasons(reader: Browser) -> None:
+    assert reader.texts("#failed tbody th") == ["files/<b>bad<"]
+    assert "bad<.ply" in reader.texts("#failed td")[0]
+    assert "1 mesh is missing" in reader.texts("header .warning")[0]
+    rows = reader.texts("#table-convergence tbody:not([hidden]) tr")
+    assert any("failed: see why" in row for row in rows)
+
+
+def test_columns_sort_by_clicks_and_keys(reader: Browser) -> None:
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    shown = "#table-convergence tbody:not([hidden]) tr:not(.of-order) > :nth-child(2)"
+    button = reader.driver.find_elements(By.CSS_SELECTOR, "#table-convergence thead button")[1]
+    reader.driver.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", button)
+    button.click()
+    assert reader.texts(shown) == ["20", "80", "80", "320", "failed: see why"]
+    assert reader.tell("document.querySelectorAll('#table-convergence thead th')[1].ariaSort") == "ascending"
+    button.send_keys(Keys.ENTER)
+    assert reader.texts(shown) == ["320", "80", "80", "20", "failed: see why"]
+    assert reader.tell("document.activeElement.closest('th').ariaSort") == "descending"
+    # On to the next column by keys alone.
+    reader.driver.switch_to.active_element.send_keys(Keys.TAB)
+    reader.driver.switch_to.active_element.send_keys(Keys.SPACE)
+    edges = [float(text) for text in reader.texts(shown.replace("2)", "3)"))]
+    assert edges == sorted(edges)
+    assert len(edges) == 4
+
+
+def test_the_order_switches_tables_and_pictures(reader: Browser, store: str) -> None:
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    frame = convergence_frame(open_store(store)).dropna(subset="distance")
+    for order, name in ((-10.0, "−10"), (-3.0, "−3")):
+        assert reader.texts(".current-order b") == [name]
+        shown = [float(x.split()[0]) for x in reader.texts("#table-convergence tbody:not([hidden]) td:nth-of-type(3)")]
+        assert sorted(shown) == pytest.approx(sorted(frame[frame["order"] == order]["distance"]), rel=0.02)
+        drawn = reader.tell("document.getElementById('chart-convergence').data[0].y")
+        here = frame[(frame["order"] == order) & (frame["family"] == FAMILY)]
+        assert sorted(drawn) == pytest.approx(sorted(here["relative"]), rel=1e-3)
+        reader.driver.find_element(By.CSS_SELECTOR, "input[name=order]:checked").send_keys(Keys.ARROW_RIGHT)
+    # Around to the first one.
+    assert reader.texts(".current-order b") == ["−10"]
+
+
+def test_a_phone_is_wide_enough(reader: Browser, page: Path) -> None:
+    reader.open(page, width=360, height=740)
+    assert reader.tell("innerWidth") == 360
+    assert reader.tell("document.documentElement.scrollWidth") <= 360
+    assert reader.tell("document.querySelector('.scroll').scrollWidth > document.querySelector('.scroll').clientWidth")
+
+
+def test_dark_mode_changes_page_and_pictures(reader: Browser, page: Path) -> None:
+    colors = (
+        "[getComputedStyle(document.body).backgroundColor, "
+        "getComputedStyle(document.querySelector('#chart-convergence .xtick text')).fill]"
+    )
+    light = reader.tell(colors)
+    reader.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    reader.wait(f"{colors}[1] !== '{light[1]}'")
+    dark = reader.tell(colors)
+    assert [_brightness(x) > 0.5 for x in light] == [True, False]
+    assert [_brightness(x) > 0.5 for x in dark] == [False, True]
+
+
+def test_paper_and_browsers_without_scripts_show_every_order(reader: Browser, page: Path) -> None:
+    def check() -> None:
+        assert reader.texts("#table-convergence .of-order th") == ["order −10", "order −3"]
+        assert len(reader.texts("#table-convergence tbody th.label")) == 10
+        assert reader.tell("[...document.images].filter(e => e.offsetWidth > 100).length") >= 8
+        reader.wait("[...document.images].every(e => e.complete && e.naturalWidth > 0)")
+        assert reader.tell("document.getElementById('chart-convergence').offsetParent === null")
+
+    reader.command("Emulation.setEmulatedMedia", media="print")
+    check()
+    reader.command("Emulation.setEmulatedMedia", media="")
+    reader.command("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        reader.driver.get(page.as_uri())
+    finally:
+        reader.command("Emulation.setScriptExecutionDisabled", value=False)
+    check()
+
+
+class _Outline(HTMLParser):
+    """What a page is made of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+
+def test_page_can_be_found_through_without_eyes(page: Path) -> None:
+    outline = _Outline()
+    outline.feed(page.read_text(encoding="utf-8"))
+    tags = [tag for tag, _ in outline.elements]
+    assert {"main", "nav", "header", "footer", "fieldset", "legend", "caption", "figcaption"} <= set(tags)
+    assert tags.count("h1") == 1
+    ids = [attributes["id"] for _, attributes in outline.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    for tag, attributes in outline.elements:
+        if tag == "img":
+            assert attributes["alt"]
+        if attributes.get("role") == "img":
+            assert attributes["aria-label"]
+        if tag == "a":
+            assert (attributes["href"] or "").removeprefix("#") in ids
+        for name in ("src", "href"):
+            assert (attributes.get(name) or "data:").startswith(("data:", "#"))
+
+
+def test_the_study_can_be_run_again(page: Path, folder: Path, reader: Browser) -> None:
+    assert tomllib.loads(reader.tell("document.getElementById('study').textContent")) == table(folder)
+
+
+def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> None:
+    tree = open_store(store)
+    study = tree.attrs["study"]["table"]
+    gallery = make_gallery(tree, study, folder, ["files/good", "reference", "files/<b>bad<"])
+    assert [portrait.label for portrait in gallery.portraits] == ["files/good"]
+    assert gallery.absent == {"reference": "a surface in closed form has no triangles", "files/<b>bad<": "it is failed"}
+    (portrait,) = gallery.portraits
+    assert portrait.values.shape == (2, len(portrait.vertices))
+    # An inscribed mesh has less area than the sphere everywhere.
+    assert (portrait.values < 0).all()
+    elsewhere = make_gallery(tree, study, folder / "results.zarr", ["files/good"])
+    assert "cannot be listed here" in elsewhere.absent["files/good"]
+    changed = {**study, "family": [study["family"][0], {**study["family"][1], "source": "icosphere", "levels": [1]}]}
+    changed["family"][1].pop("paths")
+    renamed = make_gallery(tree, changed, folder, [f"{FAMILY}/0", "files/good"])
+    assert list(renamed.absent) == ["files/good"]
+    with pytest.raises(InputError, match="no mesh 'nobody'"):
+        make_gallery(tree, study, folder, ["nobody"])
+
+
+def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_LINES", 6)
+    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_MESHES", 2)
+    monkeypatch.setattr("sobolev_batch.results.report.charts.MOST_MESHES", 3)
+    monkeypatch.setattr("sobolev_batch.results.figures.spectra._MOST_MESHES", 2)
+    nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
+    monkeypatch.setattr("sobolev_batch.results.report.build._stills", lambda *_: nothing)
+    text = make_report(store, folder=folder)
+    for note in (
+        "2 more meshes are left out here; <code>sobolev-batch table --format csv</code>",
+        "4 more meshes are left out here.",
+        "Of 5 meshes the first 3 are shown, the reference among them",
+        "Of 4 meshes 2 are shown, evenly through the study",
+    ):
+        assert note in text
+
+
+def test_a_page_without_rendered_pictures_says_why(
+    store: str, folder: Path, page: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = "No pictures here: meshes cannot be drawn here: no &lt;OpenGL&gt;</p>"
+    assert note not in page.read_text(encoding="utf-8")
+
+    def nothing(*_: object) -> None:
+        raise InputError("meshes cannot be drawn here: no <OpenGL>")
+
+    monkeypatch.setattr("sobolev_batch.results.report.build.render", nothing)
+    assert make_report(store, folder=folder).count(note) == 1
+
+
+def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path) -> None:
+    study = {
+        "study": {"name": "near"},
+        "lattice": {"xi_max": 3.0, "M": 16},
+        "norm": {"orders": [-4.0]},
+        "proximity": {"points": 100},
+        "reference": {"source": "icosphere", "levels": [3]},
+        "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+    }
+    place, path = "memory://near.zarr", tmp_path / "report.html"
+    run(Study.from_table(study), place)
+    write_report(place, path)
+    with browser(tmp_path / "profile") as reader:
+        reader.open(path)
+        assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff ≥", "Chamfer"]
+        cells = reader.texts("#table-convergence tbody:not([hidden]) tr:last-child td")
+        assert len(cells) == 9
+        assert "±" in cells[-1]
+        assert "Chamfer the mean distance" in reader.texts("#convergence")[0]
+        assert "proximity" in reader.texts("#asked dt")
+
+
+def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    status = replace(Status.of(store), not_compared={"files/good": "no witness: <i>changed</i>"})
+    monkeypatch.setattr(Status, "of", lambda _: status)
+    text = make_report(store)
+    assert "1 mesh lacks a comparison" in text
+    assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
+    assert "no witness: &lt;i&gt;changed&lt;/i&gt;" in text
+
+
+def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(tree: xr.DataTree) -> None:
+        raise ValueError("Stored and computed checksum do not match.")
+
+    monkeypatch.setattr("sobolev_batch.results.report.build.Wavelengths.of_store", damaged)
+    with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
+        make_report(store)
+
+
+def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(StoreError, match="no store of a study is there"):
+        make_report(tmp_path)
+    monkeypatch.setattr("sobolev_batch.results.report.build.make_report", lambda *_, **__: "")
+    with pytest.raises(StoreError, match="cannot be written there"):
+        write_report(store, tmp_path / "nowhere" / "a.html")
+
+
+def test_what_is_missing_is_said(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty = xr.DataTree()
+    empty.attrs = open_store(store).attrs
+    with monkeypatch.context() as patch:
+        patch.setattr("sobolev_batch.results.report.build.open_store", lambda place: empty)
+        with pytest.raises(InputError, match="no tables yet: run the study to its end"):
+            make_report(store)
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    with pytest.raises(InputError, match=r"library plotly.*pip install 'sobolev-batch\[report\]'"):
+        make_report(store)
+
+
+def _brightness(color: str) -> float:
+    red, green, blue = map(int, re.findall(r"\d+", color)[:3])
+    return (0.3 * red + 0.6 * green + 0.1 * blue) / 255

@@ -1,0 +1,510 @@
+"""Backends: a strict fake of a GPU everywhere, the real CuPy where it is installed, a real GPU where there is one."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
+from sobolev_batch.spectral.backends import backends, cuda
+from sobolev_batch.spectral.backends.arrays import combine, sums_of_runs
+from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.errors.a_priori import Goal
+from sobolev_batch.spectral.fields import compute_field, field_for
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
+from sobolev_batch.spectral.transform.transform import Transform, Transformed, transform_block
+from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
+from tests.support.repository import PACKAGE, imported
+
+LATTICE = Lattice(5.0, 32)
+DOUBLE = Transform(1e-13)
+
+
+def uneven() -> Mesh:
+    """A closed surface with triangles of all sizes: corners, midpoints, interior rules and triangles cut up."""
+    sphere = icosphere(4)
+    height = sphere.vertices[:, 2]
+    stretched = sphere.vertices * (0.5 + 0.4 * np.sin(sphere.vertices @ np.array([3.0, -2.0, 1.0])))[:, None]
+    small = np.where(height[:, None] > 0.2, stretched, 0.02 * stretched + np.array([0.0, 0.0, -0.3]))
+    far = Mesh(np.array([[-1.2, -1.2, 0.9], [1.3, -1.1, 0.8], [0.1, 1.4, 1.2]]), [[0, 1, 2]])
+    return Mesh(
+        np.concatenate([small, far.vertices]),
+        np.concatenate([sphere.triangles, far.triangles + len(small)]),
+    )
+
+
+def on(backend: backends.Backend, mesh: Mesh, settings: Transform = DOUBLE, **options: Any) -> Transformed:
+    return transform_block(mesh, LATTICE, LATTICE.half, settings, backend=backend, **options)
+
+
+def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, tolerance: float = 1e-12) -> None:
+    assert found.points == expected.points
+    assert found.values.dtype == expected.values.dtype
+    assert isinstance(found.values, np.ndarray)
+    assert np.abs(found.values - expected.values).max() < tolerance * mesh.area
+
+
+def rules_in_use(mesh: Mesh, settings: Transform) -> set[str]:
+    groups = settings.quadrature._groups(mesh, LATTICE.highest_frequency, settings.rule_tolerance)
+    kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
+    return {"split" if group.splits else kinds.get(group.rule, "interior") for group in groups}
+
+
+MESHES: list[Callable[[], Mesh]] = [*(lambda level=level: icosphere(level) for level in range(5)), uneven]
+
+
+@pytest.mark.parametrize("make", MESHES)
+@pytest.mark.parametrize("quadrature", ["auto", "gauss8", 7])
+def test_the_fake_agrees_with_the_processor(make: Callable[[], Mesh], quadrature: str | int) -> None:
+    mesh = make()
+    settings = Transform(1e-13, quadrature=Quadrature(quadrature))
+    found = on(Device().backend(), mesh, settings)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh, settings), mesh)
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
+def test_every_kind_of_rule_agrees(tolerance: float) -> None:
+    mesh, settings = uneven(), Transform(1e-13, tolerance=tolerance)
+    if tolerance == 1e-2:
+        assert rules_in_use(mesh, settings) == {"corners", "midpoints", "interior", "split"}
+    found = on(Device().backend(), mesh, settings)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh, settings), mesh)
+
+
+def test_single_precision_agrees_to_its_own_accuracy() -> None:
+    mesh, settings = uneven(), Transform(1e-6, "complex64")
+    found = on(Device().backend(), mesh, settings)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh, settings), mesh, 1e-5)
+
+
+@pytest.mark.parametrize("block", [Block((-3, 4, 2), (5, 2, 4)), Block((-2, -3, 0), (4, 6, 1))])
+def test_batches_and_blocks_agree(block: Block) -> None:
+    mesh = icosphere(3)
+    found, expected = (
+        transform_block(mesh, LATTICE, block, DOUBLE, backend=backend, batch=20_000)
+        for backend in (Device().backend(), CPU)
+    )
+    assert found.backend == "cufinufft"
+    assert_agree(found, expected, mesh)
+
+
+@pytest.mark.parametrize("eps", [1e-5, 1e-9])
+def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog: pytest.LogCaptureFixture) -> None:
+    mesh, settings, lattice = icosphere(5), Transform(eps), Lattice(5.0, 64)
+    expected = transform_block(mesh, lattice, lattice.half, settings)
+    device = Device(capacity=7.5e7)
+    found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
+    assert found.backend == "cufinufft"
+    assert device.options[0]["n_modes"] != lattice.shape
+    assert not caplog.records
+    assert_agree(found, expected, mesh, 5 * eps)
+    assert device.used == 0
+
+
+def test_what_is_foreseen_of_a_device_is_what_it_takes() -> None:
+    mesh, settings = icosphere(6), Transform(1e-9)
+    device = Device()
+    on(device.backend(), mesh, settings, batch=200_000)
+    allowed = device.most_used / 0.9
+    assert on(Device(capacity=allowed + 1e8).backend(), mesh, settings, batch=200_000).backend == "cufinufft"
+    # Points: what a batch holds at most, over the points of a batch.
+    assert device.most_used < 200_000 * backends.GPU_COSTS.point_bytes + 60 * len(mesh.triangles) + 20e6
+
+
+def test_every_option_of_a_plan_is_given() -> None:
+    device = Device()
+    on(device.backend(), icosphere(1))
+    (options,) = device.options
+    needed = {"eps", "isign", "dtype", "modeord", "upsampfac", "gpu_method", "gpu_sort", "gpu_device_id", "gpu_stream"}
+    assert needed <= options.keys()
+    assert (options["isign"], options["modeord"], options["dtype"], options["eps"]) == (-1, 0, "complex128", 1e-13)
+
+
+@pytest.mark.parametrize("where", ["plan", "setpts", "execute"])
+@pytest.mark.parametrize("times", [1, 2])
+def test_out_of_memory_is_tried_again_in_smaller_parts(
+    where: str, times: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    mesh, lattice, device = icosphere(5), Lattice(5.0, 64), Device(failures=[(where, "memory")] * times)
+    settings = Transform(1e-9)
+    found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
+    assert found.backend == "cufinufft"
+    assert_agree(found, transform_block(mesh, lattice, lattice.half, settings), mesh, 5e-9)
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * times
+    assert "cufinufft: out of memory; trying again with" in caplog.text
+    assert device.used == 0
+
+
+def test_out_of_memory_for_good_falls_back(caplog: pytest.LogCaptureFixture) -> None:
+    mesh, device = icosphere(3), Device(failures=[("execute", "memory")] * 20)
+    found = on(device.backend(), mesh)
+    assert found.backend == "finufft after cufinufft: out of memory"
+    assert np.array_equal(found.values, on(CPU, mesh).values)
+    assert "the processor computes it instead" in caplog.records[-1].message
+    assert device.used == 0
+
+
+def test_a_device_too_small_for_anything_is_not_tried(caplog: pytest.LogCaptureFixture) -> None:
+    mesh, device = icosphere(3), Device(capacity=1e6)
+    found = on(device.backend(), mesh)
+    assert found.backend == "finufft after cufinufft: out of memory"
+    assert not device.options
+    assert len(caplog.records) == 1
+
+
+def test_arrays_that_run_out_of_memory_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, device = icosphere(4), Device(capacity=2e6)
+    monkeypatch.setattr(Gpu, "free_bytes", 1e9)  # as with a limit on CuPy's pool, which CUDA does not know
+    found = on(device.backend(), mesh)
+    assert found.backend == "finufft after cufinufft: out of memory"
+    assert np.array_equal(found.values, on(CPU, mesh).values)
+
+
+@pytest.mark.parametrize("where", ["plan", "setpts", "execute"])
+def test_any_other_failure_falls_back_at_once(where: str, caplog: pytest.LogCaptureFixture) -> None:
+    mesh, device = icosphere(3), Device(failures=[(where, "error")])
+    found = on(device.backend(), mesh)
+    assert found.backend.startswith("finufft after cufinufft: Error ")
+    assert np.array_equal(found.values, on(CPU, mesh).values)
+    assert len(caplog.records) == 1
+    assert "the processor computes it instead" in caplog.text
+    assert device.used == 0
+
+
+def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
+    mesh, lattice = icosphere(4), Lattice(5.0, 64)
+    device = Device(capacity=2.5e8, failures=[("plan", "error")])
+    found = transform_block(mesh, lattice, lattice.half, DOUBLE, backend=device.backend())
+    assert found.backend == "cufinufft"
+    assert len(device.options) == 2
+    assert_agree(found, transform_block(mesh, lattice, lattice.half, DOUBLE), mesh)
+
+
+def test_memory_bounds_the_processor_that_steps_in() -> None:
+    mesh, device = icosphere(3), Device(failures=[("execute", "error")])
+    found = on(device.backend(), mesh, Transform(1e-9), memory=1.2e7)
+    assert found.backend.startswith("finufft after")
+    assert np.array_equal(found.values, on(CPU, mesh, Transform(1e-9), memory=1.2e7).values)
+    with pytest.raises(InputError, match="give at least"):
+        on(Device().backend(), mesh, memory=1e6)
+
+
+def test_two_threads_take_turns() -> None:
+    mesh, backend = icosphere(3), Device().backend()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: on(backend, mesh), range(8)))
+    assert {each.backend for each in found} == {"cufinufft"}
+    assert all(np.array_equal(each.values, found[0].values) for each in found)
+
+
+def test_fields_carry_their_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Device().backend()
+    mesh = icosphere(2)
+    assert compute_field(mesh, LATTICE, Transform(), [-2.0], backend=backend).backend == "cufinufft"
+    goal = Goal((-2.0,), (1e-3,))
+    assert field_for(mesh, LATTICE, goal, Transform(), backend=backend).backend == "cufinufft"
+    assert field_for(Sphere(), LATTICE, goal, Transform(), backend=backend).backend == "closed form"
+    monkeypatch.setattr(backends, "gpu_backend", lambda: backend)
+    attributes = {name: fourier_transform(mesh, LATTICE, backend=name).attrs["backend"] for name in ("gpu", "auto")}
+    assert attributes == {"gpu": "cufinufft", "auto": "cufinufft"}
+    assert fourier_transform(mesh, LATTICE).attrs["backend"] == "finufft"
+
+
+def test_auto_means_the_processor_where_there_is_no_gpu(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def missing() -> Gpu:
+        raise BackendError("no GPU: none")
+
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(backends, "gpu_backend", missing)
+    assert backend_named("auto") is CPU
+    assert "computing on the processor: no GPU: none" in caplog.text
+    with pytest.raises(BackendError, match="no GPU: none"):
+        fourier_transform(icosphere(0), LATTICE, backend="gpu")
+    with pytest.raises(InputError, match="backend must be 'cpu', 'gpu' or 'auto', found 'tpu'"):
+        backend_named("tpu")
+
+
+def test_the_trial_compares_values() -> None:
+    try_out(Device().backend())
+    with pytest.raises(BackendError, match="fails a trial transform: Error executing plan"):
+        try_out(Device(failures=[("execute", "error")]).backend())
+
+
+def test_the_cpu_and_errors_survive_pickling() -> None:
+    assert pickle.loads(pickle.dumps(CPU)) is CPU
+    error = pickle.loads(pickle.dumps(BackendError("no GPU: none")))
+    assert (type(error), str(error)) == (BackendError, "no GPU: none")
+    assert Device().backend().__reduce__() == (gpu_backend, ())
+
+
+def test_importing_the_package_loads_nothing_of_a_gpu() -> None:
+    # zarr imports CuPy where it is installed; nothing of this package does.
+    code = "import sys, sobolev_batch; print('cufinufft' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+    for path in PACKAGE.rglob("*.py"):
+        assert not {name.split(".")[0] for name in imported(path)} & {"cupy", "cufinufft", "cuda"}, path
+
+
+class Loader:
+    """A pathfinder that does not find one of the libraries."""
+
+    def __init__(self, missing: str = "") -> None:
+        self.missing = missing
+
+    def load_nvidia_dynamic_lib(self, name: str) -> Any:
+        if name == self.missing:
+            raise RuntimeError("not found")
+        return SimpleNamespace(abs_path=None)  # the process itself
+
+
+def no_device(status: int, driver: int = 0) -> Any:
+    def get_device_count() -> int:
+        if status:
+            raise CUDARuntimeError(status)
+        return 0
+
+    runtime = SimpleNamespace(
+        CUDARuntimeError=CUDARuntimeError, getDeviceCount=get_device_count, driverGetVersion=lambda: driver
+    )
+    return SimpleNamespace(cuda=SimpleNamespace(runtime=runtime))
+
+
+@pytest.mark.parametrize(
+    ("modules", "message"),
+    [
+        ({}, r"^no GPU: cuda-pathfinder is not installed: pip install 'sobolev-batch\[gpu\]'$"),
+        (
+            {"cuda.pathfinder": Loader("cudart")},
+            r"^no GPU: the CUDA runtime \(cudart\) is not installed or cannot .*gpu",
+        ),
+        ({"cuda.pathfinder": Loader("cufft")}, r"^no GPU: cuFFT \(cufft\) is not installed .*pip install"),
+        ({"cuda.pathfinder": Loader("nvrtc")}, r"^no GPU: the CUDA compiler NVRTC \(nvrtc\) is not .*pip install"),
+        ({"cuda.pathfinder": Loader()}, r"^no GPU: CuPy is not installed: pip install"),
+        ({"cuda.pathfinder": Loader(), "cupy": no_device(0)}, r"^no GPU: cuFINUFFT is not installed: pip install"),
+        (
+            {"cuda.pathfinder": Loader(), "cupy": no_device(0), "cufinufft": ImportError("bad\nlibrary")},
+            r"^no GPU: cuFINUFFT is installed but cannot be imported \(bad library\): pip install",
+        ),
+        ({"cupy": no_device(35)}, "^no GPU: the NVIDIA driver is not installed on this machine$"),
+        ({"cupy": no_device(35, 11000)}, "^no GPU: the NVIDIA driver is too old for CUDA 12: update it"),
+        ({"cupy": no_device(100)}, "^no GPU: the NVIDIA driver sees no device; is CUDA_VISIBLE_DEVICES"),
+        ({"cupy": no_device(0)}, "^no GPU: the NVIDIA driver sees no device; is CUDA_VISIBLE_DEVICES"),
+        ({"cupy": no_device(999)}, "^no GPU: CUDA says cudaError 999$"),
+    ],
+)
+def test_says_in_one_line_what_is_missing(
+    modules: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "cuda.pathfinder" not in modules and modules:
+        modules = {"cuda.pathfinder": Loader(), "cufinufft": SimpleNamespace(), **modules}
+
+    def import_module(name: str) -> Any:
+        found = modules.get(name)
+        if found is None:
+            raise ModuleNotFoundError(name)
+        if isinstance(found, ImportError):
+            raise found
+        return found
+
+    monkeypatch.setattr(cuda, "importlib", SimpleNamespace(import_module=import_module))
+    with pytest.raises(BackendError, match=message):
+        cuda.load()
+
+
+def test_the_exceptions_agree_with_numpy() -> None:
+    rng = np.random.default_rng(7)
+    device = Device()
+    rows, values = rng.normal(size=(3, 50)), rng.normal(size=50)
+    starts = np.array([0, 3, 4, 20, 49])
+    for coefficients in (rng.normal(size=3), rng.normal(size=(5, 3))):
+        found = combine(coefficients, device._asarray(rows))
+        assert isinstance(found, Array)
+        assert np.abs(found.host - coefficients @ rows).max() < 1e-14
+    sums = sums_of_runs(device._asarray(values), device._asarray(starts))
+    assert np.abs(sums.host - np.add.reduceat(values, starts)).max() < 1e-14
+
+
+# The real libraries, without a device.
+
+
+@pytest.fixture(scope="module")
+def real_cupy() -> Any:
+    return pytest.importorskip("cupy", reason="CuPy comes with the extra 'gpu'")
+
+
+def test_cupy_answers_what_the_fake_answers(real_cupy: Any) -> None:
+    for name in FUNCTIONS:
+        assert getattr(real_cupy, name) is not getattr(np, name), name
+    for name in UFUNCS:
+        assert isinstance(getattr(real_cupy, name), real_cupy.ufunc), name
+    public = {name for name in vars(Array) if not name.startswith("_")}
+    assert public <= set(dir(real_cupy.ndarray))
+
+
+def test_numpys_functions_reach_cupy(real_cupy: Any) -> None:
+    """Each call that the package makes gets through to CUDA, which then may well miss its driver."""
+    memory = real_cupy.cuda.UnownedMemory(1 << 12, 1 << 20, None, 0)
+
+    def phantom(*shape: int, dtype: Any = np.float64) -> Any:
+        return real_cupy.ndarray(shape, dtype=dtype, memptr=real_cupy.cuda.MemoryPointer(memory, 0))
+
+    try:
+        has_device = real_cupy.cuda.runtime.getDeviceCount() > 0
+    except real_cupy.cuda.runtime.CUDARuntimeError:
+        has_device = False
+    make = real_cupy.zeros if has_device else lambda shape, dtype=np.float64: phantom(*shape, dtype=dtype)
+    rows, row = make((3, 5)), make((5,))
+    indices, complexes, flags = make((5,), np.int64), make((5,), np.complex128), make((5,), np.bool_)
+    calls: dict[str, Callable[[], object]] = {
+        "empty": lambda: np.empty((3, 4), dtype=np.int64, like=row),
+        "zeros": lambda: np.zeros(3, dtype="complex64", like=row),
+        "asarray": lambda: np.asarray(np.arange(3.0), like=row),
+        "arange": lambda: np.arange(5, like=indices),
+        "ascontiguousarray": lambda: np.ascontiguousarray(rows[0], dtype=np.float32, like=rows),
+        "concatenate": lambda: np.concatenate([rows, rows], axis=1),
+        "stack": lambda: np.stack([row, row]),
+        "tile": lambda: np.tile(row, 4),
+        "repeat": lambda: np.repeat(row, 3),
+        "unique": lambda: np.unique(indices, return_inverse=True),
+        "bincount": lambda: np.bincount(indices, weights=row),
+        "flatnonzero": lambda: np.flatnonzero(flags),
+        "cumsum": lambda: np.cumsum(indices),
+        "multiply": lambda: np.multiply(row, row, out=complexes.real, casting="same_kind"),
+        "not_equal": lambda: np.not_equal(indices[1:], indices[:-1], out=flags[1:]),
+        "left_shift": lambda: np.left_shift(np.minimum(indices, indices), 3, out=indices),
+        "tan": lambda: np.tan(0.5 * row),
+        "exp": lambda: np.exp(1j * row),
+        "numpy scalar": lambda: np.float64(2) * row,
+        "list index": lambda: rows[[0, 2]],
+        "assignment": lambda: indices.__setitem__(indices, 1),
+        "imaginary part": lambda: setattr(complexes, "imag", 0),
+        # Without a driver, sorting itself ends some versions of CuPy.
+        "sort": lambda: indices.sort() if has_device else None,
+        "iteration": lambda: [each.ravel() for each in rows],
+    }
+    for name, call in calls.items():
+        try:
+            call()
+        except real_cupy.cuda.runtime.CUDARuntimeError:
+            assert not has_device, name
+    assert calls.keys() >= FUNCTIONS
+
+
+def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cupy: Any) -> None:
+    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
+    code = """
+import sys
+from sobolev_batch import BackendError
+from sobolev_batch.spectral.backends.backends import gpu_backend
+try:
+    print("found", gpu_backend().description)
+except BackendError as error:
+    print("cufinufft" in sys.modules, error)
+"""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(("found", "True no GPU: the NVIDIA driver")), done.stdout
+    assert not done.stderr
+
+
+def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> None:
+    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
+    # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
+    code = """
+from sobolev_batch.spectral.backends import cuda
+from sobolev_batch.spectral.backends.backends import GPU_COSTS, Gpu
+cuda._require_device = lambda cupy: None
+backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
+try:
+    backend.plan((8, 8, 8), eps=1e-9, precision="complex128", oversampling=1.5, threads=1)
+except RuntimeError as error:
+    print(error, backend.libraries.is_out_of_memory(error))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "Error creating plan. False\n"
+    assert "Exception ignored" not in done.stderr
+    assert "upsampfac=1.5 cannot be handled" in done.stderr
+
+
+def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
+    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
+    code = """
+from sobolev_batch import BackendError
+from sobolev_batch.spectral.backends import cuda
+try:
+    cuda.load()
+except BackendError:
+    pass
+from cufinufft._cufinufft import NufftOpts
+print(*(name for name, _ in NufftOpts._fields_))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == OPTIONS
+
+
+# A real GPU.
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Iterator[Gpu]:
+    try:
+        yield gpu_backend()
+    except BackendError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("make", [*MESHES, lambda: icosphere(5)])
+def test_a_gpu_agrees_with_the_processor(gpu: Gpu, make: Callable[[], Mesh]) -> None:
+    mesh = make()
+    found = on(gpu, mesh)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh), mesh)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("complex128", 1e-12), ("complex64", 1e-5)])
+@pytest.mark.parametrize("rule_tolerance", [1e-2, 1e-4])
+def test_a_gpu_agrees_in_both_precisions(
+    gpu: Gpu, precision: Precision, tolerance: float, rule_tolerance: float
+) -> None:
+    mesh = uneven()
+    settings = Transform(1e-13 if precision == "complex128" else 1e-6, precision, tolerance=rule_tolerance)
+    found = on(gpu, mesh, settings, batch=20_000)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh, settings), mesh, tolerance)
+
+
+def test_a_gpu_agrees_in_parts(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = icosphere(5)
+    monkeypatch.setattr(Gpu, "free_bytes", 7e7)
+    found = on(gpu, mesh)
+    assert found.backend == "cufinufft"
+    assert_agree(found, on(CPU, mesh), mesh)
+
+
+def test_a_gpu_out_of_memory_falls_back(gpu: Gpu) -> None:
+    pool = gpu.libraries.cupy.get_default_memory_pool()
+    pool.free_all_blocks()
+    pool.set_limit(size=1 << 16)
+    try:
+        found = on(gpu, icosphere(4))
+    finally:
+        pool.set_limit(size=0)
+    assert found.backend == "finufft after cufinufft: out of memory"
+    assert on(gpu, icosphere(4)).backend == "cufinufft"

@@ -1,0 +1,100 @@
+"""Errors of norms and distances: they cover the truth, and are not many times larger."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch.spectral.errors.budget import Sums, truncated
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.surfaces.shapes.similarity import Surface
+from tests.support.shapes import CENTRED_BOX as BOX
+
+Reals = NDArray[np.float64]
+
+ORDERS = (-2.0, -3.0, -5.0, -10.0)
+STICK = Mesh(BOX.vertices * np.array([1.0, 0.15, 0.1]), BOX.triangles)
+PAIRS: dict[str, tuple[Surface, Surface]] = {
+    "icosphere and sphere": (icosphere(2), Sphere()),
+    "icospheres": (icosphere(0), icosphere(1)),
+    "box and sphere": (BOX, Sphere()),
+    "boxes": (BOX, Mesh(0.9 * BOX.vertices, BOX.triangles)),
+    "sticks": (STICK, Mesh(0.97 * STICK.vertices, STICK.triangles)),
+    "moved spheres": (Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.8, (-0.2, 0.0, 0.0))),
+    "near spheres": (Sphere(0.8), Sphere(0.79)),
+}
+FINE = Lattice(16.0, 128)
+COARSE = (Lattice(2.0, 12), Lattice(3.0, 20), Lattice(4.0, 24), Lattice(4.0, 36), Lattice(6.0, 54))
+
+
+def test_reported_errors_cover_the_true_ones_and_stay_near_them() -> None:
+    ratios = []
+    for name, (a, b) in PAIRS.items():
+        truth = distance(a, b, ORDERS, lattice=FINE)
+        for lattice in COARSE:
+            found = distance(a, b, ORDERS, lattice=lattice)
+            true_errors = np.abs(found["distance"].values - truth["distance"].values)
+            # Where the fine lattice cannot tell, there is nothing to compare with.
+            telling = true_errors > 20 * truth["error"].values
+            ratio = found["error"].values[telling] / true_errors[telling]
+            assert (ratio > 1).all(), (name, lattice, ratio)
+            ratios.append(ratio)
+    every = np.concatenate(ratios)
+    assert len(every) > 35
+    assert np.median(every) < 10
+
+
+def test_closed_forms_lie_within_the_error() -> None:
+    a, b = Sphere(), Sphere(0.9, (0.3, 0.0, 0.0))
+    exact = distance(a, b, ORDERS)
+    assert (exact["error"] <= 1e-12 * norm(a, ORDERS)["norm"] ** 2 / exact["distance"]).all()
+    for lattice in (Lattice(3.0, 20), Lattice(5.0, 64)):
+        found = distance(a, b, ORDERS, lattice=lattice)
+        assert (np.abs(found["distance"] - exact["distance"]) <= found["error"] + exact["error"]).all()
+        total = found["truncation"] + found["aliasing"] + found["discretisation"]
+        assert np.allclose(found["error"], total, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test_coarse_quadrature_is_noticed(degree: int) -> None:
+    mesh, lattice = icosphere(3), Lattice(5.0, 64)
+    exact = fourier_transform(mesh, lattice, 1e-13)
+    rough = fourier_transform(mesh, lattice, 1e-10, quadrature=degree)
+    true_error = norm((rough - exact), ORDERS)["norm"].values
+    reported = norm(rough, ORDERS)["discretisation"].values
+    assert (reported > true_error).all()
+    assert (reported < 4 * true_error).all()
+
+
+def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> None:
+    lattice = Lattice(4.0, 32)
+    first, again = (Quality.from_json(fourier_transform(icosphere(2), lattice).attrs["quality"]) for _ in range(2))
+    assert first.probe.shells == again.probe.shells
+    other = Quality.from_json(fourier_transform(icosphere(1), lattice).attrs["quality"])
+    assert other.probe.shells != first.probe.shells
+    assert (first.probe.norms(lattice, [-1.3, -7.7]) > 0).all()
+
+
+def test_fields_of_unknown_origin_have_numbers_without_errors() -> None:
+    lattice = Lattice(4.0, 32)
+    field = fourier_transform(BOX, lattice)
+    found = norm(2 * field.drop_attrs(), ORDERS)
+    assert np.isnan(found["error"]).all()
+    assert np.allclose(found["norm"], 2 * norm(field, ORDERS)["norm"], rtol=1e-13)
+
+
+def test_truncation_only_adds() -> None:
+    exact = norm(Sphere(), -2.0)["norm"].item()
+    found = norm(Sphere(), -2.0, lattice=Lattice(3.0, 48))
+    assert found["norm"].item() < exact <= found["norm"].item() + found["truncation"].item()
+
+
+@pytest.mark.parametrize("growth", [1e-4, 3e-4, 1e-3, 1e-2])
+def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
+    lattice = Lattice(4.0, 16)
+    sums = Sums(np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
+    bound = truncated(sums, lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    assert bound == pytest.approx(flat, rel=0.3)

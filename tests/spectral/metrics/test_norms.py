@@ -1,0 +1,126 @@
+"""Norms, inner products and distances of fields."""
+
+from __future__ import annotations
+
+import dask.array
+import numpy as np
+import pytest
+from scipy.special import gamma, kv
+
+from sobolev_batch import (
+    InputError,
+    Lattice,
+    LatticeError,
+    OrderError,
+    Sphere,
+    distance,
+    fourier_transform,
+    icosphere,
+    inner_product,
+    norm,
+)
+from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.shells import shell_sums, shell_weights
+from tests.support.oracles import full_lattice_norm
+from tests.support.shapes import CENTRED_BOX as BOX
+
+LATTICE = Lattice(4.0, 32)
+
+
+@pytest.mark.parametrize("order", [-0.6, -2.0, -10.0])
+def test_norm_is_the_trapezoidal_rule_over_the_whole_cube(order: float) -> None:
+    field = fourier_transform(BOX, LATTICE)
+    assert norm(field, order)["norm"].item() == pytest.approx(
+        full_lattice_norm(field.values, LATTICE, order), rel=1e-13
+    )
+
+
+def test_distance_is_the_norm_of_the_difference() -> None:
+    a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(), LATTICE)
+    found = distance(a, b, [-1.0, -3.0])["distance"].values
+    assert found == pytest.approx([full_lattice_norm((a - b).values, LATTICE, s) for s in (-1.0, -3.0)], rel=1e-13)
+
+
+def test_inner_product_polarises() -> None:
+    a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(0.8, (0.1, 0.2, 0.0)), LATTICE)
+    product = inner_product(a, b, -2.5)["inner_product"].item()
+    squares = norm(a, -2.5)["norm"].item() ** 2 + norm(b, -2.5)["norm"].item() ** 2
+    assert squares - 2 * product == pytest.approx(distance(a, b, -2.5)["distance"].item() ** 2, rel=1e-12)
+
+
+def test_distance_against_the_matern_kernel_in_real_space() -> None:
+    # ||m||² = ∬ K(|x-y|) dm dm with K the Matérn kernel: no Fourier transform on that side.
+    order = -6.0
+    shrunk = type(BOX)(0.8 * BOX.vertices, BOX.triangles)
+    points, weights = [], []
+    for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
+        for batch in Quadrature(22).batches(mesh, 1.0, 1e-9, 1 << 20):
+            points.append(batch.coordinates.T)
+            weights.append(sign * batch.weights)
+    x, w = np.concatenate(points), np.concatenate(weights)
+    # The diagonal stands for r -> 0, where the kernel has a finite limit that r = 1e-4 has reached.
+    r = np.maximum(np.sqrt(np.sum((x[:, None] - x[None]) ** 2, axis=2)), 1e-4)
+    a = -order
+    kernel = 2 * np.pi**a / gamma(a) * r ** (a - 1.5) * kv(1.5 - a, 2 * np.pi * r)
+    in_space = np.sqrt(w @ kernel @ w)
+    lattice = Lattice(7.0, 112)
+    assert distance(BOX, shrunk, order, lattice=lattice)["distance"].item() == pytest.approx(in_space, rel=1e-7)
+
+
+def test_one_order_gives_a_number_and_several_an_axis() -> None:
+    one = norm(fourier_transform(Sphere(), LATTICE), -2)
+    assert one["norm"].dims == ()
+    assert one["order"].item() == -2.0
+    several = norm(fourier_transform(Sphere(), LATTICE), [-2, -3])
+    assert several["norm"].dims == ("order",)
+    assert several["norm"].sel(order=-2).item() == pytest.approx(one["norm"].item(), rel=1e-14)
+
+
+@pytest.mark.parametrize("order", [-0.5, -0.49, 0, 2, float("nan"), float("-inf"), [-2.0, -0.1], []])
+def test_refuses_orders_without_a_norm(order: float | list[float]) -> None:
+    with pytest.raises(OrderError):
+        norm(Sphere(), order)
+
+
+def test_surfaces_take_the_lattice_of_the_field_beside_them() -> None:
+    field = fourier_transform(Sphere(), LATTICE)
+    direct = distance(fourier_transform(BOX, LATTICE), field, -2)["distance"].item()
+    assert distance(BOX, field, -2)["distance"].item() == pytest.approx(direct, rel=1e-14)
+
+
+def test_refuses_what_cannot_be_compared() -> None:
+    field = fourier_transform(Sphere(), LATTICE)
+    with pytest.raises(LatticeError, match="different lattices"):
+        distance(field, fourier_transform(Sphere(), Lattice(4.0, 30)), -2)
+    with pytest.raises(InputError, match="needs a lattice"):
+        norm(BOX, -2)
+    with pytest.raises(InputError, match="found str"):
+        norm("box.ply", -2)  # type: ignore[arg-type]
+    with pytest.raises(LatticeError, match="select one mesh"):
+        norm(field.expand_dims(mesh=["a"]), -2)
+
+
+def test_lazy_and_transposed_fields_give_the_same_numbers() -> None:
+    field = fourier_transform(BOX, LATTICE)
+    lazy = field.copy(data=dask.array.from_array(field.values, chunks=(10, 33, 5)))
+    assert norm(lazy.transpose("xi_z", "xi_x", "xi_y"), -2)["norm"].item() == norm(field, -2)["norm"].item()
+
+
+def test_missing_samples_make_the_norm_missing() -> None:
+    field = fourier_transform(BOX, LATTICE).copy()
+    field[3, 4, 5] = np.nan
+    assert np.isnan(norm(field, -2)["norm"].item())
+
+
+def test_single_precision_fields_are_summed_in_double() -> None:
+    field = fourier_transform(icosphere(2), LATTICE, 1e-6)
+    single = norm(field.astype(np.complex64), -2)["norm"].item()
+    assert single == pytest.approx(norm(field, -2)["norm"].item(), rel=1e-7)
+
+
+def test_shell_sums_of_blocks_add_up() -> None:
+    field = fourier_transform(BOX, LATTICE)
+    parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
+    whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
+    assert np.allclose(parts, whole, rtol=1e-13, atol=0)
+    assert shell_weights(LATTICE, [-2.0]) @ whole == pytest.approx(norm(field, -2)["norm"].item() ** 2, rel=1e-14)

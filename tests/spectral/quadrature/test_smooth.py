@@ -1,0 +1,370 @@
+"""Transforms of parametrised surfaces: against closed forms and Bessel integrals, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import j0
+
+from sobolev_batch import (
+    Ellipsoid,
+    InputError,
+    Interval,
+    Lattice,
+    LatticeError,
+    Mesh,
+    ParametrisedSurface,
+    Similarity,
+    Sphere,
+    Torus,
+    distance,
+    fourier_transform,
+    inner_product,
+    norm,
+)
+from sobolev_batch.spectral.backends.backends import CPU
+from sobolev_batch.spectral.errors.budget import DIRECTIONS
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.exact.spheres import sphere_transform
+from sobolev_batch.spectral.quadrature import meshes as quadrature
+from sobolev_batch.spectral.quadrature import smooth as resolution
+from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolve
+from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from tests.support.fake_device import Device
+from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
+from tests.support.smooth_shapes import (
+    HALF_TURN,
+    ROTATION,
+    TURN,
+    angular_ball,
+    ball,
+    plate,
+    roof,
+    roof_derivatives,
+    turned_torus,
+)
+
+Reals = NDArray[np.float64]
+
+LATTICE = Lattice(4.0, 32)
+SMOOTH = [
+    Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3)),
+    Torus(1.0, 0.4, (0.1, -0.2, 0.3)),
+    turned_torus(Torus(0.9, 0.3)),
+]
+
+
+def frequencies(count: int = 12, highest: float = 7.0) -> Reals:
+    """Random ones, zero among them."""
+    found = np.random.default_rng(4).normal(size=(count, 3))
+    found *= highest * np.linspace(0, 1, count)[:, None] / np.linalg.norm(found, axis=1, keepdims=True)
+    return found
+
+
+def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
+    """The field of a surface on the half lattice."""
+    return np.asarray(fourier_transform(surface, LATTICE, eps, threads=1).values)
+
+
+@pytest.mark.parametrize("derivatives", [False, True])
+def test_the_sphere_as_a_parametrised_surface_is_the_closed_form(derivatives: bool) -> None:
+    exact = fourier_transform(Sphere(), LATTICE)
+    for surface in (Ellipsoid(), angular_ball(derivatives)):
+        field = fourier_transform(surface, LATTICE, 1e-14, threads=1)
+        assert np.abs(field.values - exact.values).max() < 1e-12 * 4 * math.pi
+        orders = [-2.0, -5.0, -10.0]
+        assert norm(field, orders)["norm"].values == pytest.approx(norm(exact, orders)["norm"].values, rel=1e-12)
+        assert (distance(field, exact, orders)["distance"] < 1e-12 * norm(exact, orders)["norm"]).all()
+
+
+def test_a_sphere_elsewhere() -> None:
+    center = (0.3, -0.4, 0.2)
+    points = frequencies()
+    exact = sphere_transform(Sphere(0.8, center), points)
+    assert exact_values(Ellipsoid((0.8, 0.8, 0.8), center), points) == pytest.approx(exact, abs=1e-13)
+
+
+def test_a_torus_is_its_bessel_integral() -> None:
+    torus = Torus(1.0, 0.4)
+    points = frequencies()
+    exact = [torus_value(1.0, 0.4, math.hypot(x, y), z) for x, y, z in points]
+    assert exact_values(torus, points) == pytest.approx(np.array(exact), abs=1e-12 * torus.area)
+    assert exact[0] == pytest.approx(torus.area, rel=1e-13)
+    # On the lattice, through the NUFFT: along x, where the tube's two sides interfere.
+    values = half_values(torus)
+    for k in (0, 5, 16):
+        value = torus_value(1.0, 0.4, k * LATTICE.spacing, 0.0)
+        assert values[16 + k, 16, 0] == pytest.approx(value, abs=1e-12 * torus.area)
+
+
+def test_a_torus_on_its_axis_is_a_bessel_function() -> None:
+    heights = LATTICE.axes[2]
+    values = half_values(Torus(1.0, 0.4))[16, 16]
+    assert values == pytest.approx(4 * math.pi**2 * 0.4 * j0(2 * math.pi * 0.4 * heights), abs=1e-12 * 16)
+
+
+@pytest.mark.parametrize(("a", "c"), [(1.0, 0.4), (0.4, 1.0)])
+def test_a_spheroid_is_its_bessel_integral(a: float, c: float) -> None:
+    spheroid = Ellipsoid((a, a, c))
+    points = frequencies()
+    exact = np.array([spheroid_value(a, c, math.hypot(x, y), z) for x, y, z in points])
+    assert exact_values(spheroid, points) == pytest.approx(exact, abs=1e-12 * spheroid.area)
+    # With another axis as the pole's, the nodes are others.
+    lying = Ellipsoid((c, a, a))
+    assert exact_values(lying, points[:, [2, 0, 1]]) == pytest.approx(exact, abs=1e-12 * spheroid.area)
+
+
+def test_an_ellipsoid_on_its_axes_is_an_integral_of_elliptic_integrals() -> None:
+    a, b, c = 1.0, 0.7, 0.4
+    ellipsoid = Ellipsoid((a, b, c))
+    values = half_values(ellipsoid)
+    for k in (0, 3, 16):
+        frequency = k * LATTICE.spacing
+        for place, axes in (((16 + k, 16, 0), (b, c, a)), ((16, 16 + k, 0), (c, a, b)), ((16, 16, k), (a, b, c))):
+            exact = ellipsoid_value_along_c(*axes, frequency)
+            assert values[place] == pytest.approx(exact, abs=1e-12 * ellipsoid.area)
+
+
+def test_a_rectangle_is_a_product_of_sines() -> None:
+    surface = ParametrisedSurface(plate, Interval(-1.0, 1.0), Interval(-0.5, 0.5))
+    points = frequencies()
+    exact = 2 * np.sinc(2 * points[:, 0]) * np.sinc(points[:, 1])
+    assert exact_values(surface, points) == pytest.approx(exact, abs=1e-13)
+
+
+def test_a_turned_torus_has_the_turned_transform() -> None:
+    torus, points = Torus(1.0, 0.4), frequencies()
+    turned = exact_values(turned_torus(torus), points)
+    assert turned == pytest.approx(exact_values(torus, points @ ROTATION), abs=1e-12 * torus.area)
+
+
+@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
+def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
+    scale, origin = 0.6, np.array([0.5, -0.3, 0.1])
+    moved = Similarity(scale, (0.5, -0.3, 0.1)).apply(surface)
+    assert isinstance(moved, Smooth)
+    points = frequencies()
+    expected = scale**2 * np.exp(2j * np.pi * scale * (points @ origin)) * exact_values(surface, scale * points)
+    assert exact_values(moved, points) == pytest.approx(expected, abs=1e-12 * moved.area)
+
+
+@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
+def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
+    settings = Transform(1e-13)
+    whole = transform_block(surface, LATTICE, LATTICE.half, settings)
+    assert whole.points > 1000
+    for block in LATTICE.split(4000):
+        part = transform_block(surface, LATTICE, block, settings, batch=1 << 12, memory=1e9)
+        assert part.values == pytest.approx(whole.values[LATTICE.place(block)], abs=1e-12 * surface.area)
+
+
+def test_single_precision() -> None:
+    surface = SMOOTH[0]
+    field = fourier_transform(surface, LATTICE, dtype="complex64", threads=1)
+    assert field.dtype == np.complex64
+    error = np.abs(field.values - half_values(surface)).max() / surface.area
+    assert 1e-9 < error < 5e-6
+
+
+# The nodes.
+
+
+@pytest.mark.parametrize("surface", [*SMOOTH, angular_ball(False)], ids=lambda surface: type(surface).__name__)
+@pytest.mark.parametrize("highest", [0.5, 7.0, 20.0])
+def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float) -> None:
+    found = resolve(surface, highest, 1e-9)
+    assert found.settled
+    assert found.change <= 1e-9
+    points = highest * np.random.default_rng(9).normal(size=(20, 3))
+    points *= highest / np.linalg.norm(points, axis=1, keepdims=True)
+    error = np.abs(direct_transform(surface, found.counts, points) - exact_values(surface, points)).max()
+    assert error <= 1e-9 * surface.area
+    fewer = (found.counts[0] // 3 | 1, found.counts[1] // 3 | 1)
+    if highest > 1:
+        error = np.abs(direct_transform(surface, fewer, points) - exact_values(surface, points)).max()
+        assert error > 1e-9 * surface.area
+
+
+def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() -> None:
+    def rippled(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
+        radii = 1 + 0.02 * np.cos(62 * v)
+        return radii * np.sin(u) * np.cos(v), radii * np.sin(u) * np.sin(v), np.cos(u)
+
+    surface = ParametrisedSurface(rippled, HALF_TURN, TURN)
+    assert resolve(surface, 0.01, 1e-9).counts[1] > 2 * 62
+    assert surface.area > 1.2 * 4 * math.pi
+
+
+def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resolution, "MOST_NODES", 1 << 14)
+    side = Interval(-0.9, 1.0)
+    surface = ParametrisedSurface(roof, side, side, roof_derivatives)
+    with pytest.raises(
+        InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
+    ):
+        fourier_transform(surface, LATTICE)
+    # Where less is asked for, it converges, if slowly.
+    assert resolve(surface, 2.0, 1e-4).change <= 1e-4
+
+
+def test_a_surface_large_beside_the_wavelength_is_refused_at_once() -> None:
+    with pytest.raises(InputError, match="it would take more to begin with"):
+        resolve(Torus(1.0, 0.4), 1e4, 1e-9)
+
+
+def test_a_surface_beyond_the_period_is_refused() -> None:
+    with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 5"):
+        fourier_transform(Ellipsoid((5.0, 1.0, 1.0)), LATTICE)
+    with pytest.raises(LatticeError, match="the surface reaches"):
+        fourier_transform(Similarity(1.0, (4.0, 0.0, 0.0)).apply(angular_ball(True)), LATTICE)
+
+
+def test_a_surface_needs_a_lattice_or_an_accuracy() -> None:
+    for surface in (Ellipsoid(), Torus()):
+        with pytest.raises(InputError, match="lattice"):
+            norm(surface, -2.0)
+
+
+# What is said of the error.
+
+
+@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
+@pytest.mark.parametrize("eps", [1e-3, 1e-6])
+def test_the_error_of_the_nufft_is_reported(surface: Smooth, eps: float) -> None:
+    orders = [-2.0, -5.0]
+    field, exact = (fourier_transform(surface, LATTICE, accuracy, threads=1) for accuracy in (eps, 1e-14))
+    truth = distance(field, exact, orders)["distance"].values
+    reported = norm(field, orders)["discretisation"].values
+    assert (truth <= reported).all()
+    assert (reported < 30 * truth).all()
+
+
+def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = SMOOTH[1]
+    exact = fourier_transform(surface, LATTICE, 1e-14, threads=1)
+    monkeypatch.setattr(quadrature, "resolve", lambda *_: Resolution((91, 25), 0.0, True))
+    field = fourier_transform(surface, LATTICE, 1e-12, threads=1)
+    orders = [-2.0, -5.0]
+    truth = distance(field, exact, orders)["distance"].values
+    reported = norm(field, orders)["discretisation"].values
+    assert (truth > 1e-8).all()
+    assert (truth <= reported).all()
+    assert (reported < 30 * truth).all()
+
+
+def test_what_doubling_the_nodes_changes_is_reported() -> None:
+    side = Interval(-0.9, 1.0)
+    surface = ParametrisedSurface(roof, side, side, roof_derivatives)
+    corners = [[u, v, -abs(u)] for u in (-0.9, 0.0, 1.0) for v in (-0.9, 1.0)]
+    mesh = Mesh(corners, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    assert mesh.area == pytest.approx(surface.area, rel=1e-12)
+    orders = [-2.0, -5.0]
+    exact = fourier_transform(mesh, LATTICE, 1e-13, threads=1)
+    field = fourier_transform(surface, LATTICE, 1e-4, threads=1)
+    truth = distance(field, exact, orders)["distance"].values
+    reported = norm(field, orders)["discretisation"].values
+    assert (truth <= reported).all()
+    assert (truth > 1e-6).all()
+    change = resolve(surface, LATTICE.highest_frequency, 1e-4).change
+    assert (reported > change * surface.area).all()
+
+
+@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
+def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
+    found = Quality.from_json(fourier_transform(surface, LATTICE, threads=1).attrs["quality"])
+    points = np.concatenate([part for part, _ in surface.nodes((301, 301))], axis=1)
+    assert found.area == surface.area
+    assert np.array(found.highest) == pytest.approx((DIRECTIONS @ points).max(axis=1), abs=1e-3)
+    assert np.array(found.lowest) == pytest.approx((DIRECTIONS @ points).min(axis=1), abs=1e-3)
+    assert len(found.probe.shells) == 32 + 8
+
+
+@pytest.mark.parametrize("rtol", [1e-2, 1e-5])
+def test_a_norm_to_an_accuracy(rtol: float) -> None:
+    exact = norm(Sphere(0.8), [-3.0, -6.0])["norm"].values
+    found = norm(Ellipsoid((0.8, 0.8, 0.8), (3.0, 0.0, 1.0)), [-3.0, -6.0], rtol=rtol)
+    assert found["within"].all()
+    assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
+    assert (found["error"].values <= rtol * exact).all()
+
+
+def test_a_distance_to_an_accuracy() -> None:
+    near, far = Sphere(0.8, (0.2, 0.0, 0.0)), Ellipsoid((1.0, 1.0, 1.0))
+    exact = distance(near, Sphere(), [-3.0, -6.0])["distance"].values
+    found = distance(near, far, [-3.0, -6.0], rtol=1e-4)
+    assert found["within"].all()
+    assert (np.abs(found["distance"].values - exact) <= found["error"].values).all()
+
+
+def test_twins_have_no_distance() -> None:
+    torus = Torus(0.9, 0.3)
+    same = ParametrisedSurface(torus.positions, TURN, TURN)
+    found = distance(torus, same, -5.0, lattice=LATTICE)
+    assert found["distance"].item() < found["discretisation"].item() < 1e-8
+
+
+def test_inner_products() -> None:
+    torus, ellipsoid = Torus(0.9, 0.3), SMOOTH[0]
+    both = inner_product(torus, ellipsoid, -3.0, lattice=LATTICE)["inner_product"].item()
+    squares = [norm(part, -3.0, lattice=LATTICE)["norm"].item() ** 2 for part in (torus, ellipsoid)]
+    apart = distance(torus, ellipsoid, -3.0, lattice=LATTICE)["distance"].item()
+    assert sum(squares) - 2 * both == pytest.approx(apart**2, rel=1e-9)
+
+
+def test_nodes_of_a_surface_are_its_points() -> None:
+    surface = ParametrisedSurface(ball, HALF_TURN, TURN)
+    parts = list(surface.nodes((15, 31), most=40))
+    assert max(len(weights) for _, weights in parts) <= 40
+    points = np.concatenate([part for part, _ in parts], axis=1)
+    assert points.shape == (3, 15 * 31)
+    assert np.linalg.norm(points, axis=0) == pytest.approx(np.ones(15 * 31), rel=1e-14)
+    assert sum(weights.sum() for _, weights in parts) == pytest.approx(4 * math.pi, rel=1e-13)
+
+
+def test_a_gpu_gets_the_same_nodes() -> None:
+    device = Device()
+    for surface in SMOOTH:
+        found, expected = (
+            transform_block(surface, LATTICE, LATTICE.half, Transform(1e-13), backend=backend, batch=1 << 13)
+            for backend in (device.backend(), CPU)
+        )
+        assert (found.backend, expected.backend) == ("cufinufft", "finufft")
+        assert found.points == expected.points > 1 << 12
+        assert np.abs(found.values - expected.values).max() < 1e-12 * surface.area
+
+
+def test_little_memory_makes_parts_and_not_other_numbers() -> None:
+    surface, lattice = SMOOTH[1], Lattice(4.0, 64)
+    whole, parts = (
+        transform_block(surface, lattice, lattice.half, Transform(1e-9), memory=memory) for memory in (None, 1.5e7)
+    )
+    assert whole.points == parts.points
+    assert 0 < np.abs(whole.values - parts.values).max() < 1e-8 * surface.area
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reported_errors_hold_true_ones(seed: int) -> None:
+    rng = np.random.default_rng([11, seed])
+    axes, radii = rng.uniform(0.3, 0.9, 3), np.sort(rng.uniform(0.1, 0.5, 2))
+    torus = Torus(float(radii[1]) + 0.2, float(radii[0]), (0.0, 0.0, float(rng.uniform(-0.3, 0.3))))
+    ellipsoid = Ellipsoid((float(axes[0]), float(axes[1]), float(axes[2])))
+    mesh = torus.mesh(int(rng.integers(8, 40)), int(rng.integers(5, 20)))
+    orders = [-5.0, -8.0]
+    for other in (ellipsoid, mesh):
+        truth = distance(torus, other, orders, rtol=1e-5)
+        found = distance(torus, other, orders, rtol=float(10 ** rng.uniform(-3.5, -1)))
+        assert truth["within"].all()
+        assert found["within"].all()
+        error = np.abs(found["distance"].values - truth["distance"].values)
+        assert (error <= found["error"].values + truth["error"].values).all()
+
+
+def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
+    fewer, more = (resolve(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9).counts[0] for thickness in (0.04, 0.01))
+    assert 2 * fewer < more < 8 * fewer
+    with pytest.raises(InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"):
+        resolve(Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)

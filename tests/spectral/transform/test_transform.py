@@ -1,0 +1,245 @@
+"""Fields against the exact triangle transform, closed forms and direct sums."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
+from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.exact.triangles import exact_transform
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.transform.nufft import transform_points
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.sources.files import Files
+from tests.support.shapes import CENTRED_BOX as BOX
+
+Reals = NDArray[np.float64]
+
+
+def slivers(rng: np.random.Generator) -> Mesh:
+    corners = rng.uniform(-0.9, 0.9, size=(40, 3, 3))
+    corners[:, 2] = corners[:, 0] + 1e-4 * rng.normal(size=(40, 3))
+    return Mesh(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3))
+
+
+def soup(rng: np.random.Generator) -> Mesh:
+    centers = rng.uniform(-0.8, 0.8, size=(60, 1, 3))
+    sizes = 10.0 ** rng.uniform(-4, -0.7, size=(60, 1, 1))
+    return Mesh((centers + sizes * rng.normal(size=(60, 3, 3))).reshape(-1, 3), np.arange(180).reshape(-1, 3))
+
+
+def moved_box(rng: np.random.Generator) -> Mesh:
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return Mesh(BOX.vertices @ rotation.T + rng.uniform(-0.3, 0.3, size=3), BOX.triangles)
+
+
+def bumpy(rng: np.random.Generator) -> Mesh:
+    sphere = icosphere(4)
+    radii = 0.7 + 0.2 * np.sin(sphere.vertices @ rng.normal(scale=4, size=3))
+    return Mesh(sphere.vertices * radii[:, None], sphere.triangles)
+
+
+def cortex(rng: np.random.Generator) -> Mesh:
+    pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
+    path = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
+    (member,) = Files(paths=(path,), distribution="nilearn").members(Path())
+    mesh = member.load()
+    scaled = Similarity.to_unit_ball(mesh).apply(mesh)
+    assert isinstance(scaled, Mesh)
+    return scaled
+
+
+@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy, cortex])
+@pytest.mark.parametrize("eps", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+def test_agrees_with_the_exact_transform_to_a_small_multiple_of_eps(make, eps: float) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(17)
+    mesh, lattice = make(rng), Lattice(5.0, 64)
+    field = fourier_transform(mesh, lattice, eps)
+    chosen = [rng.integers(0, count, 60) for count in lattice.shape]
+    frequencies = np.stack([axis[k] for axis, k in zip(lattice.axes, chosen, strict=True)], axis=1)
+    errors = np.abs(field.values[tuple(chosen)] - exact_transform(mesh, frequencies))
+    assert errors.max() < 5 * eps * mesh.area
+
+
+def test_single_precision_reaches_its_own_accuracy() -> None:
+    lattice, mesh = Lattice(5.0, 64), bumpy(np.random.default_rng(2))
+    single = fourier_transform(mesh, lattice, dtype="complex64")
+    double = fourier_transform(mesh, lattice, 1e-12)
+    assert single.dtype == np.complex64
+    assert np.abs(single.values - double.values).max() < 1e-5 * mesh.area
+
+
+def test_every_block_of_the_lattice_equals_the_same_part_of_the_whole() -> None:
+    lattice, mesh = Lattice(4.0, 20), icosphere(2)
+    settings = Transform(1e-12)
+    whole = transform_block(mesh, lattice, lattice.half, settings).values
+    for block in (*lattice.split(600), Block((-3, 4, 2), (5, 2, 4)), Block((10, -10, 0), (1, 1, 1))):
+        part = transform_block(mesh, lattice, block, settings).values
+        assert np.abs(part - whole[lattice.place(block)]).max() < 1e-11 * mesh.area
+
+
+def test_parts_of_a_mesh_add_up() -> None:
+    lattice, mesh = Lattice(3.0, 16), icosphere(2)
+    halves = [Mesh(mesh.vertices, mesh.triangles[i::2]) for i in range(2)]
+    added = sum(fourier_transform(half, lattice, 1e-12) for half in halves)
+    assert np.abs(added - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
+
+
+def test_batches_change_nothing_but_rounding() -> None:
+    lattice, mesh = Lattice(3.0, 16), icosphere(3)
+    settings = Transform(1e-12)
+    one = transform_block(mesh, lattice, lattice.half, settings).values
+    many = transform_block(mesh, lattice, lattice.half, settings, batch=4_000).values
+    assert np.abs(one - many).max() < 1e-11 * mesh.area
+
+
+@pytest.mark.parametrize("memory", [2.5e7, 1.2e7, 9.9e6])
+@pytest.mark.parametrize("precision", ["complex128", "complex64"])
+def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: float, precision: Precision) -> None:
+    lattice, mesh = Lattice(5.0, 64), bumpy(np.random.default_rng(5))
+    settings = Transform(1e-9 if precision == "complex128" else 1e-6, precision)
+    whole = transform_block(mesh, lattice, lattice.half, settings)
+    assert memory_bytes(lattice.half, settings, triangles=len(mesh.triangles)) > 3 * memory
+    divided = transform_block(mesh, lattice, lattice.half, settings, memory=memory)
+    assert divided.points == whole.points
+    assert divided.values.dtype == precision
+    assert not np.array_equal(divided.values, whole.values)
+    assert np.abs(divided.values - whole.values).max() < 5 * settings.accuracy * mesh.area
+
+
+def test_enough_memory_changes_nothing() -> None:
+    lattice, mesh = Lattice(5.0, 32), bumpy(np.random.default_rng(5))
+    settings = Transform(1e-9)
+    ample = memory_bytes(lattice.half, settings, triangles=len(mesh.triangles))
+    whole, same = (transform_block(mesh, lattice, lattice.half, settings, memory=memory) for memory in (None, ample))
+    assert np.array_equal(whole.values, same.values)
+
+
+def test_states_the_smallest_memory() -> None:
+    lattice, mesh = Lattice(5.0, 32), icosphere(2)
+    with pytest.raises(InputError, match=r"^1 MB .* 33 x 33 x 17 samples: give at least [\d.]+ MB") as caught:
+        transform_block(mesh, lattice, lattice.half, Transform(), memory=1e6)
+    least = float(str(caught.value).split("at least ")[1].split(" MB")[0]) * 1e6
+    transform_block(mesh, lattice, lattice.half, Transform(), memory=least)
+    with pytest.raises(InputError, match="give at least"):
+        transform_block(mesh, lattice, lattice.half, Transform(), memory=least - 1.1e5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("intervals", "memory"), [(128, None), (128, 6e7), (256, 3e8)])
+def test_takes_no_more_memory_than_it_says(intervals: int, memory: float | None) -> None:
+    taken, said, result = map(int, memory_of_a_transform(intervals, memory).split())
+    assert taken < said
+    if memory is not None:
+        assert said <= memory + result
+        assert taken > 0.3 * said  # an estimate far too high would divide what fits
+
+
+def memory_of_a_transform(intervals: int, memory: float | None) -> str:
+    """What a transform adds to the peak of a fresh process, what that was estimated as, and its result, in bytes."""
+    code = f"""
+import resource, sys
+import sobolev_batch as sb
+from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block
+
+mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), Transform()
+mesh.areas, mesh.centroid_radii, mesh.bounds
+settings.lowest_degree(mesh, lattice)
+unit = 1 if sys.platform == "darwin" else 1024
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+values = transform_block(mesh, lattice, lattice.half, settings, memory={memory}).values
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+said = memory_bytes(lattice.half, settings, memory={memory}, triangles=len(mesh.triangles))
+print(after - before, said, values.nbytes)
+"""
+    # A shell in between: on Linux a process starts from the peak of the one that forked it.
+    command = ["sh", "-c", f"{shlex.quote(sys.executable)} -c {shlex.quote(code)}"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_weighted_points_against_the_direct_sum() -> None:
+    rng = np.random.default_rng(23)
+    lattice = Lattice(3.0, 12)
+    points = WeightedPoints(rng.uniform(-0.9, 0.9, size=(3, 200)), rng.normal(size=200))
+    found, _ = transform_points([points], lattice, lattice.half, eps=1e-13)
+    x, y, z = (
+        np.exp(-2j * np.pi * np.outer(axis, row)) for axis, row in zip(lattice.axes, points.coordinates, strict=True)
+    )
+    direct = np.einsum("ap,bp,cp,p->abc", x, y, z, points.weights)
+    assert np.abs(found - direct).max() < 1e-11 * np.abs(points.weights).sum()
+
+
+def test_no_points_transform_to_zero() -> None:
+    lattice = Lattice(3.0, 4)
+    assert not transform_points([], lattice, lattice.half, eps=1e-6)[0].any()
+
+
+def test_translation_rotation_order_and_subdivision() -> None:
+    rng = np.random.default_rng(29)
+    lattice, mesh = Lattice(2.0, 24), BOX
+    field = fourier_transform(mesh, lattice, 1e-12)
+    shift = np.array([0.1, -0.2, 0.05])
+    x, y, z = lattice.axes
+    phase = np.exp(-2j * np.pi * (x[:, None, None] * shift[0] + y[:, None] * shift[1] + z * shift[2]))
+    moved = fourier_transform(Mesh(mesh.vertices + shift, mesh.triangles), lattice, 1e-12)
+    assert np.abs(moved - field * phase).max() < 1e-11 * mesh.area
+
+    # A quarter turn about z maps the lattice onto itself: (x, y) -> (-y, x).
+    turned_vertices = mesh.vertices[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0])
+    turned = fourier_transform(Mesh(turned_vertices, mesh.triangles), lattice, 1e-12)
+    assert np.abs(turned.values - field.values[:, ::-1].swapaxes(0, 1)).max() < 1e-11 * mesh.area
+
+    order = rng.permutation(len(mesh.triangles))
+    shuffled = Mesh(mesh.vertices, rng.permuted(mesh.triangles[order], axis=1))
+    assert np.abs(fourier_transform(shuffled, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
+
+    middle = mesh.vertices[mesh.triangles[0]].mean(axis=0)
+    a, b, c = mesh.triangles[0]
+    split = Mesh(np.vstack([mesh.vertices, middle]), np.vstack([mesh.triangles[1:], [[a, b, 8], [b, c, 8], [c, a, 8]]]))
+    assert np.abs(fourier_transform(split, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
+
+
+def test_the_papers_quadrature_stays_available() -> None:
+    lattice, mesh = Lattice(5.0, 32), icosphere(4)
+    paper = fourier_transform(mesh, lattice, 1e-12, quadrature="gauss8")
+    assert np.abs(paper - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
+    settings = Transform(1e-6, quadrature=Quadrature("gauss8"))
+    assert transform_block(mesh, lattice, lattice.half, settings).points == 64 * 5120
+
+
+def test_field_coordinates_and_attributes() -> None:
+    field = fourier_transform(Sphere(2.0), Lattice(1.0, 8))
+    assert field.dims == ("xi_x", "xi_y", "xi_z")
+    assert field.sel(xi_x=0, xi_y=0, xi_z=0).item() == pytest.approx(16 * np.pi)
+    assert field["xi_z"].attrs["units"] == "cycles per unit length"
+    assert Quality.from_json(field.attrs["quality"]).area == pytest.approx(16 * np.pi)
+
+
+def test_refuses_meshes_that_would_fold() -> None:
+    lattice = Lattice(5.0, 16)  # half period 0.8
+    with pytest.raises(LatticeError, match=r"\|coordinate\| = 1, .* < 1/\(2h\) = 0.8; take M >= 22"):
+        fourier_transform(icosphere(1), lattice)
+    fourier_transform(icosphere(1), Lattice(5.0, 22))
+
+
+@pytest.mark.parametrize(
+    ("eps", "precision"), [(1e-15, "complex128"), (0.5, "complex128"), (1e-9, "complex64"), (np.nan, "complex128")]
+)
+def test_refuses_accuracies_out_of_reach(eps: float, precision: str) -> None:
+    with pytest.raises(InputError, match="eps must lie between"):
+        Transform(eps, precision)  # type: ignore[arg-type]
+
+
+def test_refuses_other_precisions() -> None:
+    with pytest.raises(InputError, match="dtype must be"):
+        Transform(1e-6, "float64")  # type: ignore[arg-type]

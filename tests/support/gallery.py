@@ -1,0 +1,32 @@
+"""The examples of the documentation, on a study that is small enough for a test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from distributed import Client
+
+import sobolev_batch as sb
+from tests.support.repository import ROOT, blocks
+
+
+def run_icospheres(folder: Path, client: Client) -> sb.Study:
+    """Run workflows/icosphere.toml below a folder, with fewer levels on a smaller lattice."""
+    text = (ROOT / "workflows" / "icosphere.toml").read_text(encoding="utf-8")
+    small = text.replace("M = 128", "M = 48").replace("3, 4, 5, 6, 7]", "3]")
+    assert small.count("M = 48") == 1
+    for name in ("workflows", "storage"):
+        (folder / name).mkdir()
+    (folder / "workflows" / "icosphere.toml").write_text(small)
+    study = sb.Study.from_toml(folder / "workflows" / "icosphere.toml")
+    sb.run(study, folder / "storage" / "icosphere.zarr", client)
+    return study
+
+
+def run_blocks(path: str) -> dict[str, Any]:
+    """Run the Python blocks of a page one after the other; what they leave behind."""
+    found: dict[str, Any] = {}
+    for block in blocks(path, "python"):
+        exec(compile(block, path, "exec"), found)
+    return found

@@ -1,0 +1,306 @@
+"""Files made to hang a reader, to exhaust its memory or to lead it elsewhere; none of them is a mesh.
+
+Each is small on disk, so that what it costs to refuse it can be held against its size.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.support.mesh_files import BIG, LITTLE, Gltf, box_scene, gifti, obj, off, ply, stl_binary, stl_text
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
+
+# Writes what it takes into a folder; the path of the file to be read.
+Attack = Callable[[Path], Path]
+
+_MEGABYTE = 1 << 20
+_INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
+_GIFTI = gifti(BOX_VERTICES, _INT_TRIANGLES)
+
+
+def _file(ending: str, content: bytes) -> Attack:
+    def write(folder: Path) -> Path:
+        path = folder / f"scan{ending}"
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+def _special(ending: str, make: Callable[[Path], object]) -> Attack:
+    def write(folder: Path) -> Path:
+        path = folder / f"scan{ending}"
+        make(path)
+        return path
+
+    return write
+
+
+def _ply_header(*lines: str, encoding: str = LITTLE) -> bytes:
+    return "".join(f"{line}\n" for line in ("ply", f"format {encoding} 1.0", *lines, "end_header")).encode()
+
+
+def _vertices(count: int) -> list[str]:
+    return [f"element vertex {count}", *[f"property float {axis}" for axis in "xyz"]]
+
+
+def _lying_list(kind: str, length: bytes, items: str = "double") -> bytes:
+    """A binary PLY file whose one face says that it has so many corners."""
+    header = _ply_header(*_vertices(3), "element face 1", f"property list {kind} {items} vertex_indices")
+    return header + bytes(36) + length + bytes(64)
+
+
+def _wide_rows(encoding: str, kind: str) -> bytes:
+    """Rows of 900 properties announced, in a file that holds a byte or two of each."""
+    wide = [f"property {kind} p{i}" for i in range(900)]
+    body = b"1\n" * 500_000 if encoding == "ascii" else bytes(500_000)
+    header = _ply_header(*_vertices(1), *wide, "element face 400000", *wide, encoding=encoding)
+    return header.replace(b"vertex 1\n", b"vertex 100000\n") + body
+
+
+def _sharing_parts(parts: int, nodes: int) -> bytes:
+    """A scene in which so many parts of so many nodes are one and the same large array."""
+    scene = Gltf([[(np.zeros((20_000, 3)), None, None)]], [{"mesh": 0}] * nodes, range(nodes))
+    scene.tree["accessors"][0]["count"] = 19_998
+    scene.tree["meshes"][0]["primitives"] *= parts
+    return scene.glb()
+
+
+def _gltf(change: Callable[[dict[str, Any]], object]) -> bytes:
+    scene = box_scene()
+    change(scene.tree)
+    return scene.glb()
+
+
+def _overlapping(stride: int, count: int) -> bytes:
+    def change(tree: dict[str, Any]) -> None:
+        tree["bufferViews"][0]["byteStride"] = stride
+        tree["accessors"][0]["count"] = count
+
+    return _gltf(change)
+
+
+def _far_buffer(uri: str, make: Callable[[Path], object] = lambda folder: None) -> Attack:
+    """A glTF file whose buffer is there, but is not in its folder."""
+
+    def write(folder: Path) -> Path:
+        outside, inside = folder / "outside", folder / "inside"
+        outside.mkdir()
+        inside.mkdir()
+        (outside / "data.bin").write_bytes(box_scene().blob)
+        make(inside)
+        path = inside / "scan.gltf"
+        path.write_bytes(box_scene().gltf(uri.format(outside=outside)))
+        return path
+
+    return write
+
+
+def _many_buffers(folder: Path) -> Path:
+    """Two thousand buffers that are one file of a megabyte under different spellings."""
+    (folder / "data.bin").write_bytes(bytes(_MEGABYTE))
+    count = 2000
+    tree = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": i}} for i in range(count)]}],
+        "accessors": [{"bufferView": i, "componentType": 5126, "count": 3, "type": "VEC3"} for i in range(count)],
+        "bufferViews": [{"buffer": i, "byteLength": 36} for i in range(count)],
+        "buffers": [{"byteLength": _MEGABYTE, "uri": "./" * i + "data.bin"} for i in range(count)],
+    }
+    path = folder / "scan.gltf"
+    path.write_text(json.dumps(tree))
+    return path
+
+
+def _entities(kinds: int, each: str) -> bytes:
+    """XML whose entities contain each other."""
+    lines = ['<!ENTITY a0 "boom">']
+    lines += [f'<!ENTITY a{i} "{each.format(i - 1) * 10}">' for i in range(1, kinds)]
+    return f'<?xml version="1.0"?>\n<!DOCTYPE GIFTI [{"".join(lines)}]>\n<GIFTI>&a{kinds - 1};</GIFTI>'.encode()
+
+
+def _gifti_data(data: bytes, start: bytes = b"") -> bytes:
+    """The box with other bytes in place of its coordinates."""
+    before, _, rest = _GIFTI.partition(b"<Data>")
+    return start + before + b"<Data>" + data + b"</Data>" + rest.partition(b"</Data>")[2]
+
+
+def _bomb(size: int) -> bytes:
+    """So many zeros, packed a thousandfold."""
+    packer = zlib.compressobj(9, wbits=31)
+    zeros = bytes(_MEGABYTE)
+    return b"".join([*(packer.compress(zeros) for _ in range(size // _MEGABYTE)), packer.flush()])
+
+
+def _packed_zeros(size: int) -> bytes:
+    return base64.b64encode(zlib.compress(bytes(size), 9))
+
+
+def _sparse(ending: str, start: bytes, size: int) -> Attack:
+    """A file that seems large and takes no room on the disk."""
+
+    def make(path: Path) -> None:
+        path.write_bytes(start)
+        os.truncate(path, size)
+
+    return _special(ending, make)
+
+
+def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
+    assert old in content
+    return content.replace(old, new, 1)
+
+
+_DIGITS = b"9" * 5000
+_FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii")
+
+ATTACKS: dict[str, Attack] = {
+    # What is no file.
+    **{f"FIFO {ending}": _special(ending, os.mkfifo) for ending in (*_FORMATS, ".ply.gz")},
+    **{
+        f"endless device {ending}": _special(ending, lambda path: path.symlink_to("/dev/zero"))
+        for ending in (*_FORMATS, ".ply.gz")
+    },
+    "terminal": _special(".ply", lambda path: path.symlink_to("/dev/tty")),
+    "link to itself": _special(".ply", lambda path: path.symlink_to(path)),
+    "NUL in the name": lambda folder: folder / "a\0b.ply",
+    "name too long": lambda folder: folder / f"{'x' * 300}.ply",
+    # Packed.
+    **{f"bomb {ending}.gz": _file(f"{ending}.gz", _bomb(200 * _MEGABYTE)) for ending in _FORMATS},
+    "bomb of newlines .obj.gz": _file(".obj.gz", gzip.compress(b"\n" * (200 * _MEGABYTE))),
+    "many empty gzip members": _file(".ply.gz", gzip.compress(b"") * 20_000),
+    "zip": _file(".ply", b"PK\x03\x04" + bytes(100)),
+    # One line, many lines, many digits.
+    **{f"one long line {ending}": _file(ending, b"1 " * _MEGABYTE) for ending in _FORMATS},
+    **{f"one long word {ending}": _file(ending, b"9" * 2 * _MEGABYTE) for ending in _FORMATS},
+    **{f"newlines {ending}": _file(ending, b"\n" * 2 * _MEGABYTE) for ending in _FORMATS},
+    "obj, face of many corners": _file(".obj", b"v 0 0 0\nv 1 0 0\nf" + b" 1" * _MEGABYTE + b" 0\n"),
+    "obj, continued lines": _file(".obj", b"v 0 0 0\nf 1 \\\n" + b"1 \\\n" * 500_000),
+    "obj, long index": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 " + _DIGITS + b"\n"),
+    "obj, long index of few digits": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 " + b"9" * 4000 + b"\n"),
+    "obj, huge index": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 9223372036854775808\n"),
+    "obj, huge coordinate": _file(".obj", obj(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
+    "obj, overflowing coordinate": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"v 1e999 0 0\n"),
+    "obj, long coordinate": _file(".obj", b"v " + _DIGITS + b" 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj, one wide character": _file(".obj", "\U0001f600\n".encode() + b"#" * 2 * _MEGABYTE),
+    "off, long counts": _file(".off", b"OFF\n" + _DIGITS + b" 1 0\n0 0 0\n3 0 0 0\n"),
+    "off, other digits": _file(".off", "OFF\n² 1 0\n0 0 0\n".encode()),
+    "off, long length": _file(".off", off(BOX_VERTICES, BOX_TRIANGLES).replace(b"3 4 6 7", b"9" * 4000 + b" 4 6 7")),
+    "off, huge index": _file(
+        ".off", _changed(off(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 99999999999999999999")
+    ),
+    "stl ascii, long name": _file(".stl", stl_text(BOX_VERTICES * 1e300, BOX_TRIANGLES, "x" * _MEGABYTE)),
+    "stl ascii, unknown long word": _file(".stl", b"solid\n" + b"y" * _MEGABYTE),
+    "stl, huge coordinates": _file(".stl", stl_binary(BOX_VERTICES * 1e37, BOX_TRIANGLES, count=13)),
+    "stl, sparse": _sparse(".stl", b"\0" * 84, 1 << 40),
+    # PLY.
+    "ply, many digits": _file(".ply", _ply_header(f"element vertex {'9' * 5000}", "element face 1")),
+    "ply, digits that overflow a float": _file(".ply", _ply_header(f"element vertex {'9' * 400}", "element face 1")),
+    "ply, vertices without end": _file(".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, vertex_count=10**18)),
+    "ply, faces without end": _file(".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, face_count=10**18)),
+    "ply, list of 2^32 - 1": _file(".ply", _lying_list("uint", b"\xff" * 4)),
+    "ply, list of 2^31 - 1": _file(".ply", _lying_list("int", b"\xff\xff\xff\x7f")),
+    "ply, list of -1": _file(".ply", _lying_list("int", b"\xff" * 4)),
+    "ply, list of NaN": _file(".ply", _lying_list("float", b"\xff" * 4)),
+    "ply, list of infinity": _file(".ply", _lying_list("float", b"\0\0\x80\x7f")),
+    **{
+        f"ply {encoding}, wide rows of {kind}": _file(".ply", _wide_rows(encoding, kind))
+        for encoding in ("ascii", LITTLE)
+        for kind in ("double", "list uchar double")
+    },
+    "ply, endless header": _file(".ply", b"ply\nformat ascii 1.0\n" + b"comment\n" * 250_000),
+    "ply, many elements": _file(".ply", _ply_header(*[f"element e{i} 0" for i in range(100_000)], encoding="ascii")),
+    "ply, many properties": _file(
+        ".ply",
+        _ply_header(
+            *_vertices(0), *[f"property char p{i}" for i in range(100_000)], "element face 0", encoding="ascii"
+        ),
+    ),
+    "ply, long name": _file(".ply", _ply_header(*_vertices(3), "element face 1", f"element {'e' * 60_000} 1")),
+    "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0"), 1 << 40),
+    "ply ascii, float overflow": _file(".ply", ply(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
+    "ply ascii, index that overflows": _file(
+        ".ply", _changed(ply(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 99999999999")
+    ),
+    "ply, indices with fractions": _file(
+        ".ply",
+        ply(BOX_VERTICES, [[0, 1, 2.5]], LITTLE, index="float"),  # type: ignore[list-item]
+    ),
+    "ply, indices that are NaN": _file(
+        ".ply",
+        ply(BOX_VERTICES, [[0, 1, float("nan")]], LITTLE, index="float"),  # type: ignore[list-item]
+    ),
+    # glTF.
+    "gltf, deep lists": _file(".gltf", b"[" * 200_000),
+    "gltf, deep objects": _file(".gltf", b'{"a":' * 200_000),
+    "gltf, long integer": _file(".gltf", b'{"nodes": [' + _DIGITS + b"]}"),
+    "gltf, many nodes in a row": _file(
+        ".gltf", json.dumps({"nodes": [{"children": [i + 1]} for i in range(30_000)]}).encode()
+    ),
+    "glb, stride 0": _file(".glb", _overlapping(0, 10**9)),
+    "glb, stride 1": _file(".glb", _overlapping(1, 80)),
+    "glb, count of many digits": _file(".glb", _overlapping(0, 10**400)),
+    "glb, one array in many parts": _file(".glb", _sharing_parts(10_000, 1)),
+    "glb, one part in many nodes": _file(".glb", _sharing_parts(1, 10_000)),
+    "glb, many parts in many nodes": _file(".glb", _sharing_parts(1000, 1000)),
+    "glb, huge matrix": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(scale=[1e308, 1e308, 1e308]))),
+    "glb, infinite matrix": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(matrix=[float("inf")] * 16))),
+    "glb, rotation of strings": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(rotation=["1"] * 4))),
+    "glb, chunk that lies": _file(".glb", struct.pack("<4sIIII", b"glTF", 2, 20, 2**32 - 1, 0)),
+    "gltf, many names of one buffer": _many_buffers,
+    "gltf, buffer above": _far_buffer("../outside/data.bin"),
+    "gltf, buffer above, spelled out": _far_buffer("%2e%2e/outside/data.bin"),
+    "gltf, buffer above by backslash": _far_buffer("..\\outside\\data.bin"),
+    "gltf, absolute buffer": _far_buffer("{outside}/data.bin"),
+    "gltf, buffer of the web": _far_buffer("http://127.0.0.1:9/data.bin"),
+    "gltf, buffer of a file URL": _far_buffer("file://{outside}/data.bin"),
+    "gltf, buffer behind a link": _far_buffer("data.bin", lambda f: (f / "data.bin").symlink_to("../outside/data.bin")),
+    "gltf, buffer behind a linked folder": _far_buffer("up/data.bin", lambda f: (f / "up").symlink_to("../outside")),
+    "gltf, FIFO as buffer": _far_buffer("data.bin", lambda folder: os.mkfifo(folder / "data.bin")),
+    "gltf, device as buffer": _far_buffer("data.bin", lambda folder: (folder / "data.bin").symlink_to("/dev/zero")),
+    "gltf, NUL in the name of a buffer": _far_buffer("a%00b.bin"),
+    "gltf, itself as buffer": _far_buffer("scan.gltf"),
+    # GIFTI.
+    "gifti, a billion laughs": _file(".gii", _entities(10, "&a{};")),
+    "gifti, quadratic entities": _file(
+        ".gii",
+        b'<!DOCTYPE GIFTI [<!ENTITY a "' + b"a" * 50_000 + b'">]><GIFTI>' + b"&a;" * 50_000 + b"</GIFTI>",
+    ),
+    "gifti, entity of a file": _file(
+        ".gii", b'<!DOCTYPE GIFTI [<!ENTITY a SYSTEM "file:///etc/hostname">]>' + _gifti_data(b"&a;")[21:]
+    ),
+    "gifti, entities in UTF-16": _file(".gii", _entities(10, "&a{};").decode().encode("utf-16")),
+    "gifti, bomb": _file(".gii", _gifti_data(_packed_zeros(200 * _MEGABYTE))),
+    "gifti, bomb that is announced": _file(
+        ".gii", _changed(_gifti_data(_packed_zeros(240 * _MEGABYTE)), b'Dim0="8"', b'Dim0="%d"' % (20 * _MEGABYTE))
+    ),
+    "gifti, data without end": _file(".gii", _gifti_data(b"A" * 3 * _MEGABYTE)),
+    "gifti, text without end": _file(
+        ".gii",
+        gifti(BOX_VERTICES, _INT_TRIANGLES, "GIFTI_ENCODING_ASCII").replace(
+            b"<Data>", b"<Data>" + b"1 " * _MEGABYTE, 1
+        ),
+    ),
+    "gifti, many dimensions": _file(".gii", _changed(_GIFTI, b'Dimensionality="2"', b'Dimensionality="99999999"')),
+    "gifti, dimensions that overflow": _file(".gii", _changed(_GIFTI, b'Dim0="8"', b'Dim0="' + b"9" * 4000 + b'"')),
+    "gifti, negative dimension": _file(".gii", _changed(_GIFTI, b'Dim0="8"', b'Dim0="-8"')),
+    "gifti, deep elements": _file(".gii", b"<GIFTI>" + b"<MetaData>" * 100_000),
+    "gifti, long attribute": _file(".gii", b'<GIFTI Version="' + b"1" * 2 * _MEGABYTE + b'">'),
+    "gifti, data of another file": _file(
+        ".gii",
+        _changed(_GIFTI, b'Encoding="GZipBase64Binary"', b'Encoding="ExternalFileBinary"').replace(
+            b'ExternalFileName=""', b'ExternalFileName="/etc/passwd"', 1
+        ),
+    ),
+}

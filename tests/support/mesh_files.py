@@ -1,0 +1,255 @@
+"""Writers of mesh files, kept apart from the libraries that the package reads them with.
+
+They write what they are told, so that tests can make files that lie: counts can be given, indices
+and coordinates need not make sense.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import nibabel
+import numpy as np
+from nibabel.gifti import GiftiDataArray
+from numpy.typing import ArrayLike
+
+from sobolev_batch import Mesh
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
+
+Faces = Sequence[Sequence[int]]
+# Writes a file whose name has an ending, and reads it: see the fixture `read`.
+Read = Callable[[str, bytes], Mesh]
+
+LITTLE, BIG = "binary_little_endian", "binary_big_endian"
+
+_STRUCT_CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I"}
+_STRUCT_CODES |= {"float": "f", "double": "d"}
+
+
+def numbers(row: ArrayLike) -> str:
+    """The shortest decimals that read back as the same doubles."""
+    return " ".join(repr(float(x)) for x in np.asarray(row).ravel())
+
+
+def ply(
+    vertices: ArrayLike,
+    faces: Faces,
+    encoding: str = "ascii",
+    *,
+    real: str = "float",
+    length: str = "uchar",
+    index: str = "int",
+    vertex_count: int | None = None,
+    face_count: int | None = None,
+    more: str = "",
+) -> bytes:
+    """A PLY file; ``more`` names further real vertex properties, whose values are all 1/2."""
+    rows = [[*row, *([0.5] * len(more))] for row in np.asarray(vertices).tolist()]
+    header = [
+        "ply",
+        f"format {encoding} 1.0",
+        "comment element vertex 77",
+        f"element vertex {len(rows) if vertex_count is None else vertex_count}",
+        *[f"property {real} {name}" for name in "xyz" + more],
+        f"element face {len(faces) if face_count is None else face_count}",
+        f"property list {length} {index} vertex_indices",
+        "end_header",
+    ]
+    start = "".join(f"{line}\n" for line in header).encode()
+    if encoding == "ascii":
+        lines = [numbers(row) for row in rows] + [" ".join(map(str, [len(face), *face])) for face in faces]
+        return start + "".join(f"{line}\n" for line in lines).encode()
+    order = "<" if encoding == LITTLE else ">"
+    body = b"".join(struct.pack(order + _STRUCT_CODES[real] * len(row), *row) for row in rows)
+    for face in faces:
+        body += struct.pack(f"{order}{_STRUCT_CODES[length]}", len(face))
+        body += struct.pack(order + _STRUCT_CODES[index] * len(face), *face)
+    return start + body
+
+
+def obj(vertices: ArrayLike, faces: Faces, corner: Callable[[int, int], str] | None = None) -> bytes:
+    """An OBJ file; ``corner`` spells the vertex of a face from its index, from 1, and its place."""
+    spell = corner or (lambda vertex, place: str(vertex))
+    lines = [f"v {numbers(row)}" for row in np.asarray(vertices)]
+    lines += ["f " + " ".join(spell(vertex + 1, place) for place, vertex in enumerate(face)) for face in faces]
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def off(
+    vertices: ArrayLike,
+    faces: Faces,
+    header: str = "OFF\n",
+    *,
+    vertex_count: int | None = None,
+    face_count: int | None = None,
+) -> bytes:
+    """An OFF file."""
+    rows = np.asarray(vertices)
+    counts = (len(rows) if vertex_count is None else vertex_count, len(faces) if face_count is None else face_count)
+    lines = [f"{counts[0]} {counts[1]} 0", *[numbers(row) for row in rows]]
+    lines += [" ".join(map(str, [len(face), *face])) for face in faces]
+    return (header + "".join(f"{line}\n" for line in lines)).encode()
+
+
+def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
+    """An ASCII STL file."""
+    rows = np.asarray(vertices)
+    facets = [
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join(f"vertex {numbers(rows[vertex])}\n" for vertex in face)
+        + "endloop\nendfacet\n"
+        for face in faces
+    ]
+    return f"solid {name}\n{''.join(facets)}endsolid {name}\n".encode()
+
+
+def stl_binary(vertices: ArrayLike, faces: Faces, start: bytes = b"box", *, count: int | None = None) -> bytes:
+    """A binary STL file."""
+    rows = np.asarray(vertices, dtype=np.float64)
+    facets = [struct.pack("<12fH", 0, 0, 0, *rows[list(face)].ravel(), 0) for face in faces]
+    return start.ljust(80, b"\0") + struct.pack("<I", len(facets) if count is None else count) + b"".join(facets)
+
+
+GltfPart = tuple[ArrayLike, ArrayLike | None, int | None]
+_COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+
+
+class Gltf:
+    """A glTF scene: ``tree`` is its JSON document, open to changes, ``blob`` its one buffer.
+
+    Args:
+        meshes: for each mesh its primitives: vertices, indices (or None) and mode (or None).
+        nodes: as in the JSON document.
+        roots: the indices of the scene's root nodes; all nodes unless given.
+        real: the type of the coordinates.
+        index: the type of the indices.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Sequence[GltfPart]],
+        nodes: Sequence[dict[str, Any]],
+        roots: Sequence[int] | None = None,
+        *,
+        real: str = "float32",
+        index: str = "uint16",
+    ) -> None:
+        self.blob = b""
+        self.tree: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": list(range(len(nodes)) if roots is None else roots)}],
+            "nodes": list(nodes),
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self.tree["meshes"] = [
+            {"primitives": [self._primitive(*part, real, index) for part in parts]} for parts in meshes
+        ]
+        self.tree["buffers"] = [{"byteLength": len(self.blob)}]
+
+    def accessor(self, values: ArrayLike, kind: str, dtype: str) -> int:
+        """Append values to the buffer; the index of their accessor."""
+        array = np.ascontiguousarray(values, dtype=dtype)
+        self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes})
+        self.tree["accessors"].append(
+            {
+                "bufferView": len(self.tree["bufferViews"]) - 1,
+                "componentType": _COMPONENTS[dtype],
+                "count": len(array),
+                "type": kind,
+            }
+        )
+        self.blob += array.tobytes()
+        self.blob += bytes(-len(self.blob) % 4)
+        return len(self.tree["accessors"]) - 1
+
+    def _primitive(
+        self, vertices: ArrayLike, indices: ArrayLike | None, mode: int | None, real: str, index: str
+    ) -> dict[str, Any]:
+        primitive: dict[str, Any] = {"attributes": {"POSITION": self.accessor(vertices, "VEC3", real)}}
+        if indices is not None:
+            primitive["indices"] = self.accessor(np.asarray(indices).ravel(), "SCALAR", index)
+        if mode is not None:
+            primitive["mode"] = mode
+        return primitive
+
+    def glb(self) -> bytes:
+        """The binary form."""
+        self.tree["buffers"][0]["byteLength"] = len(self.blob)
+        document = json.dumps(self.tree).encode()
+        document += b" " * (-len(document) % 4)
+        length = 12 + 8 + len(document) + 8 + len(self.blob)
+        return (
+            struct.pack("<4sII", b"glTF", 2, length)
+            + struct.pack("<I4s", len(document), b"JSON")
+            + document
+            + struct.pack("<I4s", len(self.blob), b"BIN\0")
+            + self.blob
+        )
+
+    def gltf(self, uri: str | None = None) -> bytes:
+        """The JSON form; the buffer is embedded, or in a file of its own where ``uri`` says so."""
+        embedded = "data:application/octet-stream;base64," + base64.b64encode(self.blob).decode()
+        self.tree["buffers"][0] = {"byteLength": len(self.blob), "uri": uri or embedded}
+        return json.dumps(self.tree).encode()
+
+
+def gifti(
+    vertices: ArrayLike | None,
+    faces: ArrayLike | None,
+    encoding: str = "GIFTI_ENCODING_B64GZ",
+    *,
+    ordering: str = "C",
+    points: int = 1,
+) -> bytes:
+    """A GIFTI file with so many point sets."""
+    arrays = []
+    if vertices is not None:
+        arrays += [
+            GiftiDataArray(
+                np.asarray(vertices, dtype=np.float32),
+                intent="NIFTI_INTENT_POINTSET",
+                encoding=encoding,
+                ordering=ordering,
+            )
+        ] * points
+    if faces is not None:
+        arrays.append(
+            GiftiDataArray(np.asarray(faces), intent="NIFTI_INTENT_TRIANGLE", encoding=encoding, ordering=ordering)
+        )
+    return bytes(nibabel.GiftiImage(darrays=arrays).to_bytes())
+
+
+# Each as the end of the file's name and its bytes.
+Content = tuple[str, bytes]
+
+
+def box_scene() -> Gltf:
+    """The box as a scene of one node; a fresh one, open to changes."""
+    return Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}])
+
+
+BOXES: dict[str, Content] = {
+    "ply ascii float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES)),
+    "ply ascii double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, real="double")),
+    "ply little float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE)),
+    "ply little double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, real="double", index="uint")),
+    "ply big float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, index="ushort")),
+    "ply big double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, real="double", length="int")),
+    "obj": (".obj", obj(BOX_VERTICES, BOX_TRIANGLES)),
+    "off": (".off", off(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl ascii": (".stl", stl_text(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl binary": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES)),
+    "stl binary that starts with solid": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES, b"solid box")),
+    "gltf": (".gltf", box_scene().gltf()),
+    "glb": (".glb", box_scene().glb()),
+    "gifti gzipped": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))),
+    "gifti base64": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_B64BIN")),
+    "gifti ascii": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII")),
+    "gifti by columns": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), ordering="F")),
+}

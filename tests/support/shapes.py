@@ -1,0 +1,74 @@
+"""Small surfaces whose areas are known, and random ones, for the tests of this room."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from numpy.typing import NDArray
+
+from sobolev_batch import Mesh
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
+
+Reals = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# A box with sides of 1, 2 and 4, so that no two axes can be mistaken for each other. All its
+# coordinates are exact in single precision.
+BOX_VERTICES: Reals = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)], dtype=np.float64)
+BOX_QUADS: list[list[int]] = [
+    [0, 1, 3, 2],
+    [4, 6, 7, 5],
+    [0, 4, 5, 1],
+    [2, 3, 7, 6],
+    [0, 2, 6, 4],
+    [1, 5, 7, 3],
+]
+BOX_TRIANGLES: list[list[int]] = [[q[0], q[i], q[i + 1]] for q in BOX_QUADS for i in (1, 2)]
+# Three sides of the box in one piece, three in two.
+BOX_MIXED: list[list[int]] = [*BOX_QUADS[:3], *BOX_TRIANGLES[6:]]
+BOX_AREA = 28.0
+
+# The same box with coordinates that need all digits of double precision.
+AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
+
+CLOSED = MeshCounts(zero_area=0, duplicate=0, boundary_edges=0, nonmanifold_edges=0)
+
+TETRAHEDRON_VERTICES: Reals = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=np.float64)
+TETRAHEDRON_TRIANGLES: list[list[int]] = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
+TETRAHEDRON_AREA = 1.5 + np.sqrt(3) / 2
+
+
+def box() -> Mesh:
+    """The box as a mesh."""
+    return Mesh(BOX_VERTICES, BOX_TRIANGLES)
+
+
+def tetrahedron() -> Mesh:
+    """The corner of a unit cube, cut off."""
+    return Mesh(TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES)
+
+
+def soup(mesh: Mesh) -> list[list[tuple[float, ...]]]:
+    """The triangles as sorted coordinates: equal for meshes that differ in nothing but order and sharing."""
+    return sorted(sorted(tuple(corner) for corner in triangle) for triangle in mesh.vertices[mesh.triangles].tolist())
+
+
+@st.composite
+def meshes(draw: st.DrawFn) -> Mesh:
+    """Random triangle soups on shared vertices: mostly non-manifold, always with an area above zero."""
+    vertex_count = draw(st.integers(3, 8))
+    coordinates = st.floats(-10, 10, width=32).map(lambda x: round(x, 3))
+    vertices = draw(arrays.arrays(np.float64, (vertex_count, 3), elements=coordinates))
+    # A triangle whose area is at least 1/2 wherever the others fall.
+    vertices[:3] = draw(st.sampled_from([1.0, 3.0, 7.5])) * np.eye(3)
+    more = draw(arrays.arrays(np.int64, (draw(st.integers(0, 10)), 3), elements=st.integers(0, vertex_count - 1)))
+    return Mesh(vertices, np.concatenate([[[0, 1, 2]], more]))
+
+
+# Around the origin, with no two sides equal.
+CENTRED_BOX = Mesh(
+    np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.6, 0.6) for z in (-0.7, 0.7)]),
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]],
+)  # fmt: skip

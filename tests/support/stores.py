@@ -1,0 +1,65 @@
+"""Stores held against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from tests.support.studies import variable
+
+TABLES = (("norms", "norm"), ("norms", "error"), ("distances", "distance"), ("convergence", "distance"))
+
+
+def assert_same_fields(one: Path | str, other: Path | str, besides: Collection[str] = ()) -> None:
+    """The fields of two stores are the same, bit for bit, and none is missing."""
+    with xr.open_datatree(one, engine="zarr") as left, xr.open_datatree(other, engine="zarr") as right:
+        a, b = variable(left, "fourier", "fourier"), variable(right, "fourier", "fourier")
+        assert a["mesh"].values.tolist() == b["mesh"].values.tolist()
+        for label in a["mesh"].values.tolist():
+            if label not in besides:
+                assert not np.isnan(a.sel(mesh=label).values).any(), label
+                assert np.array_equal(a.sel(mesh=label).values, b.sel(mesh=label).values), label
+
+
+def assert_same_tables(one: Path | str, other: Path | str) -> None:
+    """The tables of two stores agree to rounding."""
+    with xr.open_datatree(one, engine="zarr") as left, xr.open_datatree(other, engine="zarr") as right:
+        for group, name in TABLES:
+            a, b = variable(left, group, name), variable(right, group, name)
+            np.testing.assert_allclose(a.values, b.values, rtol=1e-12, atol=0, err_msg=f"{group}/{name}")
+        for name in ("status", "digest"):
+            a, b = variable(left, "meshes", name), variable(right, "meshes", name)
+            assert a.values.tolist() == b.values.tolist()
+
+
+def assert_same(ours: xr.DataTree, theirs: xr.DataTree) -> None:
+    """All but who computed it, when, and how long that took, is equal to the bit."""
+    assert set(ours.children) == set(theirs.children)
+    for group in ("fourier", "norms", "distances", "convergence", "meshes"):
+        one, other = (
+            tree[group].to_dataset().drop_vars(["seconds", "worker", "finished"], errors="ignore")
+            for tree in (ours, theirs)
+        )
+        if group == "fourier":
+            # Its coordinate says how far the field is from exact; the field itself is compared.
+            assert np.array_equal(one["quality"].values, other["quality"].values)
+        xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
+
+
+# What reads a store without this package.
+READER = """
+import sys, warnings
+warnings.simplefilter("error")
+sys.modules["sobolev_batch"] = None
+import xarray
+tree = xarray.open_datatree(sys.argv[1], engine="zarr")
+for node in tree.subtree:
+    node.to_dataset().load()
+assert sorted(tree.children) == ["convergence", "distances", "fourier", "meshes", "norms", "records"]
+assert tree["fourier"]["fourier"].dims == ("mesh", "xi_x", "xi_y", "xi_z")
+assert str(tree["convergence"]["distance"].sel(mesh="ico/2", order=-3.0).dims) == "()"
+print(float(tree["convergence"]["relative"].sel(mesh="ico/3", order=-10.0)))
+"""

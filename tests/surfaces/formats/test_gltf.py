@@ -1,0 +1,205 @@
+"""The reader of glTF scenes: every surface of the scene, where its nodes place it."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from sobolev_batch import Mesh, MeshError, icosphere, read_mesh
+from tests.support.mesh_files import Gltf, Read, box_scene
+from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, CLOSED, box, soup
+
+ROTATION = [0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]  # by a right angle about z
+
+
+@pytest.mark.parametrize(
+    ("nodes", "roots", "area", "upper"),
+    [
+        ([{"mesh": 0, "scale": [2, 2, 2]}], None, 4 * 28, [2, 4, 8]),
+        ([{"mesh": 0, "scale": [3, 1, 1]}], None, 2 * (6 + 12 + 8), [3, 2, 4]),
+        ([{"mesh": 0, "scale": [-1, 1, 1]}], None, 28, [0, 2, 4]),
+        ([{"mesh": 0, "translation": [5, 6, 7]}], None, 28, [6, 8, 11]),
+        ([{"mesh": 0, "rotation": ROTATION}], None, 28, [0, 1, 4]),
+        # Scaled, then rotated, then shifted.
+        ([{"mesh": 0, "scale": [3, 1, 1], "rotation": ROTATION, "translation": [9, 0, 0]}], None, 52, [9, 3, 4]),
+        # Column by column: the same rotation, with lengths doubled and a shift.
+        ([{"mesh": 0, "matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 9, 0, 0, 1]}], None, 4 * 28, [9, 2, 8]),
+        ([{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [1, 0, 0]}], [0], 4 * 28, [4, 4, 8]),
+        ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], None, 5 * 28, [2, 4, 8]),
+        ([{"mesh": 0, "name": "a"}, {"mesh": 0, "name": "a", "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
+        ([{"mesh": 0, "name": "world"}, {"mesh": 0, "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
+        # The second node belongs to no scene.
+        ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], [0], 28, [1, 2, 4]),
+        # A camera at a mesh, and a mesh that hangs on a camera.
+        ([{"mesh": 0, "camera": 0}, {"mesh": 0, "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
+        ([{"camera": 0, "children": [1], "translation": [9, 0, 0]}, {"mesh": 0}], [0], 28, [10, 2, 4]),
+    ],
+    ids=[
+        "scaled",
+        "stretched",
+        "mirrored",
+        "shifted",
+        "rotated",
+        "all three",
+        "matrix",
+        "child",
+        "two nodes",
+        "two of a name",
+        "named world",
+        "outside the scene",
+        "camera beside",
+        "camera above",
+    ],
+)
+def test_gltf_nodes_place_their_meshes(
+    read: Read, nodes: list[dict[str, Any]], roots: list[int] | None, area: float, upper: list[float]
+) -> None:
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], nodes, roots)
+    if "camera" in nodes[0]:
+        scene.tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1, "aspectRatio": 1}}]
+    mesh = read(".glb", scene.glb())
+    assert mesh.area == pytest.approx(area, rel=1e-14)
+    assert mesh.bounds[1] == pytest.approx(upper, abs=1e-14)
+    embedded = read(".gltf", scene.gltf())
+    assert soup(embedded) == soup(mesh)
+
+
+def test_gltf_meshes_may_have_several_primitives(read: Read) -> None:
+    halves = [(BOX_VERTICES, BOX_TRIANGLES[:6], None), (BOX_VERTICES, BOX_TRIANGLES[6:], 4)]
+    mesh = read(".glb", Gltf([halves], [{"mesh": 0}]).glb())
+    assert soup(mesh) == soup(box())
+    assert mesh.counts == CLOSED
+    twice = read(".glb", Gltf([halves], [{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}]).glb())
+    assert twice.area == 5 * BOX_AREA
+
+
+def test_gltf_primitives_may_go_without_indices(read: Read) -> None:
+    corners = BOX_VERTICES[np.array(BOX_TRIANGLES)].reshape(-1, 3)
+    mesh = read(".glb", Gltf([[(corners, None, None)]], [{"mesh": 0}]).glb())
+    assert soup(mesh) == soup(box())
+    assert mesh.counts == CLOSED
+
+
+@pytest.mark.parametrize("index", ["uint8", "uint16", "uint32"])
+def test_gltf_parts_with_many_vertices_do_not_run_into_each_other(read: Read, index: str) -> None:
+    # 162 vertices fit one byte; the second part's come after the first's, and no longer do.
+    ball = icosphere(2)
+    nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}]
+    mesh = read(".glb", Gltf([[(ball.vertices, ball.triangles, None)]], nodes, index=index).glb())
+    assert mesh.area == pytest.approx(2 * ball.area, rel=1e-6)
+    assert mesh.vertices.shape == (324, 3)
+    assert mesh.counts == CLOSED
+
+
+def test_gltf_parts_beyond_16_bits_do_not_run_into_each_other(read: Read) -> None:
+    ball = icosphere(6)
+    nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}]
+    mesh = read(".glb", Gltf([[(ball.vertices, ball.triangles, None)]], nodes, index="uint16").glb())
+    assert mesh.area == pytest.approx(2 * ball.area, rel=1e-6)
+
+
+@pytest.mark.parametrize(("mode", "area"), [(0, 28.0), (1, 28.0), (2, 28.0), (3, 28.0), (5, 30.0)])
+def test_gltf_points_and_lines_have_no_area_but_strips_of_triangles_do(read: Read, mode: int, area: float) -> None:
+    corners = [[0, 0, 9], [1, 0, 9], [0, 2, 9], [1, 2, 9]]
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None), (corners, [0, 1, 2, 3], mode)]], [{"mesh": 0}])
+    assert read(".glb", scene.glb()).area == area
+
+
+def test_gltf_buffers_may_be_files_beside(tmp_path: Path) -> None:
+    scene = box_scene()
+    (tmp_path / "box.gltf").write_bytes(scene.gltf("box data.bin"))
+    (tmp_path / "box data.bin").write_bytes(scene.blob)
+    assert soup(read_mesh(tmp_path / "box.gltf")) == soup(box())
+    (tmp_path / "zipped.gltf.gz").write_bytes(gzip.compress(scene.gltf("box data.bin")))
+    assert soup(read_mesh(tmp_path / "zipped.gltf.gz")) == soup(box())
+
+
+def test_gltf_vertices_may_be_interleaved_with_others(read: Read) -> None:
+    scene = box_scene()
+    wide = np.column_stack([BOX_VERTICES, np.full((8, 3), 7.0)]).astype(np.float32)
+    position = scene.accessor(wide, "VEC3", "float32")
+    scene.tree["bufferViews"][-1]["byteStride"] = 24
+    scene.tree["accessors"][position]["count"] = 8
+    scene.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = position
+    assert soup(read(".glb", scene.glb())) == soup(box())
+
+
+def right_or_refused(path: Path, expected: Mesh) -> None:
+    """Read a file that needs what a reader need not have; it must not come out as something else."""
+    try:
+        mesh = read_mesh(path)
+    except MeshError as error:
+        assert str(error).startswith(f"{path}: ")  # noqa: PT017
+        return
+    assert soup(mesh) == soup(expected)
+
+
+def test_gltf_fans_of_triangles_are_not_left_out(tmp_path: Path) -> None:
+    corners = [[0.0, 0.0, 9.0], [1.0, 0.0, 9.0], [1.0, 2.0, 9.0], [0.0, 2.0, 9.0]]
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None), (corners, [0, 1, 2, 3], 6)]], [{"mesh": 0}])
+    (tmp_path / "fan.glb").write_bytes(scene.glb())
+    whole = Mesh([*BOX_VERTICES.tolist(), *corners], [*BOX_TRIANGLES, [8, 9, 10], [8, 10, 11]])
+    right_or_refused(tmp_path / "fan.glb", whole)
+
+
+def test_gltf_sparse_accessors_are_not_ignored(tmp_path: Path) -> None:
+    scene = box_scene()
+    indices = scene.accessor([7], "SCALAR", "uint16")
+    values = scene.accessor([[9.0, 9.0, 9.0]], "VEC3", "float32")
+    views = [scene.tree["accessors"].pop()["bufferView"] for _ in (values, indices)][::-1]
+    scene.tree["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": views[0], "componentType": 5123},
+        "values": {"bufferView": views[1]},
+    }
+    (tmp_path / "sparse.glb").write_bytes(scene.glb())
+    right_or_refused(tmp_path / "sparse.glb", Mesh([*BOX_VERTICES.tolist()[:7], [9, 9, 9]], BOX_TRIANGLES))
+
+
+def test_gltf_normalized_coordinates_are_not_taken_for_lengths(tmp_path: Path) -> None:
+    unit = BOX_VERTICES > 0
+    scene = Gltf([[(unit * 127, BOX_TRIANGLES, None)]], [{"mesh": 0}], real="int8", index="uint16")
+    scene.tree["accessors"][0]["normalized"] = True
+    scene.tree["extensionsUsed"] = scene.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    (tmp_path / "normalized.glb").write_bytes(scene.glb())
+    right_or_refused(tmp_path / "normalized.glb", Mesh(unit.astype(float), BOX_TRIANGLES))
+
+
+def test_gltf_compressed_primitives_are_not_left_out(tmp_path: Path) -> None:
+    halves = [(BOX_VERTICES, BOX_TRIANGLES[:6], None), (BOX_VERTICES, BOX_TRIANGLES[6:], None)]
+    scene = Gltf([halves], [{"mesh": 0}])
+    draco = "KHR_draco_mesh_compression"
+    scene.tree["extensionsUsed"] = scene.tree["extensionsRequired"] = [draco]
+    primitive = scene.tree["meshes"][0]["primitives"][1]
+    primitive["extensions"] = {draco: {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    for accessor in (primitive["indices"], primitive["attributes"]["POSITION"]):
+        del scene.tree["accessors"][accessor]["bufferView"]
+    (tmp_path / "draco.glb").write_bytes(scene.glb())
+    with pytest.raises(MeshError, match=r"draco\.glb: "):
+        read_mesh(tmp_path / "draco.glb")
+
+
+@pytest.mark.parametrize("content", [b"{", b"not JSON", box_scene().gltf()[:-50]])
+def test_a_damaged_gltf_file_is_not_replaced_by_its_neighbour(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "model.gltf").write_bytes(box_scene().gltf())
+    (tmp_path / "damaged.gltf").write_bytes(content)
+    with pytest.raises(MeshError, match=r"damaged\.gltf: "):
+        read_mesh(tmp_path / "damaged.gltf")
+
+
+def test_scenes_of_trimesh_are_read(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((1, 2, 4)), transform=trimesh.transformations.scale_matrix(2))
+    scene.add_geometry(trimesh.creation.icosphere(2), transform=trimesh.transformations.translation_matrix((9, 9, 9)))
+    for name, content in trimesh.exchange.gltf.export_gltf(scene).items():
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "scene.glb").write_bytes(scene.export(file_type="glb"))
+    for name in ("model.gltf", "scene.glb"):
+        mesh = read_mesh(tmp_path / name)
+        assert mesh.area == pytest.approx(4 * BOX_AREA + icosphere(2).area, rel=1e-6)
+        assert mesh.counts == CLOSED

@@ -1,0 +1,378 @@
+"""Readers of mesh files: what each format holds is what comes out."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from sobolev_batch import Mesh, icosphere, read_mesh
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
+from tests.support.mesh_files import BIG, BOXES, LITTLE, Gltf, Read, gifti, obj, off, ply, stl_binary, stl_text
+from tests.support.shapes import (
+    AWKWARD_VERTICES,
+    BOX_AREA,
+    BOX_MIXED,
+    BOX_QUADS,
+    BOX_TRIANGLES,
+    BOX_VERTICES,
+    CLOSED,
+    Reals,
+    box,
+    soup,
+)
+
+
+@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gzipped"])
+def test_every_format_gives_the_box(read: Read, name: str, zipped: bool) -> None:
+    ending, content = BOXES[name]
+    mesh = read(f"{ending}.gz", gzip.compress(content)) if zipped else read(ending, content)
+    assert mesh.area == BOX_AREA
+    assert mesh.counts == CLOSED
+    assert mesh.vertices.shape == (8, 3)
+    assert soup(mesh) == soup(box())
+
+
+@pytest.mark.parametrize("ending", [".OFF", ".Off", ".off.GZ", ".scan 2.off", ".tar.off"])
+def test_only_the_last_endings_of_a_name_matter(read: Read, ending: str) -> None:
+    content = off(BOX_VERTICES, BOX_TRIANGLES)
+    assert read(ending, gzip.compress(content) if ending.endswith("GZ") else content).area == BOX_AREA
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    path = tmp_path / "box.off"
+    path.write_bytes(off(BOX_VERTICES, BOX_TRIANGLES))
+    assert read_mesh(str(path)).digest == read_mesh(path).digest
+
+
+@pytest.mark.parametrize(
+    ("ending", "content"),
+    [
+        (".ply", ply(AWKWARD_VERTICES, BOX_TRIANGLES, real="double")),
+        (".ply", ply(AWKWARD_VERTICES, BOX_TRIANGLES, LITTLE, real="double")),
+        (".ply", ply(AWKWARD_VERTICES, BOX_TRIANGLES, BIG, real="double")),
+        (".obj", obj(AWKWARD_VERTICES, BOX_TRIANGLES)),
+        (".off", off(AWKWARD_VERTICES, BOX_TRIANGLES)),
+    ],
+    ids=["ply ascii", "ply little", "ply big", "obj", "off"],
+)
+def test_double_precision_is_kept_to_the_last_bit(read: Read, ending: str, content: bytes) -> None:
+    mesh = read(ending, content)
+    assert mesh.vertices.tolist() == AWKWARD_VERTICES.tolist()
+    assert mesh.triangles.tolist() == BOX_TRIANGLES
+
+
+def test_ascii_stl_keeps_double_precision(read: Read) -> None:
+    mesh = read(".stl", stl_text(AWKWARD_VERTICES, BOX_TRIANGLES))
+    assert soup(mesh) == soup(Mesh(AWKWARD_VERTICES, BOX_TRIANGLES))
+
+
+@pytest.mark.parametrize(
+    ("ending", "content"),
+    [
+        (".ply", ply(AWKWARD_VERTICES, BOX_TRIANGLES, LITTLE)),
+        (".stl", stl_binary(AWKWARD_VERTICES, BOX_TRIANGLES)),
+        (".glb", Gltf([[(AWKWARD_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}]).glb()),
+        (".gii", gifti(AWKWARD_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))),
+    ],
+    ids=["ply", "stl", "glb", "gifti"],
+)
+def test_single_precision_is_widened_and_not_touched(read: Read, ending: str, content: bytes) -> None:
+    single = AWKWARD_VERTICES.astype(np.float32).astype(np.float64)
+    assert soup(read(ending, content)) == soup(Mesh(single, BOX_TRIANGLES))
+
+
+# A house in the plane z = 0: a pentagon of area 3 on a rectangle of area 2, with a buttress of area 1/2.
+# The numbers of corners, 4, 3 and 5, have the mean of the first, so that a reader which takes all
+# faces to be like the first one finds as many bytes as it expects.
+HOUSE_VERTICES: Reals = np.array(
+    [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 2, 0), (0, 1, 0), (0, -1, 0), (2, -1, 0), (3, 0, 0)], dtype=np.float64
+)
+HOUSE_FACES = [[5, 6, 1, 0], [1, 7, 2], [0, 1, 2, 3, 4]]
+
+POLYGON_WRITERS: dict[str, tuple[str, Callable[[Any, Any], bytes]]] = {
+    "ply ascii": (".ply", ply),
+    "ply little": (".ply", lambda v, f: ply(v, f, LITTLE)),
+    "ply little bytes": (".ply", lambda v, f: ply(v, f, LITTLE, index="uchar")),
+    "ply big": (".ply", lambda v, f: ply(v, f, BIG)),
+    "obj": (".obj", obj),
+    "obj with texture": (".obj", lambda v, f: b"vt 0 0\n" + obj(v, f, lambda vertex, _: f"{vertex}/1")),
+    "obj with normals": (".obj", lambda v, f: b"vn 0 0 1\n" + obj(v, f, lambda vertex, _: f"{vertex}//1")),
+    "off": (".off", off),
+}
+
+
+@pytest.mark.parametrize("name", POLYGON_WRITERS)
+@pytest.mark.parametrize("faces", [BOX_QUADS, BOX_MIXED, BOX_MIXED[::-1]], ids=["quads", "mixed", "mixed reversed"])
+def test_quadrilaterals_are_cut_in_two(read: Read, name: str, faces: list[list[int]]) -> None:
+    ending, write = POLYGON_WRITERS[name]
+    mesh = read(ending, write(BOX_VERTICES, faces))
+    assert mesh.area == BOX_AREA
+    assert mesh.triangles.shape == (12, 3)
+    assert mesh.vertices.tolist() == BOX_VERTICES.tolist()
+    assert mesh.counts == CLOSED
+
+
+@pytest.mark.parametrize("name", POLYGON_WRITERS)
+def test_polygons_of_all_sizes_are_cut_into_fans(read: Read, name: str) -> None:
+    ending, write = POLYGON_WRITERS[name]
+    mesh = read(ending, write(HOUSE_VERTICES, HOUSE_FACES))
+    assert mesh.area == pytest.approx(5.5, rel=1e-15)
+    assert mesh.triangles.shape == (6, 3)
+    assert mesh.vertices.tolist() == HOUSE_VERTICES.tolist()
+    assert mesh.counts == MeshCounts(zero_area=0, duplicate=0, boundary_edges=8, nonmanifold_edges=0)
+    pentagon = read(ending, write(HOUSE_VERTICES, HOUSE_FACES[2:]))
+    assert pentagon.area == pytest.approx(3, rel=1e-15)
+
+
+# What the formats allow beside plain lists of vertices and faces.
+
+
+def insert(content: bytes, before: bytes, line: bytes) -> bytes:
+    assert content.count(before) == 1
+    return content.replace(before, line + before)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", LITTLE, BIG])
+@pytest.mark.parametrize("more", ["abc", "st", "uv"], ids=["plain", "st", "uv"])
+def test_ply_vertices_may_have_more_properties(read: Read, encoding: str, more: str) -> None:
+    # s, t and u, v are names of texture coordinates. The last vertex is not in use.
+    vertices = [*BOX_VERTICES.tolist(), [9.0, 9.0, 9.0]]
+    mesh = read(".ply", ply(vertices, BOX_TRIANGLES, encoding, more=more))
+    assert mesh.vertices.tolist() == vertices
+    assert mesh.triangles.tolist() == BOX_TRIANGLES
+
+
+@pytest.mark.parametrize("faces", [BOX_TRIANGLES, BOX_QUADS], ids=["triangles", "quads"])
+def test_ply_faces_may_have_colors(read: Read, faces: list[list[int]]) -> None:
+    colors = b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
+    content = insert(ply(BOX_VERTICES, faces), b"end_header\n", colors)
+    lines = content.splitlines()
+    content = b"\n".join([*lines[: -len(faces)], *[line + b" 255 0 7" for line in lines[-len(faces) :]], b""])
+    assert soup(read(".ply", content)) == soup(box())
+
+
+def test_ply_faces_may_have_texture_coordinates(read: Read) -> None:
+    content = insert(ply(BOX_VERTICES, BOX_TRIANGLES), b"end_header\n", b"property list uchar float texcoord\n")
+    lines = content.splitlines()
+    faces = [b"%s 6 %d 0 1 0 1 1" % (line, number) for number, line in enumerate(lines[-12:])]
+    mesh = read(".ply", b"\n".join([*lines[:-12], *faces, b""]))
+    assert soup(mesh) == soup(box())
+    # Texture seams do not cut the surface.
+    assert mesh.counts == CLOSED
+
+
+@pytest.mark.parametrize("encoding", ["ascii", LITTLE])
+def test_ply_files_may_have_more_elements(read: Read, encoding: str) -> None:
+    edges = b"element edge 2\nproperty int vertex1\nproperty int vertex2\n"
+    content = insert(ply(BOX_VERTICES, BOX_TRIANGLES, encoding), b"end_header\n", edges)
+    content += b"0 1\n1 2\n" if encoding == "ascii" else np.array([0, 1, 1, 2], dtype="<i4").tobytes()
+    assert soup(read(".ply", content)) == soup(box())
+
+
+def test_ply_faces_may_come_first(read: Read) -> None:
+    lines = ply(BOX_VERTICES, BOX_TRIANGLES).splitlines(keepends=True)
+    vertex_header, face_header = lines[3:7], lines[7:9]
+    assert (vertex_header[0], face_header[0]) == (b"element vertex 8\n", b"element face 12\n")
+    content = [*lines[:3], *face_header, *vertex_header, lines[9], *lines[18:], *lines[10:18]]
+    assert soup(read(".ply", b"".join(content))) == soup(box())
+
+
+@pytest.mark.parametrize("ending", [".ply", ".obj", ".off", ".stl"])
+def test_lines_may_end_as_on_windows(read: Read, ending: str) -> None:
+    content = next(content for found, content in BOXES.values() if found == ending)
+    assert soup(read(ending, content.replace(b"\n", b"\r\n"))) == soup(box())
+
+
+def test_obj_corners_may_count_backwards_from_the_line_they_stand_on(read: Read) -> None:
+    triangle = b"v 0 0 %d\nv %d 0 %d\nv 0 %d %d\nf -3 -2 -1\n"
+    mesh = read(".obj", triangle % (0, 1, 0, 1, 0) + triangle % (5, 2, 5, 2, 5))
+    assert mesh.triangles.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert mesh.areas.tolist() == [0.5, 2.0]
+    assert mesh.counts == MeshCounts(zero_area=0, duplicate=0, boundary_edges=6, nonmanifold_edges=0)
+
+
+@pytest.mark.parametrize("rest", ["", "/-1", "/-1/-1", "//-1"])
+def test_obj_corners_may_count_backwards_at_the_end_of_the_file(read: Read, rest: str) -> None:
+    content = obj(BOX_VERTICES, BOX_TRIANGLES, lambda vertex, _: f"{vertex - 9}{rest}")
+    mesh = read(".obj", b"vt 0 0\nvn 0 0 1\n" + content)
+    assert mesh.vertices.tolist() == BOX_VERTICES.tolist()
+    assert mesh.triangles.tolist() == BOX_TRIANGLES
+
+
+@pytest.mark.parametrize("divider", [b"o second\n", b"g second\n", b"usemtl second\n", b"s 2\n"])
+def test_obj_parts_share_their_vertices(read: Read, divider: bytes) -> None:
+    start = divider.replace(b"second", b"first").replace(b"2", b"1")
+    content = obj(BOX_VERTICES, BOX_TRIANGLES)
+    content = insert(content, b"f 1 2 4\n", b"mtllib missing.mtl\n" + start)
+    third = b"f " + b" ".join(b"%d" % (vertex + 1) for vertex in BOX_TRIANGLES[4]) + b"\n"
+    content = insert(content, third, divider)
+    mesh = read(".obj", content)
+    assert soup(mesh) == soup(box())
+    assert mesh.vertices.shape == (8, 3)
+    assert mesh.counts == CLOSED
+
+
+def test_obj_texture_seams_do_not_cut_the_surface(read: Read) -> None:
+    texture = "".join(f"vt {i / 36} 0\n" for i in range(36)).encode()
+    numbers = iter(range(1, 37))
+    content = obj(BOX_VERTICES, BOX_TRIANGLES, lambda vertex, _: f"{vertex}/{next(numbers)}")
+    mesh = read(".obj", texture + content)
+    assert soup(mesh) == soup(box())
+    assert mesh.vertices.shape == (8, 3)
+    assert mesh.counts == CLOSED
+
+
+OBJ_BOX = obj(BOX_VERTICES, BOX_TRIANGLES)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"# made by hand\n\n" + OBJ_BOX + b"\n# end",
+        OBJ_BOX.replace(b"f 1 2 4\n", b"f 1 2 4 # the first\n"),
+        OBJ_BOX.replace(b"v 0.0 0.0 0.0\n", b"v 0.0 0.0 0.0 # the origin\n"),
+        OBJ_BOX.replace(b" ", b"  "),
+        OBJ_BOX.replace(b" ", b"\t"),
+        OBJ_BOX.replace(b"f 1 2 4\n", b"f 1 2 \\\n4\n"),
+        OBJ_BOX.replace(b"f 1 2 4\n", b"f 1 2 \\\n4\n").replace(b"\n", b"\r\n"),
+        re.sub(rb"(v .*)\n", rb"\1 1.0\n", OBJ_BOX),
+        re.sub(rb"(v .*)\n", rb"\1 0.5 0.5 1\n", OBJ_BOX),
+        OBJ_BOX.replace(b"v 1.0 2.0 4.0\n", b"v 1.0 2.0 4.0 1.0\n"),
+        OBJ_BOX.replace(b"v 1.0 2.0 4.0\n", b"v 1e+0 20.E-1 .4e1\n"),
+        OBJ_BOX + b"p 1\nl 1 2 8\n",
+        b"".join(sorted(OBJ_BOX.splitlines(keepends=True)[8:])) + b"".join(OBJ_BOX.splitlines(keepends=True)[:8]),
+        OBJ_BOX.rstrip(),
+    ],
+    ids=[
+        "comments",
+        "comment after a face",
+        "comment after a vertex",
+        "two spaces",
+        "tabs",
+        "continued line",
+        "continued line as on Windows",
+        "weights",
+        "colors",
+        "one weight",
+        "exponents",
+        "points and lines",
+        "faces first",
+        "no newline at the end",
+    ],
+)
+def test_obj_files_may_look_like_this(read: Read, content: bytes) -> None:
+    assert soup(read(".obj", content)) == soup(box())
+
+
+OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        off(BOX_VERTICES, BOX_TRIANGLES, "OFF "),
+        OFF_BOX.replace(b"OFF\n8 12 0\n", b"# one\nOFF # two\n\n# three\n8 12 0 # four\n# five\n"),
+        OFF_BOX.replace(b"8 12 0\n", b"8 12\n"),
+        re.sub(rb"^(3 .*)\n", rb"\1 3 255 0 0\n", OFF_BOX, flags=re.MULTILINE),
+        re.sub(rb"^(\S+ \S+ \S+)\n", rb"\1 1 2 3\n", OFF_BOX, flags=re.MULTILINE)
+        .replace(b"8 12 0 1 2 3", b"8 12 0")
+        .replace(b"OFF", b"NOFF"),
+        OFF_BOX.rstrip(),
+    ],
+    ids=["counts beside the keyword", "comments", "no edge count", "face colors", "normals", "no newline at the end"],
+)
+def test_off_files_may_look_like_this(read: Read, content: bytes) -> None:
+    assert soup(read(".off", content)) == soup(box())
+
+
+@pytest.mark.parametrize("names", [("one", "two"), ("same", "same"), ("", "")])
+def test_stl_files_may_hold_several_solids(read: Read, names: tuple[str, str]) -> None:
+    content = stl_text(BOX_VERTICES, BOX_TRIANGLES[:6], names[0]) + stl_text(BOX_VERTICES, BOX_TRIANGLES[6:], names[1])
+    mesh = read(".stl", content)
+    assert soup(mesh) == soup(box())
+    assert mesh.counts == CLOSED
+
+
+@pytest.mark.parametrize("name", ["", "a solid box", "vertex", "facet", "facet normal"])
+def test_stl_solids_may_have_any_name(read: Read, name: str) -> None:
+    assert soup(read(".stl", stl_text(BOX_VERTICES, BOX_TRIANGLES, name))) == soup(box())
+
+
+def test_stl_text_may_be_indented_and_in_capitals(read: Read) -> None:
+    content = stl_text(BOX_VERTICES, BOX_TRIANGLES)
+    assert soup(read(".stl", content.upper())) == soup(box())
+    assert soup(read(".stl", b"\n  " + content.replace(b"\n", b"\n\t "))) == soup(box())
+
+
+def test_stl_vertices_are_merged_where_they_coincide_and_nowhere_else(read: Read) -> None:
+    content = stl_text(BOX_VERTICES, BOX_TRIANGLES)
+    negative = content.replace(b"vertex 0.0 0.0 0.0", b"vertex -0.0 0.0 -0.0", 1)
+    assert read(".stl", negative).counts == CLOSED
+    moved = content.replace(b"vertex 0.0 0.0 0.0", b"vertex 1e-300 0.0 0.0", 1)
+    mesh = read(".stl", moved)
+    assert mesh.vertices.shape == (9, 3)
+    assert mesh.counts.boundary_edges > 0
+
+
+def test_other_vertices_that_coincide_stay_apart(read: Read) -> None:
+    corners = BOX_VERTICES[np.array(BOX_TRIANGLES)].reshape(-1, 3)
+    faces = np.arange(36).reshape(-1, 3)
+    apart = [
+        (".ply", ply(corners, faces.tolist())),
+        (".ply", ply(corners, faces.tolist(), LITTLE)),
+        (".obj", obj(corners, faces.tolist())),
+        (".off", off(corners, faces.tolist())),
+        (".gii", gifti(corners, faces.astype(np.int32))),
+    ]
+    for ending, content in apart:
+        mesh = read(ending, content)
+        assert mesh.vertices.tolist() == corners.tolist()
+        assert mesh.counts.boundary_edges == 36
+
+
+@pytest.mark.parametrize("name", ["ply", "obj", "off", "gii"])
+def test_degenerate_and_duplicate_faces_are_kept(read: Read, name: str) -> None:
+    faces = [*BOX_TRIANGLES, [0, 0, 1], [0, 1, 3], [3, 1, 0]]
+    write: dict[str, Callable[[], bytes]] = {
+        "ply": lambda: ply(BOX_VERTICES, faces),
+        "obj": lambda: obj(BOX_VERTICES, faces),
+        "off": lambda: off(BOX_VERTICES, faces),
+        "gii": lambda: gifti(BOX_VERTICES, np.array(faces, dtype=np.int32)),
+    }
+    mesh = read(f".{name}", write[name]())
+    assert mesh.triangles.tolist() == faces
+    assert (mesh.counts.zero_area, mesh.counts.duplicate) == (1, 2)
+    assert mesh.area == BOX_AREA + 2 * 4
+
+
+# Files of other writers.
+
+
+@pytest.mark.parametrize(
+    ("ending", "options"),
+    [
+        (".ply", {"encoding": "ascii"}),
+        (".ply", {"encoding": "binary"}),
+        (".obj", {"digits": 17}),
+        (".off", {"digits": 17}),
+        (".stl", {}),
+        (".glb", {}),
+    ],
+)
+def test_files_of_trimesh_are_read(read: Read, ending: str, options: dict[str, Any]) -> None:
+    ball = icosphere(2)
+    made = trimesh.Trimesh(ball.vertices, ball.triangles, process=False)
+    content = made.export(file_type=ending[1:], **options)
+    mesh = read(ending, content if isinstance(content, bytes) else content.encode())
+    assert mesh.area == pytest.approx(ball.area, rel=1e-14 if "digits" in options else 1e-6)
+    assert mesh.triangles.shape == ball.triangles.shape
+    assert mesh.vertices.shape == ball.vertices.shape
+    assert mesh.counts == CLOSED

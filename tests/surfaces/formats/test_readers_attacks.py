@@ -1,0 +1,138 @@
+"""Files made to hang or to exhaust a reader: refused in seconds, and in memory that follows their size."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+
+from sobolev_batch import MeshError, read_mesh
+from sobolev_batch.surfaces.formats.readers import expected_size
+from sobolev_batch.surfaces.sources.files import FileMember
+from tests.support.mesh_attacks import ATTACKS
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")
+
+# Most take a tenth of a second; machines may be busy.
+_LONGEST_SECONDS = 20
+# What refusing may take besides a multiple of the file: what packed data may grow to in any case, and its parsing.
+_SPARE_BYTES, _BYTES_PER_BYTE = 150 << 20, 150
+# A lying count would ask for more than this.
+_ADDRESS_BYTES = 8 << 30
+# What any size is told by: no format has less of a file for each triangle, nor takes more memory for it.
+_LEAST_BYTES, _MOST_MEMORY = 3, 1300
+
+
+def main(folder: Path) -> None:
+    """Carry out all attacks on this process, and print what came of each."""
+    resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_BYTES, _ADDRESS_BYTES))
+    warnings.simplefilter("error")
+    for number, (name, attack) in enumerate(ATTACKS.items()):
+        place = folder / str(number)
+        place.mkdir()
+        path = attack(place)
+        Path("/proc/self/clear_refs").write_text("5")
+        before, start = _peak_bytes(), time.perf_counter()
+        outcomes = [_outcome(path, use) for use in ("load", "fingerprint", "expected_size")]
+        seconds = time.perf_counter() - start
+        sys.stdout.write(json.dumps([name, outcomes, seconds, _peak_bytes() - before]) + "\n")
+        sys.stdout.flush()
+
+
+def _outcome(path: Path, use: str) -> str:
+    try:
+        getattr(FileMember("scan", -1, path), use)()
+    except MeshError as error:
+        return f"MeshError {error}"
+    except BaseException as error:
+        return f"{type(error).__name__} {error}"
+    return "returned"
+
+
+def _peak_bytes() -> int:
+    """The most memory that was resident since the peak was last reset."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return 1024 * int(line.split()[1])
+
+
+def disk_bytes(folder: Path) -> int:
+    """What all files of a folder take up."""
+    return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if not path.is_symlink())
+
+
+def test_attacks_are_refused_in_bounded_time_and_memory(tmp_path: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", f"from {__name__} import main; from pathlib import Path; main(Path({str(tmp_path)!r}))"],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        cwd=Path(__file__).parents[3],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )
+    assert found.returncode == 0, found.stderr
+    results = [json.loads(line) for line in found.stdout.splitlines()]
+    assert [name for name, *_ in results] == list(ATTACKS)
+    wrong = []
+    for number, (name, outcomes, seconds, memory_bytes) in enumerate(results):
+        allowed_bytes = _SPARE_BYTES + _BYTES_PER_BYTE * disk_bytes(tmp_path / str(number))
+        loaded, fingerprint, size = outcomes
+        refused = loaded.startswith("MeshError ") and len(loaded) < 900 and "Warning" not in loaded
+        orderly = fingerprint.startswith(("MeshError ", "returned")) and size == "returned"
+        if not (refused and orderly and seconds < _LONGEST_SECONDS and memory_bytes < allowed_bytes):
+            wrong.append(f"{name}: {outcomes}, {seconds:.1f} s, {memory_bytes >> 20} of {allowed_bytes >> 20} MiB")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", [name for name in ATTACKS if not name.startswith(("stl, sparse", "ply, sparse"))])
+def test_no_size_is_claimed_that_the_file_cannot_hold(tmp_path: Path, name: str) -> None:
+    path = ATTACKS[name](tmp_path)
+    triangles, memory_bytes = expected_size(path)
+    # Packed files count as what they may unpack to.
+    held_bytes = disk_bytes(tmp_path) * (4 if name.endswith(".gz") else 1)
+    assert 0 <= triangles <= held_bytes / _LEAST_BYTES
+    assert 0 <= memory_bytes <= held_bytes / _LEAST_BYTES * _MOST_MEMORY
+
+
+@pytest.mark.parametrize(("ending", "name"), [(".ply", "ply, sparse"), (".stl", "stl, sparse")])
+def test_files_beyond_the_bound_are_refused_unread(tmp_path: Path, ending: str, name: str) -> None:
+    path = ATTACKS[name](tmp_path)
+    with pytest.raises(MeshError, match=rf"scan\{ending}: larger than 8589934592 bytes.*1099511627776"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("FIFO .ply", "cannot be read: it is a pipe, a socket or a device, and no regular file"),
+        ("endless device .obj", "cannot be read: it is a pipe, a socket or a device"),
+        ("gltf, FIFO as buffer", r"its buffer data\.bin cannot be read: it is a pipe"),
+        ("gltf, buffer behind a link", "its buffer 'data.bin' lies outside the file's folder; put it there"),
+        ("gltf, buffer above", "lies outside the file's folder"),
+        ("gltf, buffer of the web", "lies outside the file's folder"),
+        ("bomb .ply.gz", "larger than 20[0-9]* bytes once it is unpacked from [0-9]*: no mesh file shrinks so much"),
+        ("gifti, bomb", r"unpacks to more than the 96 bytes announced"),
+        ("gifti, bomb that is announced", "its arrays unpack to more than [0-9]* bytes: no mesh file shrinks so much"),
+        ("gifti, a billion laughs", "the XML declares the entity 'a0'; a GIFTI file has none"),
+        ("gifti, entities in UTF-16", "the XML declares the entity 'a0'"),
+        ("gifti, data of another file", "its data lie in another file; write it with them inside"),
+        ("gifti, negative dimension", r"a negative dimension: \[-8, 3\]"),
+        ("glb, one part in many nodes", "its scene repeats parts until they take more than [0-9]* bytes"),
+        ("glb, stride 0", "accessor 0 has entries of 12 bytes every 0 bytes"),
+        ("ply, list of 2^32 - 1", "early end-of-file"),
+        ("ply, indices with fractions", "the PLY faces have indices that are not integers, but of the type f4"),
+        ("ply ascii, wide rows of list uchar double", "announces .* but only 1000001 bytes follow"),
+        ("ply, long name", r"announces \{'vertex': 3, 'face': 1, 'e{100,200}\.\.\.$"),
+        ("obj, huge coordinate", r"largest absolute coordinate 4e\+300; rescale it"),
+        ("ply ascii, float overflow", "NaN or infinite"),
+    ],
+)
+def test_attacks_are_refused_for_what_they_are(tmp_path: Path, name: str, reason: str) -> None:
+    with pytest.raises(MeshError, match=reason):
+        read_mesh(ATTACKS[name](tmp_path))

@@ -1,0 +1,167 @@
+"""Readers under random bytes and random damage: they end in a mesh or a MeshError, in silence and in time."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sobolev_batch import MeshError, read_mesh
+from sobolev_batch.surfaces.formats.readers import expected_size
+from tests.support.mesh_files import BOXES, LITTLE, Content, ply
+from tests.support.shapes import BOX_MIXED, BOX_VERTICES
+
+# Reading the box takes milliseconds; machines may be busy.
+_LONGEST_SECONDS = 5.0
+
+_KINDS: dict[str, Content] = {
+    **BOXES,
+    "ply little polygons": (".ply", ply(BOX_VERTICES, BOX_MIXED, LITTLE)),
+    "ply gzipped": (".ply.gz", gzip.compress(BOXES["ply ascii float"][1], mtime=0)),
+}
+_PLY_HEADERS = [
+    content[: content.index(b"end_header\n") + len(b"end_header\n")] for end, content in BOXES.values() if end == ".ply"
+]
+# What a format begins with, so that random bytes get past the first look.
+_STARTS: dict[str, tuple[bytes, ...]] = {
+    ".ply": (b"", *_PLY_HEADERS),
+    ".obj": (b"", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf "),
+    ".off": (b"", b"OFF\n", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n"),
+    ".stl": (b"", b"solid\n", b"solid\nfacet normal 0 0 0\nouter loop\nvertex ", bytes(80) + b"\1\0\0\0"),
+    ".gltf": (b"", b"{", b'{"nodes": [{"mesh": 0}], "meshes": '),
+    ".glb": (b"", BOXES["glb"][1][:20]),
+    ".gii": (b"", b"<GIFTI>", BOXES["gifti ascii"][1].partition(b"<Data>")[0] + b"<Data>"),
+    ".ply.gz": (b"", b"\x1f\x8b", gzip.compress(b"", mtime=0)),
+}
+# Numbers that have broken readers before.
+_NUMBERS = ["-1", "0", "1", "2", "7", "8", "9", "255", "256", "65536", "-2147483648", "2147483648", "4294967295"]
+_NUMBERS += ["9223372036854775807", "18446744073709551616", "9" * 40, "9" * 400, "9" * 5000, "1e300", "1e999", "nan"]
+_NUMBERS += ["-inf", "1_0", "0x10", "1.5", "", "-", "²", "１"]
+_TOKENS = [
+    b"\0",
+    b"\n",
+    b" ",
+    b'"',
+    b"\xff",
+    b"\xff\xff\xff\xff",
+    b"\xff\xff\xff\x7f",
+    b"\0\0\xc0\x7f",
+    b"[",
+    b"{}",
+    b"<",
+]
+_TOKENS += [b"end_header\n", b"element face 9\n", b"property list int double vertex_indices\n", b"f 1 2 3 4 5\n", b"#"]
+_TOKENS += [b"null", b'"byteStride":0,', b"<Data>", b"</DataArray>", b"&a;", b'Dim0="99"', b"\xf0\x9f\x98\x80"]
+
+_fuzz = settings(
+    derandomize=True,
+    deadline=None,  # a mean over examples; each is timed by itself
+    max_examples=60,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+def _ends_well(path: Path, content: bytes) -> None:
+    """Read a file and estimate its size: nothing but a mesh or a MeshError, no warning, no lie believed."""
+    path.write_bytes(content)
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        triangles, memory_bytes = expected_size(path)
+        try:
+            mesh = read_mesh(path)
+        except MeshError as error:
+            assert str(error).startswith(f"{path}: ")  # noqa: PT017
+            assert len(str(error)) < len(str(path)) + 400  # noqa: PT017
+            # A warning that an "except Exception" swallowed.
+            assert not re.search(r"Warning\b", str(error))  # noqa: PT017
+        else:
+            assert np.isfinite(mesh.vertices).all()
+            assert mesh.triangles.min() >= 0
+            assert mesh.triangles.max() < len(mesh.vertices)
+            assert math.isfinite(mesh.area)
+            assert mesh.area > 0
+            assert mesh.counts.zero_area < len(mesh.triangles)
+            assert math.isfinite(mesh.edge_length_range[1])
+    assert time.perf_counter() - start < _LONGEST_SECONDS
+    held_bytes = len(content) * (4 if path.suffix == ".gz" else 1)
+    assert isinstance(triangles, int)
+    assert 0 <= triangles <= held_bytes
+    assert 0 <= memory_bytes <= 1300 * held_bytes
+
+
+@st.composite
+def _damaged(draw: st.DrawFn, content: bytes) -> bytes:
+    """A valid file after a few accidents."""
+    for _ in range(draw(st.integers(1, 4))):
+        size = len(content)
+        place, other = draw(st.integers(0, size)), draw(st.integers(0, size))
+        accident = draw(st.sampled_from(["flip", "cut", "insert", "repeat", "drop", "number", "number", "word"]))
+        if accident == "flip" and place < size:
+            flipped = content[place] ^ (1 << draw(st.integers(0, 7)))
+            content = content[:place] + bytes([flipped]) + content[place + 1 :]
+        elif accident == "cut":
+            content = content[:place]
+        elif accident == "insert":
+            content = content[:place] + draw(st.binary(max_size=12) | st.sampled_from(_TOKENS)) + content[place:]
+        elif accident == "repeat":
+            content = content[: max(place, other)] + content[min(place, other) :]
+        elif accident == "drop":
+            content = content[: min(place, other)] + content[max(place, other) :]
+        else:
+            pattern = rb"-?\d+(?:\.\d+)?" if accident == "number" else rb"[A-Za-z_]+"
+            found = list(re.finditer(pattern, content))
+            if found:
+                match = draw(st.sampled_from(found[:40]))
+                new = draw(st.sampled_from(_NUMBERS)).encode() if accident == "number" else draw(st.binary(max_size=8))
+                content = content[: match.start()] + new + content[match.end() :]
+    return content
+
+
+@pytest.mark.parametrize("name", _KINDS)
+@_fuzz
+@given(data=st.data())
+def test_damaged_files_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    ending, content = _KINDS[name]
+    _ends_well(tmp_path / f"scan{ending}", data.draw(_damaged(content)))
+
+
+@pytest.mark.parametrize("ending", _STARTS)
+@_fuzz
+@given(data=st.data())
+def test_any_bytes_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, ending: str, data: st.DataObject) -> None:
+    start = data.draw(st.sampled_from(_STARTS[ending]))
+    body = data.draw(st.binary(max_size=300) | st.lists(st.sampled_from(_TOKENS), max_size=30).map(b" ".join))
+    _ends_well(tmp_path / f"scan{ending}", start + body)
+
+
+@pytest.mark.parametrize("ending", _STARTS)
+@_fuzz
+@given(data=st.data())
+def test_any_text_ends_in_a_mesh_or_a_mesh_error(tmp_path: Path, ending: str, data: st.DataObject) -> None:
+    words = st.sampled_from([*_NUMBERS, "v", "f", "facet", "vertex", "endloop", "solid", "3", "0 1 2", "\n", "\n3 "])
+    start = data.draw(st.sampled_from(_STARTS[ending]))
+    _ends_well(tmp_path / f"scan{ending}", start + " ".join(data.draw(st.lists(words, max_size=40))).encode())
+
+
+@_fuzz
+@given(
+    vertex=st.sampled_from(_NUMBERS),
+    face=st.sampled_from(_NUMBERS),
+    kind=st.sampled_from(["ascii", LITTLE]),
+    x=st.binary(),
+)
+def test_headers_that_lie_claim_no_more_than_the_file_holds(
+    tmp_path: Path, vertex: str, face: str, kind: str, x: bytes
+) -> None:
+    lines = ["ply", f"format {kind} 1.0", f"element vertex {vertex}", *[f"property float {axis}" for axis in "xyz"]]
+    lines += [f"element face {face}", "property list uchar int vertex_indices", "end_header", ""]
+    _ends_well(tmp_path / "scan.ply", "\n".join(lines).encode() + x)

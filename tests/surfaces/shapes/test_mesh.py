@@ -1,0 +1,423 @@
+"""Meshes: what they refuse, what they keep and count, what they measure."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+from dataclasses import FrozenInstanceError
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sobolev_batch import InputError, Mesh, MeshError
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
+from tests.support.shapes import (
+    BOX_AREA,
+    TETRAHEDRON_AREA,
+    TETRAHEDRON_TRIANGLES,
+    TETRAHEDRON_VERTICES,
+    Reals,
+    box,
+    meshes,
+    tetrahedron,
+)
+
+seeded = settings(derandomize=True, deadline=None, max_examples=60)
+
+VERTICES: list[list[float]] = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
+TRIANGLES = [[0, 1, 2]]
+
+
+def with_entry(row: int, column: int, value: float) -> Reals:
+    vertices = np.array(VERTICES)
+    vertices[row, column] = value
+    return vertices
+
+
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (with_entry(1, 2, np.nan), "1 of 3 vertices have NaN or infinite coordinates: #1 = [3.0, 0.0, nan]"),
+        (with_entry(2, 0, np.inf), "#2 = [inf, 4.0, 0.0]"),
+        (with_entry(0, 1, -np.inf), "#0 = [0.0, -inf, 0.0]"),
+        (np.full((7, 3), np.nan), "7 of 7 vertices have NaN or infinite coordinates: #0 = [nan, nan, nan], #1 ="),
+        (np.array(VERTICES)[:, :2], "vertices must have shape (n, 3), found (3, 2)"),
+        (np.zeros((3, 4)), "found (3, 4)"),
+        (np.zeros(9), "found (9,)"),
+        (np.zeros((1, 3, 3)), "found (1, 3, 3)"),
+        (np.array(VERTICES) * 1j, "vertices must be real numbers, found dtype complex128"),
+        (np.array(VERTICES).astype(str), "vertices must be real numbers, found dtype <U"),
+        (np.array(VERTICES).astype(bool), "vertices must be real numbers, found dtype bool"),
+        (np.array(VERTICES).astype(object), "vertices must be real numbers, found dtype object"),
+        (None, "vertices must be real numbers, found dtype object"),
+        (np.array(VERTICES) * 1e200, "largest absolute coordinate 4e+200; rescale it"),
+        (np.array(VERTICES) * 4e307, "largest absolute coordinate 1.6e+308; rescale it"),
+    ],
+)
+def test_bad_vertices_are_named(vertices: Any, message: str) -> None:
+    with pytest.raises(MeshError, match=re.escape(message)):
+        Mesh(vertices, TRIANGLES)
+
+
+@pytest.mark.parametrize(
+    ("triangles", "message"),
+    [
+        ([[0, 1, 2], [0, -1, 2]], "1 of 2 triangles have indices outside 0..2: #1 = [0, -1, 2]"),
+        ([[0, 1, 3]], "1 of 1 triangles have indices outside 0..2: #0 = [0, 1, 3]"),
+        (np.array([[0, 1, 2**63]], dtype=np.uint64), "#0 = [0, 1, 9223372036854775808]"),
+        (np.array([[0, 1, 255]], dtype=np.uint8), "#0 = [0, 1, 255]"),
+        (np.array([[0.0, 1.0, 2.0]]), "triangles must be integer indices, found dtype float64"),
+        (np.array([[False, True, True]]), "triangles must be integer indices, found dtype bool"),
+        (np.array([["0", "1", "2"]]), "triangles must be integer indices, found dtype <U1"),
+        (np.array([[0, 1, 2]], dtype=object), "triangles must be integer indices, found dtype object"),
+        ([0, 1, 2], "triangles must have shape (m, 3), found (3,)"),
+        ([[0, 1, 2, 0]], "triangles must have shape (m, 3), found (1, 4)"),
+        ([[0, 1]], "triangles must have shape (m, 3), found (1, 2)"),
+        ([], "the mesh has no triangles"),
+        (np.zeros((0, 3), dtype=np.int64), "the mesh has no triangles"),
+        (None, "triangles must be integer indices, found dtype object"),
+    ],
+)
+def test_bad_triangles_are_named(triangles: Any, message: str) -> None:
+    with pytest.raises(MeshError, match=re.escape(message)):
+        Mesh(VERTICES, triangles)
+
+
+def test_long_lists_of_offenders_are_cut() -> None:
+    with pytest.raises(MeshError) as caught:
+        Mesh(VERTICES, [[0, 1, 2], *([[7, 8, 9]] * 5)])
+    assert str(caught.value) == (
+        "5 of 6 triangles have indices outside 0..2: #1 = [7, 8, 9], #2 = [7, 8, 9], #3 = [7, 8, 9], ..."
+    )
+    with pytest.raises(MeshError) as caught:
+        Mesh(VERTICES, [[7, 8, 9]] * 3)
+    assert str(caught.value).endswith("#2 = [7, 8, 9]")
+
+
+def test_a_bad_vertex_counts_even_where_no_triangle_uses_it() -> None:
+    with pytest.raises(MeshError, match=r"1 of 4 vertices .* #3 = \[nan, 0\.0, 0\.0\]"):
+        Mesh(np.vstack([VERTICES, [np.nan, 0.0, 0.0]]), TRIANGLES)
+
+
+def test_triangles_without_any_vertices_are_out_of_range() -> None:
+    with pytest.raises(MeshError, match=r"1 of 1 triangles have indices outside .*#0 = \[0, 1, 2\]"):
+        Mesh(np.zeros((0, 3)), TRIANGLES)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles"),
+    [([[0, 0, 0], [1, 0], [0, 1, 0]], TRIANGLES), (VERTICES, [[0, 1, 2], [0, 1]])],
+    ids=["vertices", "triangles"],
+)
+def test_rows_of_unequal_length_are_refused(vertices: Any, triangles: Any) -> None:
+    with pytest.raises(MeshError, match=r"vertices|triangles"):
+        Mesh(vertices, triangles)
+
+
+@pytest.mark.parametrize(
+    "vertices",
+    [
+        [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [1, 1, 1], [2, 2, 2]],
+        # Collinear in exact arithmetic, not in rounded arithmetic.
+        [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]],
+        [[0.0, 0.0, 0.0], [1 / 3, 1 / 7, 1 / 9], [5 / 3, 5 / 7, 5 / 9]],
+    ],
+)
+def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
+    with pytest.raises(MeshError, match="the total area of the 2 triangles is zero: every one is degenerate"):
+        Mesh(vertices, [[0, 1, 2], [0, 0, 1]])
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).maxexp == 1024, reason="needs numbers wider than double precision")
+def test_coordinates_beyond_double_precision_are_refused() -> None:
+    wide = np.array([[0, 0, 0], [np.longdouble("1e400"), 0, 0], [0, 1, 0]], dtype=np.longdouble)
+    with pytest.raises(MeshError, match="coordinates"):
+        Mesh(wide, TRIANGLES)
+
+
+def test_errors_survive_pickling_and_are_input_errors() -> None:
+    with pytest.raises(InputError) as caught:
+        Mesh(VERTICES, [[0, 1, 9]])
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert type(again) is MeshError
+    assert str(again) == str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("extra_vertices", "extra_triangles", "counts"),
+    [
+        ([], [], MeshCounts(0, 0, 0, 0)),
+        # A fourth vertex on the edge 0-1: a triangle of no area that is open along two new edges.
+        ([[0.5, 0, 0]], [[0, 1, 4]], MeshCounts(1, 0, 2, 1)),
+        # The first face again, in the same and in the other orientation.
+        ([], [[0, 2, 1]], MeshCounts(0, 1, 0, 3)),
+        ([], [[1, 2, 0], [0, 1, 2]], MeshCounts(0, 2, 0, 3)),
+        # A fin on the edge 0-1.
+        ([[0, 0, -1]], [[0, 1, 4]], MeshCounts(0, 0, 2, 1)),
+        # A triangle apart from the rest.
+        ([[5, 5, 5], [6, 5, 5], [5, 6, 5]], [[4, 5, 6]], MeshCounts(0, 0, 3, 0)),
+        # A vertex that nothing uses.
+        ([[100, 100, 100]], [], MeshCounts(0, 0, 0, 0)),
+    ],
+    ids=["closed", "zero area", "duplicate", "two duplicates", "fin", "apart", "unused vertex"],
+)
+def test_oddities_are_kept_and_counted(extra_vertices: Any, extra_triangles: Any, counts: MeshCounts) -> None:
+    vertices: Reals = np.array([*TETRAHEDRON_VERTICES.tolist(), *extra_vertices], dtype=np.float64)
+    triangles: list[list[int]] = [*TETRAHEDRON_TRIANGLES, *extra_triangles]
+    mesh = Mesh(vertices, triangles)
+    assert mesh.triangles.tolist() == triangles
+    assert np.array_equal(mesh.vertices, vertices)
+    assert mesh.counts == counts
+
+
+def test_an_open_mesh_counts_its_boundary() -> None:
+    mesh = Mesh(TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES[:3])
+    assert mesh.counts == MeshCounts(zero_area=0, duplicate=0, boundary_edges=3, nonmanifold_edges=0)
+
+
+def test_a_triangle_that_repeats_a_vertex_has_no_edge_from_it_to_itself() -> None:
+    # The edges of [0, 0, 1] are 0-1 alone, which the first triangle has too.
+    mesh = Mesh(VERTICES, [[0, 1, 2], [0, 0, 1]])
+    assert mesh.counts == MeshCounts(zero_area=1, duplicate=0, boundary_edges=2, nonmanifold_edges=0)
+    # In a closed mesh it opens nothing.
+    closed = Mesh(TETRAHEDRON_VERTICES, [*TETRAHEDRON_TRIANGLES, [0, 0, 1]])
+    assert closed.counts.boundary_edges == 0
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1e-6, 1.0, 1e6, 1e60])
+def test_what_counts_as_zero_area_does_not_depend_on_the_unit(scale: float) -> None:
+    needle = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1e-13, 0.0]]
+    flat = [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.5, 1.0 + 2e-16, 0.0]]
+    mesh = Mesh(scale * np.array(needle + flat), [[0, 1, 2], [3, 4, 5]])
+    assert mesh.counts.zero_area == 1
+    assert mesh.areas[0] == pytest.approx(0.5e-13 * scale**2)
+
+
+def test_a_needle_of_extreme_lengths_raises_nothing_but_mesh_errors() -> None:
+    # Its area, 1/2, can be told; the squares of its sides cannot.
+    try:
+        mesh = Mesh([[0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]], TRIANGLES)
+    except MeshError:
+        return
+    assert mesh.area == pytest.approx(0.5)
+
+
+def test_lengths_whose_squares_overflow_are_refused_whatever_else_there_is() -> None:
+    vertices = [*VERTICES, [0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]]
+    count = len(VERTICES)
+    with pytest.raises(MeshError, match=r"squared lengths overflow .* 1e\+200; rescale it"):
+        Mesh(vertices, [*TRIANGLES, [count, count + 1, count + 2]])
+
+
+def test_areas_and_lengths_of_a_right_triangle() -> None:
+    mesh = Mesh(VERTICES, TRIANGLES)
+    assert mesh.areas.tolist() == [6.0]
+    assert mesh.area == 6.0
+    assert mesh.edge_lengths.tolist() == [[3.0, 5.0, 4.0]]
+    # The centroid is (1, 4/3, 0), the farthest corner (0, 4, 0).
+    assert mesh.centroid_radii == pytest.approx([np.hypot(1, 8 / 3)])
+
+
+def test_areas_and_lengths_of_solids() -> None:
+    assert box().area == BOX_AREA
+    assert sorted(box().areas) == [1.0] * 4 + [2.0] * 4 + [4.0] * 4
+    assert sorted(set(box().edge_lengths.ravel())) == pytest.approx([1, 2, np.sqrt(5), 4, np.sqrt(17), np.sqrt(20)])
+    assert tetrahedron().area == pytest.approx(TETRAHEDRON_AREA, rel=1e-15)
+    assert tetrahedron().areas == pytest.approx([0.5, 0.5, np.sqrt(3) / 2, 0.5], rel=1e-15)
+    slanted = tetrahedron().edge_lengths[2]
+    assert slanted == pytest.approx([np.sqrt(2)] * 3, rel=1e-15)
+    assert tetrahedron().centroid_radii[2] == pytest.approx(np.sqrt(2 / 3), rel=1e-15)
+
+
+@seeded
+@given(meshes())
+def test_areas_agree_with_the_formula_of_heron(mesh: Mesh) -> None:
+    sides = np.sort(mesh.edge_lengths.astype(np.longdouble), axis=1)
+    c, b, a = sides.T
+    # W. Kahan's arrangement, which is stable for needles.
+    product = (a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))
+    heron = 0.25 * np.sqrt(np.maximum(product, 0)).astype(np.float64)
+    assert mesh.areas == pytest.approx(heron, abs=1e-5)
+    assert mesh.area == pytest.approx(heron.sum(), abs=1e-4)
+
+
+def test_corners_are_the_triangles_vertices() -> None:
+    a, b, c = tetrahedron().corners()
+    assert a.tolist() == [TETRAHEDRON_VERTICES[t[0]].tolist() for t in TETRAHEDRON_TRIANGLES]
+    assert b.tolist() == [TETRAHEDRON_VERTICES[t[1]].tolist() for t in TETRAHEDRON_TRIANGLES]
+    assert c.tolist() == [TETRAHEDRON_VERTICES[t[2]].tolist() for t in TETRAHEDRON_TRIANGLES]
+    for part in (slice(1, 3), np.array([1, 2])):
+        assert [corner.tolist() for corner in tetrahedron().corners(part)] == [x[1:3].tolist() for x in (a, b, c)]
+
+
+@pytest.mark.parametrize("length", [1, 5, 12, 13])
+def test_measures_taken_slice_by_slice_are_the_same(monkeypatch: pytest.MonkeyPatch, length: int) -> None:
+    monkeypatch.setattr("sobolev_batch.surfaces.shapes.mesh._SLICE", length)
+    sliced = box()
+    monkeypatch.undo()
+    for name in ("areas", "edge_lengths", "centroid_radii"):
+        assert np.array_equal(getattr(sliced, name), getattr(box(), name))
+    assert sliced.counts == box().counts
+
+
+def test_bounds_are_those_of_the_vertices_in_use() -> None:
+    mesh = Mesh([[100.0, -100.0, 100.0], *VERTICES, [7.0, 7.0, 7.0]], [[3, 1, 2]])
+    lower, upper = mesh.bounds
+    assert lower.tolist() == [0.0, 0.0, 0.0]
+    assert upper.tolist() == [3.0, 4.0, 0.0]
+    assert mesh.used_vertices.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4", ">f4", "f2", "i1", "<u8", ">i4"])
+@pytest.mark.parametrize("index_dtype", ["<i8", ">i8", "<i4", "u1", "<u8"])
+def test_all_real_types_make_the_same_mesh(dtype: str, index_dtype: str) -> None:
+    mesh = Mesh(np.array(VERTICES, dtype=dtype), np.array(TRIANGLES, dtype=index_dtype))
+    assert mesh.vertices.dtype == np.float64
+    assert mesh.triangles.dtype == np.int64
+    assert mesh.vertices.tolist() == VERTICES
+    assert mesh.triangles.tolist() == TRIANGLES
+    assert mesh.digest == Mesh(VERTICES, TRIANGLES).digest
+
+
+def test_single_precision_is_widened_not_rounded_again() -> None:
+    third = np.float32(1 / 3)
+    mesh = Mesh(np.array(VERTICES, dtype=np.float32) * third, TRIANGLES)
+    assert mesh.vertices[1, 0] == float(np.float32(3) * third)
+
+
+def test_arrays_are_copies() -> None:
+    vertices, triangles = np.array(VERTICES), np.array(TRIANGLES)
+    mesh = Mesh(vertices, triangles)
+    vertices[:] = 7.0
+    triangles[:] = 0
+    assert mesh.vertices.tolist() == VERTICES
+    assert mesh.triangles.tolist() == TRIANGLES
+    assert vertices.flags.writeable
+    assert not np.shares_memory(mesh.vertices, vertices)
+
+
+def test_views_of_larger_arrays_do_not_leak_later_changes() -> None:
+    store = np.zeros((6, 3))
+    store[::2] = VERTICES
+    mesh = Mesh(store[::2], TRIANGLES)
+    store[:] = np.nan
+    assert mesh.vertices.tolist() == VERTICES
+
+
+@pytest.mark.parametrize("name", ["vertices", "triangles", "areas", "edge_lengths", "centroid_radii", "used_vertices"])
+def test_arrays_are_read_only(name: str) -> None:
+    mesh = tetrahedron()
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(mesh, name)[0] = 0
+
+
+def test_bounds_are_read_only() -> None:
+    for array in tetrahedron().bounds:
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+@pytest.mark.parametrize("name", ["vertices", "triangles", "anything"])
+def test_attributes_cannot_be_set(name: str) -> None:
+    with pytest.raises(FrozenInstanceError):
+        setattr(tetrahedron(), name, None)
+
+
+def test_a_mesh_says_how_large_it_is() -> None:
+    assert repr(tetrahedron()) == "Mesh(4 vertices, 4 triangles)"
+
+
+@seeded
+@given(meshes())
+def test_pickling_keeps_every_bit(mesh: Mesh) -> None:
+    for again in (pickle.loads(pickle.dumps(mesh)), copy.deepcopy(mesh), copy.copy(mesh)):
+        assert again.vertices.tobytes() == mesh.vertices.tobytes()
+        assert again.triangles.tobytes() == mesh.triangles.tobytes()
+        assert again.digest == mesh.digest
+        assert not again.vertices.flags.writeable
+        assert not again.triangles.flags.writeable
+
+
+def test_a_pickle_does_not_carry_what_can_be_computed() -> None:
+    mesh = box()
+    before = len(pickle.dumps(mesh))
+    assert (mesh.area, mesh.edge_lengths.shape, mesh.counts.duplicate) == (BOX_AREA, (12, 3), 0)
+    assert len(mesh.digest) == 64
+    assert len(pickle.dumps(mesh)) == before
+
+
+def test_the_digest_stays() -> None:
+    assert tetrahedron().digest == tetrahedron().digest
+    assert re.fullmatch("[0-9a-f]{64}", tetrahedron().digest)
+    columns = Mesh(np.asfortranarray(TETRAHEDRON_VERTICES), np.asfortranarray(TETRAHEDRON_TRIANGLES))
+    assert columns.digest == tetrahedron().digest
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles"),
+    [
+        (np.nextafter(TETRAHEDRON_VERTICES, 2), TETRAHEDRON_TRIANGLES),
+        (TETRAHEDRON_VERTICES[[1, 0, 2, 3]], TETRAHEDRON_TRIANGLES),
+        (TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES[::-1]),
+        (TETRAHEDRON_VERTICES, [[2, 1, 0], *TETRAHEDRON_TRIANGLES[1:]]),
+        (TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES[:3]),
+        ([*TETRAHEDRON_VERTICES.tolist(), [9.0, 9.0, 9.0]], TETRAHEDRON_TRIANGLES),
+    ],
+    ids=["one bit", "vertices swapped", "triangles reversed", "corners rotated", "one less", "unused vertex"],
+)
+def test_the_digest_changes_with_every_array(vertices: Any, triangles: Any) -> None:
+    assert Mesh(vertices, triangles).digest != tetrahedron().digest
+
+
+@seeded
+@given(meshes(), st.randoms(use_true_random=False))
+def test_the_order_of_vertices_and_triangles_does_not_matter(mesh: Mesh, random: Any) -> None:
+    order = list(range(len(mesh.vertices)))
+    random.shuffle(order)
+    place = np.argsort(order)
+    rows = list(range(len(mesh.triangles)))
+    random.shuffle(rows)
+    shuffled = Mesh(mesh.vertices[order], place[mesh.triangles][rows])
+    assert np.array_equal(shuffled.areas, mesh.areas[rows])
+    assert shuffled.area == pytest.approx(mesh.area, rel=1e-14)
+    assert shuffled.counts == mesh.counts
+    assert np.array_equal(shuffled.bounds, mesh.bounds)
+
+
+@seeded
+@given(meshes(), st.permutations([0, 1, 2]))
+def test_the_order_of_corners_does_not_matter(mesh: Mesh, order: list[int]) -> None:
+    turned = Mesh(mesh.vertices, mesh.triangles[:, order])
+    assert turned.areas == pytest.approx(mesh.areas, rel=1e-12, abs=1e-13)
+    assert np.sort(turned.edge_lengths, axis=1) == pytest.approx(np.sort(mesh.edge_lengths, axis=1), rel=1e-15)
+    assert (turned.counts.duplicate, turned.counts.boundary_edges) == (
+        mesh.counts.duplicate,
+        mesh.counts.boundary_edges,
+    )
+
+
+@seeded
+@given(meshes(), st.tuples(*[st.floats(-100, 100)] * 3), st.integers(0, 2**32 - 1))
+def test_rigid_motions_keep_areas_and_lengths(mesh: Mesh, shift: tuple[float, ...], seed: int) -> None:
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    moved = Mesh(mesh.vertices @ rotation + np.array(shift), mesh.triangles)
+    assert moved.areas == pytest.approx(mesh.areas, rel=1e-11, abs=1e-11)
+    assert moved.edge_lengths == pytest.approx(mesh.edge_lengths, rel=1e-12, abs=1e-12)
+    assert moved.centroid_radii == pytest.approx(mesh.centroid_radii, rel=1e-12, abs=1e-12)
+
+
+@seeded
+@given(meshes(), st.tuples(st.floats(0.05, 1), st.floats(0.05, 1), st.floats(0.05, 1)))
+def test_splitting_a_triangle_keeps_the_area(mesh: Mesh, weights: tuple[float, float, float]) -> None:
+    a, b, c = mesh.triangles[0]
+    inner = np.average(mesh.vertices[[a, b, c]], axis=0, weights=weights)
+    new = len(mesh.vertices)
+    triangles = np.concatenate([[[a, b, new], [b, c, new], [c, a, new]], mesh.triangles[1:]])
+    split = Mesh(np.vstack([mesh.vertices, inner]), triangles)
+    assert split.areas[:3].sum() == pytest.approx(mesh.areas[0], rel=1e-13)
+    assert split.area == pytest.approx(mesh.area, rel=1e-13)

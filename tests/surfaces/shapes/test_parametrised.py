@@ -1,0 +1,143 @@
+"""Surfaces of one's own: what they say of themselves, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sobolev_batch import InputError, Interval, ParametrisedSurface, Similarity, Torus
+from tests.support.smooth_shapes import (
+    HALF_TURN,
+    ROTATION,
+    TURN,
+    angular_ball,
+    ball,
+    ball_derivatives,
+    plate,
+    roof,
+    turned_torus,
+)
+
+
+@pytest.mark.parametrize("derivatives", [False, True])
+def test_a_sphere_in_its_angles(derivatives: bool) -> None:
+    surface = angular_ball(derivatives)
+    assert surface.area == pytest.approx(4 * math.pi, rel=1e-13)
+    lower, upper = surface.bounds
+    assert lower == pytest.approx(-np.ones(3), abs=1e-12)
+    assert upper == pytest.approx(np.ones(3), abs=1e-12)
+    assert Similarity.to_unit_ball(surface).scale == pytest.approx(1, rel=1e-12)
+
+
+def test_numbers_stand_for_constant_coordinates() -> None:
+    surface = ParametrisedSurface(plate, Interval(-1.0, 2.0), Interval(0.0, 0.5))
+    assert surface.area == pytest.approx(1.5, rel=1e-14)
+    lower, upper = surface.bounds
+    assert (lower.tolist(), upper.tolist()) == ([-1.0, 0.0, 0.0], [2.0, 0.5, 0.0])
+    center, radius = surface.bounding_sphere
+    assert center == (0.5, 0.25, 0.0)
+    assert radius == pytest.approx(math.hypot(1.5, 0.25), rel=1e-12)
+
+
+def test_extents_of_a_torus_that_lies_askew() -> None:
+    torus = Torus(1.0, 0.4)
+    surface = turned_torus(torus)
+    _, upper = surface.bounds
+    # Along an axis it reaches as far as the torus does along that axis turned back.
+    assert upper == pytest.approx(torus.highest_along(ROTATION), abs=1e-11)
+    assert surface.area == pytest.approx(torus.area, rel=1e-12)
+
+
+def test_similarities_follow_each_other() -> None:
+    surface = turned_torus(Torus(1.0, 0.4))
+    first, second = Similarity(2.0, (1.0, 2.0, 3.0)), Similarity(0.3, (-1.0, 0.5, 0.0))
+    moved = second.apply(first.apply(surface))
+    u, v = np.random.default_rng(8).uniform(0, 6, (2, 5))
+    once = 2.0 * (surface.positions(u, v) - np.reshape((1.0, 2.0, 3.0), (3, 1)))
+    twice = 0.3 * (once - np.reshape((-1.0, 0.5, 0.0), (3, 1)))
+    assert isinstance(moved, ParametrisedSurface)
+    assert moved.positions(u, v) == pytest.approx(twice, abs=1e-13)
+    assert moved.area == pytest.approx(0.36 * surface.area, rel=1e-12)
+    tangents = Similarity(2.0).apply(angular_ball(True)).tangents(u, v)  # type: ignore[union-attr]
+    assert tangents is not None
+    assert tangents[0] == pytest.approx(2 * np.stack(ball_derivatives(u, v)[0]), rel=1e-15)
+
+
+def test_surfaces_of_picklable_functions_are_picklable() -> None:
+    surface = Similarity(0.5, (1.0, 0.0, 0.0)).apply(turned_torus(Torus(1.0, 0.3)))
+    again = pickle.loads(pickle.dumps(surface))
+    u, v = np.random.default_rng(8).uniform(0, 6, (2, 5))
+    assert np.array_equal(again.positions(u, v), surface.positions(u, v))  # type: ignore[union-attr]
+    assert again.area == surface.area
+
+
+def test_a_period_that_does_not_close_is_refused() -> None:
+    half = Interval(0.0, math.pi, periodic=True)
+    with pytest.raises(
+        InputError, match=re.escape("periodic in v, but its positions at the ends 0 and 3.14159 are up to")
+    ):
+        ParametrisedSurface(ball, HALF_TURN, half)
+    with pytest.raises(InputError, match="periodic in u"):
+        ParametrisedSurface(ball, half, TURN)
+
+
+def test_wrong_derivatives_are_refused() -> None:
+    def of_another(u: Any, v: Any) -> Any:
+        along_u, along_v = ball_derivatives(u, v)
+        return along_u, tuple(1.1 * part for part in along_v)
+
+    with pytest.raises(
+        InputError, match=r"x_v is not the derivative of the position: differences of that are up to 0\.1 away"
+    ):
+        ParametrisedSurface(ball, HALF_TURN, TURN, of_another)
+    with pytest.raises(InputError, match="must return two vectors"):
+        ParametrisedSurface(ball, HALF_TURN, TURN, ball)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("position", "found"),
+    [
+        (lambda u, v: (u, v), "2 of "),
+        (lambda u, v: None, "NoneType"),
+        (lambda u, v: (u, v, 1j * u), "3 of "),
+        (lambda u, v: (u, v, np.zeros(5)), r"3 of .*\(5,\)"),
+        (lambda u, v: u, r"float64 \("),
+        (lambda u, v: (u, v, "height"), "3 of "),
+    ],
+)
+def test_positions_must_be_three_arrays(position: Any, found: str) -> None:
+    with pytest.raises(InputError, match=f"position must return three arrays of real numbers .* found {found}"):
+        ParametrisedSurface(position, Interval(0.0, 1.0), Interval(0.0, 1.0))
+
+
+def test_positions_must_be_finite() -> None:
+    side = Interval(0.0, 1.0)
+    with pytest.raises(InputError, match="position is not finite everywhere"):
+        ParametrisedSurface(lambda u, v: (np.where(u < 0.5, u, np.nan), v, 0.0), side, side)
+    with np.errstate(divide="ignore"), pytest.raises(InputError, match=r"not finite everywhere|not smooth"):
+        ParametrisedSurface(lambda u, v: (1 / u, v, 0.0), Interval(0.0, 1.0), Interval(0.0, 1.0))
+
+
+def test_a_surface_without_area_is_refused() -> None:
+    with pytest.raises(InputError, match="positive and finite, found 0"):
+        ParametrisedSurface(lambda u, v: (u, u, u), Interval(0.0, 1.0), Interval(0.0, 1.0))
+
+
+def test_an_area_that_does_not_settle_is_refused() -> None:
+    with pytest.raises(InputError, match="not smooth, or oscillates too fast"):
+        ParametrisedSurface(lambda u, v: (u, v, np.sin(1 / (u + 1e-5))), Interval(0.0, 1.0), Interval(0.0, 1.0))
+
+
+def test_intervals_and_similarities_are_checked() -> None:
+    ends: Any = (0.0, 1.0)
+    with pytest.raises(InputError, match=re.escape("v must run over an Interval, found (0.0, 1.0)")):
+        ParametrisedSurface(roof, HALF_TURN, ends)
+    with pytest.raises(InputError, match="scale must be positive"):
+        ParametrisedSurface(ball, HALF_TURN, TURN, scale=0.0)
+    with pytest.raises(InputError, match="origin must be three finite numbers"):
+        ParametrisedSurface(ball, HALF_TURN, TURN, origin=(0.0, math.inf, 0.0))

@@ -1,0 +1,140 @@
+"""The similarity transform of a study."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import re
+from dataclasses import FrozenInstanceError
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sobolev_batch import InputError, Mesh, Similarity, Sphere, icosphere
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, box, meshes, tetrahedron
+
+seeded = settings(derandomize=True, deadline=None, max_examples=60)
+
+shifts = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50))
+
+
+def largest_radius(mesh: Mesh) -> float:
+    used = mesh.vertices[np.unique(mesh.triangles)]
+    return float(np.linalg.norm(used, axis=1).max())
+
+
+def moved(mesh: Mesh, similarity: Similarity) -> Mesh:
+    result = similarity.apply(mesh)
+    assert isinstance(result, Mesh)
+    return result
+
+
+def test_the_map_is_scale_times_x_minus_origin() -> None:
+    mesh = moved(box(), Similarity(2.0, (1.0, 2.0, 4.0)))
+    assert mesh.vertices.tolist() == (2 * (BOX_VERTICES - [1, 2, 4])).tolist()
+    assert mesh.triangles.tolist() == BOX_TRIANGLES
+    assert mesh.area == 4 * 28.0
+    assert Similarity(2.0, (1.0, 2.0, 4.0)).apply(Sphere(3.0, (2.0, 2.0, 2.0))) == Sphere(6.0, (2.0, 0.0, -4.0))
+
+
+def test_the_identity_hands_the_surface_through() -> None:
+    mesh, sphere = box(), Sphere(2.0)
+    assert Similarity().is_identity
+    assert Similarity().apply(mesh) is mesh
+    assert Similarity().apply(sphere) is sphere
+    assert not Similarity(1.0, (0.0, 0.0, 1e-300)).is_identity
+    assert not Similarity(math.nextafter(1, 2)).is_identity
+
+
+def test_the_caller_s_mesh_stays() -> None:
+    mesh = box()
+    moved(mesh, Similarity(3.0, (1.0, 1.0, 1.0)))
+    assert mesh.vertices.tolist() == BOX_VERTICES.tolist()
+
+
+def test_the_box_goes_into_the_unit_ball() -> None:
+    similarity = Similarity.to_unit_ball(box())
+    assert similarity.origin == (0.5, 1.0, 2.0)
+    assert similarity.scale == pytest.approx(2 / math.sqrt(1 + 4 + 16), rel=1e-15)
+    mesh = moved(box(), similarity)
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(np.ones(8), rel=1e-15)
+
+
+def test_flat_meshes_have_a_bounding_sphere_too() -> None:
+    flat = Mesh([[2.0, 5.0, 7.0], [8.0, 5.0, 7.0], [2.0, 13.0, 7.0]], [[0, 1, 2]])
+    assert Similarity.to_unit_ball(flat) == Similarity(0.2, (5.0, 9.0, 7.0))
+
+
+def test_vertices_that_no_triangle_uses_do_not_count() -> None:
+    far = Mesh([*BOX_VERTICES.tolist(), [1000.0, 1000.0, 1000.0]], BOX_TRIANGLES)
+    assert Similarity.to_unit_ball(far) == Similarity.to_unit_ball(box())
+
+
+def test_the_center_is_that_of_the_bounding_box_not_of_the_vertices() -> None:
+    # Three corners of the tetrahedron pull its mean towards the origin, not its bounding box.
+    similarity = Similarity.to_unit_ball(tetrahedron())
+    assert similarity.origin == (0.5, 0.5, 0.5)
+    assert similarity.scale == pytest.approx(2 / math.sqrt(3), rel=1e-15)
+
+
+def test_a_sphere_becomes_the_unit_sphere() -> None:
+    sphere = Sphere(4.0, (1.0, -2.0, 3.0))
+    similarity = Similarity.to_unit_ball(sphere)
+    assert similarity == Similarity(0.25, (1.0, -2.0, 3.0))
+    assert similarity.apply(sphere) == Sphere()
+    assert Similarity.to_unit_ball(Sphere()).is_identity
+
+
+def test_a_mesh_of_a_sphere_goes_where_the_sphere_goes() -> None:
+    mesh = Mesh(4 * icosphere(2).vertices + [1.0, -2.0, 3.0], icosphere(2).triangles)
+    similarity = Similarity.to_unit_ball(mesh)
+    assert similarity.scale == pytest.approx(0.25, rel=1e-14)
+    assert similarity.origin == pytest.approx((1.0, -2.0, 3.0), rel=1e-14)
+
+
+@seeded
+@given(meshes())
+def test_every_mesh_touches_the_unit_sphere_from_inside(mesh: Mesh) -> None:
+    similarity = Similarity.to_unit_ball(mesh)
+    ball = moved(mesh, similarity)
+    assert largest_radius(ball) == pytest.approx(1, rel=1e-14)
+    assert ball.area == pytest.approx(similarity.scale**2 * mesh.area, rel=1e-12)
+    lower, upper = ball.bounds
+    assert lower + upper == pytest.approx(np.zeros(3), abs=1e-14)
+    assert type(similarity.scale) is float
+    assert [type(x) for x in similarity.origin] == [float] * 3
+
+
+@seeded
+@given(meshes(), st.floats(0.01, 100), shifts)
+def test_copies_in_other_places_and_sizes_end_up_alike(
+    mesh: Mesh, scale: float, origin: tuple[float, float, float]
+) -> None:
+    elsewhere = moved(mesh, Similarity(scale, origin))
+    here = moved(mesh, Similarity.to_unit_ball(mesh))
+    there = moved(elsewhere, Similarity.to_unit_ball(elsewhere))
+    used = np.unique(mesh.triangles)
+    assert there.vertices[used] == pytest.approx(here.vertices[used], abs=1e-11)
+
+
+@pytest.mark.parametrize("scale", [0, -1.0, math.nan, math.inf])
+def test_a_scale_must_be_positive_and_finite(scale: float) -> None:
+    with pytest.raises(InputError, match=re.escape(f"scale must be positive and finite, found {scale}")):
+        Similarity(scale)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (0.0,) * 4, (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf)])
+def test_an_origin_must_be_three_finite_numbers(origin: Any) -> None:
+    with pytest.raises(InputError, match=re.escape(f"origin must be three finite numbers, found {origin}")):
+        Similarity(1.0, origin)
+
+
+def test_similarities_are_values() -> None:
+    similarity: Any = Similarity(1 / 3, (0.1, 0.2, 0.3))
+    assert pickle.loads(pickle.dumps(similarity)) == similarity
+    assert len({similarity, Similarity(1 / 3, (0.1, 0.2, 0.3)), Similarity()}) == 2
+    with pytest.raises(FrozenInstanceError):
+        similarity.scale = 2.0

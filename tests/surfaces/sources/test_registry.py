@@ -1,0 +1,307 @@
+"""Sources in general: the registry, their parameters, and the promises of every member."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from sobolev_batch import MeshError, Sphere, StudyError, icosphere
+from sobolev_batch.surfaces.sources import registry as sources
+from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, sole_member
+from tests.support.members import BALL, listed, loaded, members
+from tests.support.mesh_files import off
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
+
+OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
+
+# The registry.
+
+
+class Cubes(Source):
+    """A source of another package."""
+
+    count: int
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        return tuple(sources.parse_source(BALL).members(folder) * self.count)
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An installed distribution that brings sources: one that works and some that do not."""
+    info = tmp_path / "cubes_for_tests-1.2.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: cubes-for-tests\nVersion: 1.2\n")
+    (info / "entry_points.txt").write_text(
+        "[sobolev_batch.sources]\n"
+        f"cubes = {__name__}:Cubes\n"
+        "absent-module = no_such_module_anywhere:Cubes\n"
+        f"absent-class = {__name__}:NoSuchClass\n"
+        f"function = {__name__}:members\n"
+        f"other-class = {__name__}:Path\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sources._registry.cache_clear()
+    yield
+    sources._registry.cache_clear()
+
+
+def test_all_sources_are_registered() -> None:
+    with pytest.raises(StudyError) as caught:
+        parse_source({"source": "nothing"})
+    assert str(caught.value) == (
+        "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, icosphere, "
+        "remesh, sphere, spherical-levels, torus, torus-grid"
+    )
+
+
+@pytest.mark.parametrize("name", [None, 3, ["icosphere"], "Icosphere", "", "icosphere "])
+def test_names_of_sources_must_be_exact(name: object) -> None:
+    with pytest.raises(StudyError, match=re.escape(f"no source is named {name!r}")):
+        parse_source({"source": name, "levels": [1]})
+
+
+def test_a_table_must_name_its_source() -> None:
+    with pytest.raises(StudyError, match="no source is named None"):
+        parse_source({"levels": [1]})
+
+
+def test_the_table_is_not_changed() -> None:
+    table = {"source": "icosphere", "levels": [1]}
+    parse_source(table)
+    assert table == {"source": "icosphere", "levels": [1]}
+
+
+@pytest.mark.usefixtures("plugin")
+def test_other_packages_add_sources() -> None:
+    assert listed(members({"source": "cubes", "count": 2})) == [("3", 3), ("3", 3)]
+    with pytest.raises(StudyError, match="known are absent-class, absent-module, cubes, decimate"):
+        parse_source({"source": "nothing"})
+    with pytest.raises(ValidationError, match="count"):
+        parse_source({"source": "cubes"})
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize("name", ["absent-module", "absent-class"])
+def test_sources_that_cannot_be_loaded_are_named(name: str) -> None:
+    with pytest.raises(StudyError, match=rf"the source '{name}' cannot be loaded: .*(no_such_module|NoSuchClass)"):
+        parse_source({"source": name})
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize(("name", "value"), [("function", "members"), ("other-class", "Path")])
+def test_entry_points_must_be_sources(name: str, value: str) -> None:
+    with pytest.raises(StudyError, match=f"source '{name}' is not a subclass of Source: {__name__}:{value}"):
+        parse_source({"source": name})
+
+
+# Parameters.
+
+PATHS = {"source": "files", "paths": ["a.ply"]}
+
+
+@pytest.mark.parametrize(
+    ("table", "place"),
+    [
+        ({"source": "icosphere"}, "levels"),
+        ({"source": "icosphere", "levels": []}, "levels"),
+        ({"source": "icosphere", "levels": 3}, "levels"),
+        ({"source": "icosphere", "levels": "3"}, "levels"),
+        ({"source": "icosphere", "levels": ["3"]}, "levels.0"),
+        ({"source": "icosphere", "levels": [1, True]}, "levels.1"),
+        ({"source": "icosphere", "levels": [1.0]}, "levels.0"),
+        ({"source": "icosphere", "levels": [None]}, "levels.0"),
+        ({"source": "icosphere", "levels": [-1]}, "levels.0"),
+        ({"source": "icosphere", "levels": [0, 13]}, "levels.1"),
+        ({"source": "icosphere", "levels": [1], "level": 1}, "level"),
+        ({"source": "sphere", "radius": "1"}, "radius"),
+        ({"source": "sphere", "radius": True}, "radius"),
+        ({"source": "sphere", "radius": 0}, "radius"),
+        ({"source": "sphere", "radius": -1.0}, "radius"),
+        ({"source": "sphere", "radius": float("nan")}, "radius"),
+        ({"source": "sphere", "radius": float("inf")}, "radius"),
+        ({"source": "sphere", "center": [0.0, 0.0]}, "center.2"),
+        ({"source": "sphere", "center": [0.0, 0.0, 0.0, 0.0]}, "center"),
+        ({"source": "sphere", "center": [0.0, "0", 0.0]}, "center.1"),
+        ({"source": "sphere", "center": [0.0, False, 0.0]}, "center.1"),
+        ({"source": "sphere", "center": [float("nan"), 0.0, 0.0]}, "center.0"),
+        ({"source": "sphere", "centre": [0.0, 0.0, 0.0]}, "centre"),
+        ({"source": "ellipsoid"}, "axes"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 0.0]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, float("inf")]}, "axes.2"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e200]}, ""),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 1.0], "levels": [1]}, "levels"),
+        ({"source": "ellipsoid-levels", "axes": [1.0, 1.0, 1.0]}, "levels"),
+        ({"source": "ellipsoid-levels", "axes": [1.0, 1.0, 1.0], "levels": [13]}, "levels.0"),
+        ({"source": "torus", "R": 1.0}, "r"),
+        ({"source": "torus", "R": 1.0, "r": "0.4"}, "r"),
+        ({"source": "torus", "R": 1.0, "r": 0.0}, "r"),
+        ({"source": "torus", "R": 1.0, "r": 1.0}, ""),
+        ({"source": "torus", "R": 1.0, "r": 0.4, "radius": 1.0}, "radius"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4}, "levels"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "around": 2}, "around"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "across": 6.0}, "across"),
+        ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [0, 12]}, ""),
+        ({"source": "files"}, "paths"),
+        ({"source": "files", "paths": []}, "paths"),
+        ({"source": "files", "paths": "a.ply"}, "paths"),
+        ({"source": "files", "paths": [""]}, "paths.0"),
+        ({"source": "files", "paths": [7]}, "paths.0"),
+        ({"source": "files", "paths": ["a.ply"], "distribution": 7}, "distribution"),
+        ({"source": "files", "paths": ["a.ply"], "path": "a.ply"}, "path"),
+        *[
+            ({"source": name, **parameters}, place)
+            for name in ("decimate", "remesh")
+            for parameters, place in (
+                ({"triangles": [80]}, "mesh"),
+                ({"mesh": BALL}, "triangles"),
+                ({"mesh": BALL, "triangles": []}, "triangles"),
+                ({"mesh": BALL, "triangles": 80}, "triangles"),
+                ({"mesh": BALL, "triangles": ["80"]}, "triangles.0"),
+                ({"mesh": BALL, "triangles": [True]}, "triangles.0"),
+                ({"mesh": BALL, "triangles": [80.0]}, "triangles.0"),
+                ({"mesh": BALL, "triangles": [80, 3]}, "triangles.1"),
+                ({"mesh": BALL, "triangles": [-80]}, "triangles.0"),
+                ({"mesh": BALL, "triangles": [80], "target": 80}, "target"),
+                ({"mesh": "a.ply", "triangles": [80]}, "mesh"),
+                ({"mesh": [BALL], "triangles": [80]}, "mesh"),
+                ({"mesh": {"source": "icosphere", "levels": ["1"]}, "triangles": [80]}, "mesh.levels.0"),
+            )
+        ],
+        ({"source": "spherical-levels", "mesh": BALL, "levels": [1]}, "sphere"),
+        ({"source": "spherical-levels", "sphere": BALL, "levels": [1]}, "mesh"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL}, "levels"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": []}, "levels"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [13]}, "levels.0"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": ["1"]}, "levels.0"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [True]}, "levels.0"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": "a.ply", "levels": [1]}, "sphere"),
+        ({"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [1], "level": 1}, "level"),
+    ],
+    ids=str,
+)
+def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], place: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        parse_source(table)
+    places = {".".join(map(str, error["loc"])) for error in caught.value.errors()}
+    # A list whose only entry is bad may be called empty besides.
+    assert place in places
+    assert places <= {place, place.rsplit(".", 1)[0]}
+
+
+@pytest.mark.parametrize("name", ["decimate", "remesh", "spherical-levels"])
+def test_nested_sources_must_exist(name: str) -> None:
+    with pytest.raises(StudyError, match="no source is named 'nothing'"):
+        parse_source({"source": name, "mesh": {"source": "nothing"}, "triangles": [80]})
+    with pytest.raises(StudyError, match="no source is named None"):
+        parse_source({"source": name, "mesh": {"paths": ["a.ply"]}, "triangles": [80]})
+
+
+def test_sources_are_frozen() -> None:
+    source: Any = parse_source(BALL)
+    with pytest.raises(ValidationError, match="frozen"):
+        source.levels = (1,)
+
+
+def test_a_dump_tells_everything_of_nested_sources() -> None:
+    table = {"source": "decimate", "mesh": {"source": "icosphere", "levels": [3]}, "triangles": [80, 20]}
+    assert json.loads(parse_source(table).model_dump_json()) == {"mesh": {"levels": [3]}, "triangles": [80, 20]}
+
+
+def test_a_sole_member_is_the_only_one() -> None:
+    assert sole_member(parse_source(BALL), Path()).name == "3"
+    many = parse_source({"source": "icosphere", "levels": list(range(8))})
+    with pytest.raises(StudyError, match=r"exactly one surface is needed here, but the source makes 8: 0, 1, 2, 3, 4$"):
+        sole_member(many, Path())
+
+
+# All sources.
+
+KINDS: dict[str, dict[str, Any]] = {
+    "icosphere": {"source": "icosphere", "levels": [1, 0]},
+    "sphere": {"source": "sphere", "radius": 2.0, "center": [1, 2, 3]},
+    "ellipsoid": {"source": "ellipsoid", "axes": [3, 2, 1], "center": [1, 2, 3]},
+    "ellipsoid-levels": {"source": "ellipsoid-levels", "axes": [3, 2, 1], "levels": [1, 0]},
+    "torus": {"source": "torus", "R": 2, "r": 0.5, "center": [1, 2, 3]},
+    "torus-grid": {"source": "torus-grid", "R": 2, "r": 0.5, "levels": [1, 0]},
+    "files": {"source": "files", "paths": ["box.off"]},
+    "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
+    "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
+    "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sources_and_members_survive_pickling(tmp_path: Path, kind: str) -> None:
+    if kind == "remesh":
+        pytest.importorskip("pyacvd", reason="remeshing needs the extra `studies`")
+    (tmp_path / "box.off").write_bytes(OFF_BOX)
+    source = parse_source(KINDS[kind])
+    assert pickle.loads(pickle.dumps(source)) == source
+    for member in source.members(tmp_path):
+        again = pickle.loads(pickle.dumps(member))
+        assert again == member
+        assert again.fingerprint() == member.fingerprint()
+        surface, other = member.load(), again.load()
+        assert getattr(surface, "digest", surface) == getattr(other, "digest", other)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fingerprints_are_json_and_tell_members_apart(tmp_path: Path, kind: str) -> None:
+    if kind == "remesh":
+        pytest.importorskip("pyacvd", reason="remeshing needs the extra `studies`")
+    (tmp_path / "box.off").write_bytes(OFF_BOX)
+    found = [dict(member.fingerprint()) for member in members(KINDS[kind], tmp_path)]
+    assert json.loads(json.dumps(found)) == found
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found)
+
+
+def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
+    (tmp_path / "box.off").write_bytes(OFF_BOX)
+    tables = [table for kind, table in KINDS.items() if kind != "remesh"]
+    found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 13
+
+
+@pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])
+def test_members_are_listed_without_being_made(tmp_path: Path, kind: str) -> None:
+    missing = {"source": "files", "paths": ["missing.ply"]}
+    table = {"source": kind, "mesh": missing, "triangles": [80]}
+    if kind == "spherical-levels":
+        table = {"source": kind, "mesh": missing, "sphere": missing, "levels": [1]}
+    (member,) = members(table, tmp_path)
+    assert member.name in ("80", "1")
+    with pytest.raises(MeshError, match=re.escape(f"{tmp_path / 'missing.ply'}: cannot be read")):
+        member.fingerprint()
+
+
+def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
+    found = members({"source": "icosphere", "levels": [3, 0, 10, 3, 2]})
+    assert listed(found) == [("0", 0), ("2", 2), ("3", 3), ("10", 10)]
+    assert loaded(found[1]).digest == icosphere(2).digest
+    assert found[1].fingerprint()["icosphere"] == 2
+
+
+def test_the_fingerprint_of_a_generated_mesh_names_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    (member,) = members(BALL)
+    before = dict(member.fingerprint())
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.generated.installed_version", lambda name: f"{name} 99")
+    assert "trimesh 99" in dict(member.fingerprint()).values()
+    assert member.fingerprint() != before
+
+
+def test_the_sphere_is_one_member() -> None:
+    (member,) = members({"source": "sphere"})
+    assert listed((member,)) == [("sphere", -1)]
+    assert member.load() == Sphere()
+    (member,) = members({"source": "sphere", "radius": 2, "center": [1, 2.5, -3]})
+    assert member.load() == Sphere(2.0, (1.0, 2.5, -3.0))
+    assert member.fingerprint() == {"sphere": [2.0, 1.0, 2.5, -3.0]}
