@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh, Sphere
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.quadrature.rules import gauss_rule
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
@@ -27,7 +27,7 @@ _UPSAMPLINGS = (2.0, 1.5)
 
 
 def whole_transform(
-    mesh: Mesh, lattice: Lattice, *, eps: float, precision: Precision, upsampling: float, threads: int
+    mesh: Mesh, lattice: Lattice, *, eps: float, dtype: ComplexDtype, upsampling: float, threads: int
 ) -> Complexes:
     """The transform of a mesh's area measure on the whole lattice, complex (M+1, M+1, M+1).
 
@@ -35,16 +35,16 @@ def whole_transform(
         mesh: in units of length.
         lattice: the frequencies.
         eps: accuracy of the NUFFT.
-        precision: of all of its arithmetic.
+        dtype: of all of its arithmetic.
         upsampling: of the NUFFT's fine grid.
         threads: of the NUFFT.
     """
-    real = np.float32 if precision == "complex64" else np.float64
+    real = np.float32 if dtype == "complex64" else np.float64
     barycentric = _RULE.barycentric.astype(real)
     corners = np.stack(mesh.corners()) * (2 * np.pi * lattice.spacing)
     # One contiguous row per axis, which is what the NUFFT reads without a copy.
     angles = [(barycentric @ corners[:, :, axis].astype(real)).ravel() for axis in range(3)]
-    strengths = np.outer(_RULE.weights, mesh.areas).ravel().astype(precision)
+    strengths = np.outer(_RULE.weights, mesh.areas).ravel().astype(dtype)
     values: Complexes = finufft.nufft3d1(
         *angles,
         strengths,
@@ -59,10 +59,10 @@ def whole_transform(
     return values
 
 
-def faster_upsampling(mesh: Mesh, lattice: Lattice, *, eps: float, precision: Precision, threads: int) -> float:
+def faster_upsampling(mesh: Mesh, lattice: Lattice, *, eps: float, dtype: ComplexDtype, threads: int) -> float:
     """The upsampling of the NUFFT's fine grid with which `whole_transform` takes less time here."""
     contestants = [
-        partial(whole_transform, lattice=lattice, eps=eps, precision=precision, upsampling=upsampling, threads=threads)
+        partial(whole_transform, lattice=lattice, eps=eps, dtype=dtype, upsampling=upsampling, threads=threads)
         for upsampling in _UPSAMPLINGS
     ]
     seconds = take_turns(contestants, lambda: mesh, repeats=1)

@@ -23,7 +23,7 @@ from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.spectral.shells import shell_weights
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 
 _WORKERS = 2
 _OVERHEAD = at_most(1.15)
@@ -161,7 +161,7 @@ def _parts(client: Client, paths: Sequence[Path], study: sb.Study) -> Parts:
     return Parts(*np.mean([astuple(parts) for parts in found], axis=0).tolist())
 
 
-def _measure_parts(paths: Sequence[Path], lattice: sb.Lattice, transform: Transform) -> Parts:
+def _measure_parts(paths: Sequence[Path], lattice: sb.Lattice, transform: TransformSettings) -> Parts:
     meshes: list[sb.Mesh] = []
     reading = elapsed_seconds(lambda: meshes.extend(sb.read_mesh(path) for path in paths))
 

@@ -13,14 +13,14 @@ from benchmarks.direct import direct_transform, frequencies_of
 from benchmarks.paper import Complexes, faster_upsampling, relative_distance, whole_transform
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 
 ORDER = -10.0
 XI_MAX = 5.0
-_EPS: dict[Precision, float] = {"complex128": 1e-9, "complex64": 1e-6}
+_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
 # The norm of the field's own error over the distance. What it does to the distance is less, and measured.
 _FIELD_ERROR = 6e-6
 _SPEED_UP = at_least(18)
@@ -36,7 +36,7 @@ class Case:
     Attributes:
         mesh: its caches may be filled.
         lattice: the frequencies.
-        precision: of both pipelines.
+        dtype: of both pipelines.
         threads: of both NUFFTs.
         upsampling: of the paper's.
         goal: what the package's field may err; both have the same eps.
@@ -44,18 +44,18 @@ class Case:
 
     mesh: sb.Mesh
     lattice: sb.Lattice
-    precision: Precision
+    dtype: ComplexDtype
     threads: int
     upsampling: float
     goal: Goal
 
     @classmethod
     @cache
-    def of(cls, level: int, intervals: int, effort: Effort, precision: Precision = "complex128") -> Case:
+    def of(cls, level: int, intervals: int, effort: Effort, dtype: ComplexDtype = "complex128") -> Case:
         """An icosphere on a lattice up to 5 cycles per unit length."""
         mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
-        upsampling = faster_upsampling(mesh, lattice, eps=_EPS[precision], precision=precision, threads=effort.threads)
-        return cls(mesh, lattice, precision, effort.threads, upsampling, goal_of_the_paper(mesh))
+        upsampling = faster_upsampling(mesh, lattice, eps=_EPS[dtype], dtype=dtype, threads=effort.threads)
+        return cls(mesh, lattice, dtype, effort.threads, upsampling, goal_of_the_paper(mesh))
 
     def fresh_mesh(self) -> sb.Mesh:
         """The mesh as `fresh` leaves it."""
@@ -63,8 +63,8 @@ class Case:
 
     def ours(self, mesh: sb.Mesh) -> Complexes:
         """The package's transform, on half the lattice."""
-        settings = settle(mesh, self.lattice, self.goal, Transform(precision=self.precision))
-        same_eps = replace(settings, eps=_EPS[self.precision])
+        settings = settle(mesh, self.lattice, self.goal, TransformSettings(dtype=self.dtype))
+        same_eps = replace(settings, eps=_EPS[self.dtype])
         return transform_block(mesh, self.lattice, self.lattice.half, same_eps, threads=self.threads).values
 
     def papers(self, mesh: sb.Mesh) -> Complexes:
@@ -72,8 +72,8 @@ class Case:
         return whole_transform(
             mesh,
             self.lattice,
-            eps=_EPS[self.precision],
-            precision=self.precision,
+            eps=_EPS[self.dtype],
+            dtype=self.dtype,
             upsampling=self.upsampling,
             threads=self.threads,
         )
@@ -97,10 +97,10 @@ def goal_of_the_paper(mesh: sb.Mesh) -> Goal:
     return Goal((ORDER,), (_FIELD_ERROR * distance,))
 
 
-def settings_of_the_paper(mesh: sb.Mesh, lattice: sb.Lattice, precision: Precision) -> Transform:
+def settings_of_the_paper(mesh: sb.Mesh, lattice: sb.Lattice, dtype: ComplexDtype) -> TransformSettings:
     """The settings that items 1 and 3 arrive at for a mesh."""
-    settings = settle(mesh, lattice, goal_of_the_paper(mesh), Transform(precision=precision))
-    return replace(settings, eps=_EPS[precision])
+    settings = settle(mesh, lattice, goal_of_the_paper(mesh), TransformSettings(dtype=dtype))
+    return replace(settings, eps=_EPS[dtype])
 
 
 def fresh(mesh: sb.Mesh) -> sb.Mesh:
@@ -110,7 +110,7 @@ def fresh(mesh: sb.Mesh) -> sb.Mesh:
 
 def our_transform(mesh: sb.Mesh, lattice: sb.Lattice, threads: int) -> Complexes:
     """The package's transform on half the lattice, with its default settings."""
-    return transform_block(mesh, lattice, lattice.half, Transform(), threads=threads).values
+    return transform_block(mesh, lattice, lattice.half, TransformSettings(), threads=threads).values
 
 
 def against_the_paper(effort: Effort) -> Iterator[Row]:
@@ -178,13 +178,13 @@ def growth(effort: Effort) -> Iterator[Row]:
     )
 
 
-def _speed_up_and_distance(item: str, precision: Precision, effort: Effort) -> Iterator[Row]:
+def _speed_up_and_distance(item: str, dtype: ComplexDtype, effort: Effort) -> Iterator[Row]:
     level, intervals = (4, 32) if effort.quick else (7, 128)
-    case = Case.of(level, intervals, effort, precision)
+    case = Case.of(level, intervals, effort, dtype)
     ours, papers = case.times(effort.repeats)
-    what = f"T_{level}, M = {intervals}, {precision}"
+    what = f"T_{level}, M = {intervals}, {dtype}"
     # Single precision holds six digits of a field, hence about one of so small a distance.
-    double = precision == "complex128"
+    double = dtype == "complex128"
     speed_up, target = (_SPEED_UP, _SAME_DISTANCE) if double else (None, None)
     yield Row(item, f"{what}: transform", as_seconds(ours), as_seconds(papers), papers / ours, speed_up)
     near, far = case.distances()

@@ -90,7 +90,7 @@ def test_what_is_looked_for_is_found(source: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["os:system", "os.system", "sobolev_batch.surfaces.sources.files:Files", "../files", "builtins"]
+    "name", ["os:system", "os.system", "sobolev_batch.surfaces.sources.files:FileSource", "../files", "builtins"]
 )
 def test_sources_are_looked_up_among_entry_points_alone(name: str) -> None:
     with pytest.raises(StudyError, match="no source is named"):

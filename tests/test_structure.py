@@ -1,30 +1,82 @@
-"""The rooms of the package know of each other in one direction only."""
+"""Imports of the package run one way, between its folders and within them."""
 
 from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
 import sobolev_batch
 from tests.support.repository import PACKAGE, imported
 
-ROOMS = ("surfaces", "spectral", "batch", "results")
+# Each may import those before it.
+LAYERS = ("errors", "surfaces", "spectral", "batch", "results", "cli")
+MOST_NAMES_OF_A_FOLDER = 13
+
+Path = tuple[str, ...]
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_dependencies_point_one_way(room: str) -> None:
-    later = ROOMS[ROOMS.index(room) + 1 :]
-    paths = list((PACKAGE / room).glob("*.py"))
-    assert len(paths) > 2
-    for path in paths:
-        for name in imported(path):
-            assert not name.startswith(tuple(f"sobolev_batch.{other}" for other in (*later, "cli"))), path
+def modules() -> dict[str, Path]:
+    """The modules of the package by their dotted names, as paths from its root."""
+    found = {}
+    for file in PACKAGE.rglob("*.py"):
+        parts = file.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(["sobolev_batch", *(part for part in parts if part != "__init__")])] = parts
+    return found
 
 
-@pytest.mark.parametrize("room", ["surfaces", "spectral"])
-def test_numbers_know_neither_dask_nor_zarr(room: str) -> None:
-    for path in (PACKAGE / room).glob("*.py"):
-        tops = {name.split(".")[0] for name in imported(path)}
-        assert not tops & {"dask", "distributed", "zarr"}, path
+def imports_of(parts: Path, known: dict[str, Path]) -> Iterator[Path]:
+    """The modules that a module imports, inside of functions too."""
+    for node in ast.walk(ast.parse((PACKAGE.joinpath(*parts)).with_suffix(".py").read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                if (name if name in known else node.module) in known:
+                    yield known[name if name in known else str(node.module)]
+
+
+@pytest.fixture(scope="module")
+def arrows() -> list[tuple[Path, Path]]:
+    """Each import of one module by another. The package's own door opens onto everything."""
+    known = modules()
+    found = [(parts, other) for parts in known.values() for other in imports_of(parts, known) if parts != other]
+    found = [(one, other) for one, other in found if one[0] not in ("__init__", "__main__")]
+    assert len(found) > 300
+    return found
+
+
+def test_layers_know_only_those_below(arrows: list[tuple[Path, Path]]) -> None:
+    backwards = [(a, b) for a, b in arrows if LAYERS.index(a[0]) < LAYERS.index(b[0])]
+    assert not backwards
+
+
+def test_no_folder_and_no_module_is_in_a_circle(arrows: list[tuple[Path, Path]]) -> None:
+    # At every depth: the folders of a folder, and the modules in the innermost ones.
+    for depth in range(1, max(len(a) for a, _ in arrows) + 1):
+        graph: dict[Path, set[Path]] = {}
+        for a, b in arrows:
+            if a[:depth] != b[:depth]:
+                graph.setdefault(a[:depth], set()).add(b[:depth])
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            pytest.fail(" -> ".join("/".join(parts) for parts in error.args[1]))
+
+
+def test_every_folder_can_be_taken_in_at_a_glance() -> None:
+    for folder in {PACKAGE, *(file.parent for file in PACKAGE.rglob("*.py"))}:
+        names = [path for path in folder.iterdir() if not path.name.startswith("_") and path.suffix in ("", ".py")]
+        assert len(names) <= MOST_NAMES_OF_A_FOLDER, folder
+
+
+@pytest.mark.parametrize("layer", ["surfaces", "spectral"])
+def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
+    files = list((PACKAGE / layer).rglob("*.py"))
+    assert len(files) > 20
+    for file in files:
+        assert not {name.split(".")[0] for name in imported(file)} & {"dask", "distributed", "zarr"}, file
 
 
 def test_every_public_name_is_documented() -> None:

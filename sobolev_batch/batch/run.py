@@ -18,21 +18,21 @@ from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_reach
 from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
-from sobolev_batch.batch.cluster.workers import Crew
+from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, claimed
 from sobolev_batch.batch.store.create import prepare_store, require_place
-from sobolev_batch.batch.store.heartbeat import Journal
+from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.batch.study.lattice_choice import Choice
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.errors import DamageError
-from sobolev_batch.spectral.errors.budget import Assessed
+from sobolev_batch.spectral.errors.budget import NormEstimate
 
 _log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ def carry_out(
     work = _Work.of(location, plan)
     computed: set[int] = set()
     not_compared: dict[str, str] = {}
-    with Journal(work.store, claim) as journal:
+    with Heartbeat(work.store, claim) as journal:
         missing = work.missing()
         if missing or not work.is_tabulated or not work.comparer.is_done:
             with cluster as client:
@@ -220,17 +220,17 @@ class _Work:
             )
 
     def settle(
-        self, client: Client, crew: Crew, missing: Sequence[int], notify: Notify
-    ) -> tuple[set[int], Assessed | None]:
+        self, client: Client, crew: Workers, missing: Sequence[int], notify: Notify
+    ) -> tuple[set[int], NormEstimate | None]:
         """Compute fields and tables, and again what turns out damaged; these rows, and distances if they are new."""
 
-        def attempt(missing: Sequence[int]) -> Assessed | None:
+        def attempt(missing: Sequence[int]) -> NormEstimate | None:
             compute_fields(client, crew, self.store, self.plan, self.rows, missing, self.records, notify)
             return tabulate_fields(client, crew, self.store, self.plan, self.rows, self.records, notify)
 
         return self._repairing(client, missing, attempt)
 
-    def compare(self, client: Client, crew: Crew, notify: Notify) -> tuple[set[int], dict[str, str]]:
+    def compare(self, client: Client, crew: Workers, notify: Notify) -> tuple[set[int], dict[str, str]]:
         """Make the comparisons that are asked for; rows whose fields turned out damaged, and why meshes are without."""
 
         def attempt(damaged: Sequence[int]) -> dict[str, str]:
@@ -291,10 +291,10 @@ def rows_of(store: Store, plan: Plan) -> tuple[Row, ...]:
     return tuple(by_label[label] for label in store.labels())
 
 
-def _grown(plan: Plan, found: Assessed | None) -> Choice | None:
+def _grown(plan: Plan, found: NormEstimate | None) -> LatticeChoice | None:
     """A larger lattice where distances to the reference fall short of the accuracy that is asked for."""
     if plan.study.accuracy is None or found is None:
         return None
     known = ~np.isnan(found.values).any(axis=0)
-    complete = Assessed(*(part[:, known] for part in found))
+    complete = NormEstimate(*(part[:, known] for part in found))
     return plan.choice.grown(complete, plan.study.orders, plan.study.accuracy)

@@ -19,7 +19,7 @@ from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take
 from sobolev_batch.batch.store.create import prepare_store, require_place
-from sobolev_batch.batch.store.heartbeat import Journal
+from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study
@@ -78,7 +78,7 @@ def _hand_over(study: Study, location: Location, claim: Claim, client: Client) -
     enlist(client, study.libraries).with_backend(study.backend)
     place = prepare_store(location, plan)
     missing = rows_without_field(place.records(), rows_of(place, plan))
-    journal = Journal(place, claim)
+    journal = Heartbeat(place, claim)
     journal.cluster = client.scheduler.address
     journal.write("submitted")
     key = f"sobolev-batch-drive-{uuid4().hex}"
@@ -117,7 +117,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         # study is missing on this machine.
         with suppress(StoreError):  # it may be what failed
             if claim.is_on(location):
-                Journal(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
+                Heartbeat(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
     give_up(location, claim)
 
 

@@ -14,7 +14,7 @@ from sobolev_batch.batch.cluster.clients import available_cores
 from sobolev_batch.batch.cluster.outcomes import outcomes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, give_up, take
-from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Notes
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
@@ -125,7 +125,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
             store.write_record(row, None)
         for kind, rows in notes.items():
             for row in rows:
-                Notes(store, kind).write(row, None)
+                ComparisonRecords(store, kind).write(row, None)
     fields = {labels[row]: damaged[row] for row in sorted(damaged)}
     comparisons = {labels[row]: what for rows in notes.values() for row, what in sorted(rows.items())}
     return Verification(store.path, len(complete), len(labels), fields, comparisons, tables, withdraw)
@@ -137,7 +137,7 @@ def _complete(records: Sequence[Record | None]) -> dict[int, Record]:
 
 def _damaged_notes(store: Store, kind: Kind, complete: Mapping[int, Record]) -> dict[int, str]:
     """What is wrong with the comparison of each row, of one kind."""
-    found = Notes(store, kind)
+    found = ComparisonRecords(store, kind)
     damaged = {row: f"the note of its {kind} is damaged ({what})" for row, what in found.damaged().items()}
     # Those that readers do not find are still to be made.
     if kind == "witness" and Witnesses(store).are_listed():

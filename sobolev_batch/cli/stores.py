@@ -31,7 +31,11 @@ _study_folder = click.option(
     help="Where relative paths in the study start, by which meshes are made again. [default: here]",
 )
 _up = click.option(
-    "--up", type=click.Choice(["x", "y", "z"]), default="z", show_default=True, help="The meshes' axis that points up."
+    "--up",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="The meshes' axis that points up.",
 )
 
 

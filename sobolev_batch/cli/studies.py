@@ -10,7 +10,7 @@ import click
 
 from sobolev_batch.batch.cluster.clients import available_cores, remote_client
 from sobolev_batch.batch.cluster.worker_plugin import enlist
-from sobolev_batch.batch.cluster.workers import Crew
+from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.sizing import lay_out_rows
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.storage.location import Location
@@ -101,7 +101,7 @@ def plan_command(study: Path, store: Location | None, scheduler: str | None, tru
         with remote_client(scheduler, trust_network) as client:
             crew = enlist(client, parsed.libraries)
     else:
-        crew = Crew.of_this_machine(available_cores())
+        crew = Workers.of_this_machine(available_cores())
     for name, value in _plan_lines(plan, place, crew):
         click.echo(f"{name + ':':<14} {value}")
 
@@ -114,7 +114,7 @@ def _default_place(study: Study) -> Location:
     return location
 
 
-def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, str]]:
+def _plan_lines(plan: Plan, place: Location, crew: Workers) -> Iterator[tuple[str, str]]:
     study, lattice, transform = plan.study, plan.lattice, plan.transform
     origin = " ".join(f"{x:.9g}" for x in plan.similarity.origin)
     yield "study", study.title
@@ -133,11 +133,11 @@ def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, 
         yield "accuracy", f"rtol {study.accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
         for reason in plan.choice.reasons:
             yield "chosen", reason
-        yield "transform", f"{transform.precision}, eps and quadrature for each surface from its distance"
+        yield "transform", f"{transform.dtype}, eps and quadrature for each surface from its distance"
     else:
         yield (
             "transform",
-            f"eps {transform.accuracy:g}, {transform.precision}, quadrature {transform.quadrature.method}",
+            f"eps {transform.accuracy:g}, {transform.dtype}, quadrature {transform.quadrature.method}",
         )
     yield "backend", study.backend
     if study.witness:
@@ -151,7 +151,7 @@ def _plan_lines(plan: Plan, place: Location, crew: Crew) -> Iterator[tuple[str, 
     yield "store", f"{place}, {done} of {len(plan.rows)} already there"
 
 
-def _task_lines(plan: Plan, crew: Crew) -> Iterator[tuple[str, str]]:
+def _task_lines(plan: Plan, crew: Workers) -> Iterator[tuple[str, str]]:
     gpus = sum(member.backend == "gpu" for member in crew.members)
     yield (
         "workers",

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.comparison_records import KINDS, Notes, shortcomings
+from sobolev_batch.batch.storage.timestamps import age_seconds
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, shortcomings
 from sobolev_batch.batch.store.heartbeat import PATIENCE_SECONDS
-from sobolev_batch.batch.store.records import RunRecord, age_seconds
+from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 
@@ -51,7 +52,7 @@ class Status:
         store = Store.open(place)
         labels, records, run = store.labels(), store.records(), store.read_run()
         # Where a study asks for none, nothing is looked for.
-        asked = (Notes(store, kind) for kind in KINDS)
+        asked = (ComparisonRecords(store, kind) for kind in KINDS)
         notes = {each.kind: each.read() for each in asked if each.name in store.documents}
         complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
         return cls(

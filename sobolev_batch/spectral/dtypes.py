@@ -7,10 +7,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Precision = Literal["complex128", "complex64"]
+ComplexDtype = Literal["complex128", "complex64"]
 Complexes = NDArray[np.complexfloating[Any, Any]]
 
 
-def item_bytes(precision: Precision) -> int:
+def item_bytes(dtype: ComplexDtype) -> int:
     """Bytes of one sample of a field."""
-    return 16 if precision == "complex128" else 8
+    return 16 if dtype == "complex128" else 8

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.backends.backends import CPU, Backend, backend_named
-from sobolev_batch.spectral.dtypes import Complexes, Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
 from sobolev_batch.spectral.errors.probe import measure
 from sobolev_batch.spectral.errors.quality import Quality
@@ -19,7 +19,7 @@ from sobolev_batch.spectral.errors.samples import Sample, needs_probe, probe_blo
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
@@ -44,7 +44,7 @@ class Field:
 
     values: Complexes
     quality: Quality
-    settings: Transform
+    settings: TransformSettings
     points: int
     backend: str
 
@@ -54,7 +54,7 @@ def fourier_transform(
     lattice: Lattice,
     eps: float | None = None,
     *,
-    dtype: Precision = "complex128",
+    dtype: ComplexDtype = "complex128",
     quadrature: str | int = "auto",
     backend: Literal["cpu", "gpu", "auto"] = "cpu",
     threads: int | None = None,
@@ -88,7 +88,7 @@ def fourier_transform(
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
     """
-    settings = Transform(eps, dtype, Quadrature(quadrature))
+    settings = TransformSettings(eps, dtype, Quadrature(quadrature))
     field = compute_field(
         surface,
         lattice,
@@ -111,7 +111,7 @@ def fourier_transform(
 def compute_field(
     surface: Surface,
     lattice: Lattice,
-    settings: Transform,
+    settings: TransformSettings,
     orders: Sequence[float],
     *,
     sample: Sample | None = None,
@@ -152,7 +152,7 @@ def field_for(
     surface: Surface,
     lattice: Lattice,
     goal: Goal,
-    transform: Transform,
+    transform: TransformSettings,
     *,
     sample: Sample | None = None,
     extent: Quality | None = None,

@@ -12,12 +12,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Sphere, icosphere
-from sobolev_batch.spectral.errors.budget import support_widths
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.surfaces.shapes.extent import support_widths
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.sources.decimation import DecimatedMember
-from sobolev_batch.surfaces.sources.files import Files
+from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -214,7 +214,7 @@ def _cortex_and_sphere(rng: np.random.Generator) -> Pair:
 @lru_cache
 def cortex(triangles: int) -> Mesh:
     """The cortical surface in so many triangles, within the unit ball."""
-    (original,) = Files(paths=(_CORTEX,), distribution="nilearn").members(Path())
+    (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
     loaded = DecimatedMember("cortex", 0, original, triangles).load()
     mesh = Similarity.to_unit_ball(loaded).apply(loaded)
     assert isinstance(mesh, Mesh)

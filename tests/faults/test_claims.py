@@ -17,7 +17,7 @@ import pytest
 from sobolev_batch import ClaimError, Study, release, run
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM, Claim, claimed, take
-from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 from tests.support.commands import command, write_toml
 
@@ -127,7 +127,7 @@ import sys
 import threading
 from sobolev_batch.batch.storage.lock import Claim, take
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 take(Location.of(sys.argv[1]), Claim.of_this_process())
 print("taken", flush=True)
@@ -212,7 +212,7 @@ import resource, signal, sys
 from sobolev_batch import StoreError
 from sobolev_batch.batch.storage.lock import Claim, take
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))

@@ -15,7 +15,7 @@ import psutil
 
 
 @dataclass(frozen=True)
-class Plan:
+class HavocPlan:
     """After how many requests to the storage each kill comes, in order.
 
     Attributes:
@@ -26,7 +26,7 @@ class Plan:
     drivers: tuple[int, ...]
 
     @classmethod
-    def of(cls, seed: int, requests: range, workers: int, drivers: int) -> Plan:
+    def of(cls, seed: int, requests: range, workers: int, drivers: int) -> HavocPlan:
         """Some kills, at random among these requests."""
         chosen = random.Random(seed).sample(requests, workers + drivers)
         return cls(tuple(sorted(chosen[:workers])), tuple(sorted(chosen[workers:])))
@@ -43,7 +43,7 @@ class Havoc:
         workers, drivers: killed so far.
     """
 
-    def __init__(self, plan: Plan, seed: int, workers: Callable[[], list[int]], known: Callable[[], int]) -> None:
+    def __init__(self, plan: HavocPlan, seed: int, workers: Callable[[], list[int]], known: Callable[[], int]) -> None:
         """Take up a plan.
 
         Args:

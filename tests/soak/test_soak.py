@@ -9,7 +9,7 @@ import pytest
 
 from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
-from tests.soak.havoc import Plan
+from tests.soak.havoc import HavocPlan
 from tests.soak.trial import Outcome, soak
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
@@ -50,7 +50,7 @@ def test_what_is_lost_would_be_noticed(outcome: Outcome, folder: Path) -> None:
 
 
 def test_kills_depend_on_the_seed_alone() -> None:
-    plan = Plan.of(3, range(100, 1000), 5, 2)
-    assert plan == Plan.of(3, range(100, 1000), 5, 2) != Plan.of(4, range(100, 1000), 5, 2)
+    plan = HavocPlan.of(3, range(100, 1000), 5, 2)
+    assert plan == HavocPlan.of(3, range(100, 1000), 5, 2) != HavocPlan.of(4, range(100, 1000), 5, 2)
     assert (len(plan.workers), len(plan.drivers)) == (5, 2)
     assert set(plan.workers + plan.drivers) <= set(range(100, 1000))

@@ -14,7 +14,7 @@ from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
-from tests.soak.havoc import Havoc, Plan
+from tests.soak.havoc import Havoc, HavocPlan
 from tests.soak.meshes import write_study
 from tests.support.failing_storage import HEALTHY, FailingStorage, Kind, Rule, failing
 from tests.support.object_storage import BUCKET, serving, taken_for_s3
@@ -55,7 +55,7 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
     soaked = Location.of(f"s3://{BUCKET}/soaked.zarr")
     # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
     # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
-    plan = Plan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)
+    plan = HavocPlan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)
     with serving() as server, failing(server, seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
         with local_client(_WORKERS) as client:
             started = time.monotonic()

@@ -18,9 +18,9 @@ from sobolev_batch.batch.analysis.compare_tasks import Comparison, Stored, compa
 from sobolev_batch.batch.cluster.execution import deal, many_in_flight
 from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.workers import MEMORY, Crew
+from sobolev_batch.batch.cluster.workers import MEMORY, Workers
 from sobolev_batch.batch.fields.sizing import LEAST_ROOM_BYTES, MESH_BYTES
-from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes, shortcomings
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, ComparisonRecords, Kind, shortcomings
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
@@ -78,13 +78,13 @@ class Comparer:
             return True
         # Of this store some nodes may be known that the root does not list.
         listed = Store.open(self.store.location)
-        notes = {kind: Notes(self.store, kind).read() for kind in self.kinds}
+        notes = {kind: ComparisonRecords(self.store, kind).read() for kind in self.kinds}
         return not any(self._left(kind, notes[kind]) for kind in self.kinds) and all(
             Witnesses(listed).are_listed() if kind == "witness" else self._is_tabulated(listed, notes[kind])
             for kind in self.kinds
         )
 
-    def carry_out(self, client: Client, crew: Crew, notify: Notify) -> dict[str, str]:
+    def carry_out(self, client: Client, crew: Workers, notify: Notify) -> dict[str, str]:
         """Make the comparisons that the store lacks, and have readers find all.
 
         Returns:
@@ -103,18 +103,18 @@ class Comparer:
             del self.store.documents[name]
         self.store.consolidate()
         for kind in left_over:
-            Notes(self.store, kind).remove()
+            ComparisonRecords(self.store, kind).remove()
             self.store.remove(kind)
         left = {}
         for kind in self.kinds:
             self._lay_out(kind)
-            notes = Notes(self.store, kind).read()
+            notes = ComparisonRecords(self.store, kind).read()
             left[kind] = self._left(kind, notes)
             # Those of others speak for nothing; those that are to be replaced would speak for the values of another
             # mesh, were that mesh to come back after an end in the middle.
             kept = set(self._wanted) - set(left[kind])
             for i in [i for i, note in enumerate(notes) if note is not None and i not in kept]:
-                Notes(self.store, kind).write(i, None)
+                ComparisonRecords(self.store, kind).write(i, None)
         total, done = sum(map(len, left.values())), 0
 
         def conclude(i: int) -> None:
@@ -127,7 +127,7 @@ class Comparer:
         for kind, rows in left.items():
             if rows:
                 self._make(kind, rows, client, crew, conclude)
-        found = {kind: Notes(self.store, kind).read() for kind in self.kinds}
+        found = {kind: ComparisonRecords(self.store, kind).read() for kind in self.kinds}
         if "witness" in found:
             notes = found["witness"]
             # A task that outlives the run which submitted it may have written others.
@@ -151,7 +151,7 @@ class Comparer:
             return ()
         return tuple(i for i, record in self.complete.items() if i != self.reference and record.facts.triangles)
 
-    def _left(self, kind: Kind, notes: Sequence[Note | None]) -> list[int]:
+    def _left(self, kind: Kind, notes: Sequence[ComparisonRecord | None]) -> list[int]:
         """The meshes whose comparison is to be made, given the notes that there are."""
         left = {i for i in self._wanted if (note := notes[i]) is None or not note.completes(self._key(kind, i))}
         if kind == "witness" and len(left) < len(self._wanted):
@@ -179,18 +179,18 @@ class Comparer:
         elif not self.store.has(PROXIMITY):
             # Before the notes: what is not asked for any more is found by its group.
             Tables(self.store).write(PROXIMITY, self._proximity_dataset([None] * len(self.rows)))
-        Notes(self.store, kind).lay_out(len(self.rows))
+        ComparisonRecords(self.store, kind).lay_out(len(self.rows))
 
     def _make(
-        self, kind: Kind, left: Sequence[int], client: Client, crew: Crew, conclude: Callable[[int], None]
+        self, kind: Kind, left: Sequence[int], client: Client, crew: Workers, conclude: Callable[[int], None]
     ) -> None:
-        notes = Notes(self.store, kind)
+        notes = ComparisonRecords(self.store, kind)
         needed = {i: self._needed_bytes(kind, i) for i in left}
         claims = any(count > crew.share_bytes for count in needed.values())
 
         def give_up(i: int, reason: str) -> None:
             _log.error("%s: %s: %s", self.rows[i].label, kind, reason)
-            notes.write(i, Note(self._key(kind, i), "failed", reason))
+            notes.write(i, ComparisonRecord(self._key(kind, i), "failed", reason))
             conclude(i)
 
         def submit(i: int, rank: int) -> Future:
@@ -210,12 +210,14 @@ class Comparer:
         for i, outcome in deal(client, submit, todo, many_in_flight(crew)):
             if isinstance(outcome, StoreError):
                 raise outcome
-            if isinstance(outcome, Note):
+            if isinstance(outcome, ComparisonRecord):
                 conclude(i)
             else:
                 give_up(i, DEADLY.format(outcome) if is_suspect(outcome) else f"{type(outcome).__name__}: {outcome}")
 
-    def _task(self, kind: Kind, crew: Crew, needed: float) -> tuple[Callable[..., Note], tuple[Any, ...]]:
+    def _task(
+        self, kind: Kind, crew: Workers, needed: float
+    ) -> tuple[Callable[..., ComparisonRecord], tuple[Any, ...]]:
         """What is to be called besides the comparison itself."""
         plan = self.plan
         if kind == "witness":
@@ -247,7 +249,7 @@ class Comparer:
         drawn = 2 * POINT_BYTES * (self.plan.study.proximity or 0)
         return making(i) + making(self.reference) + TRIANGLE_BYTES * triangles + drawn
 
-    def _proximity_dataset(self, notes: Sequence[Note | None]) -> xr.Dataset:
+    def _proximity_dataset(self, notes: Sequence[ComparisonRecord | None]) -> xr.Dataset:
         """`hausdorff`, `chamfer` and `chamfer_error` (mesh), NaN where there is no comparison, and why."""
         notes = self._current(notes)
         units = {"units": "unit length"}
@@ -266,7 +268,7 @@ class Comparer:
             },
         )
 
-    def _current(self, notes: Sequence[Note | None]) -> list[Note | None]:
+    def _current(self, notes: Sequence[ComparisonRecord | None]) -> list[ComparisonRecord | None]:
         """The notes of proximities that are those of the meshes and points that there are."""
         wanted = set(self._wanted)
         return [
@@ -274,12 +276,12 @@ class Comparer:
             for i, note in enumerate(notes)
         ]
 
-    def _proximity_digest(self, notes: Sequence[Note | None]) -> str:
+    def _proximity_digest(self, notes: Sequence[ComparisonRecord | None]) -> str:
         lines = [None if note is None else note.to_json() for note in notes]
         labels = [row.label for row in self.rows]
         return hashlib.sha256(json.dumps([labels, lines]).encode()).hexdigest()
 
-    def _is_tabulated(self, store: Store, notes: Sequence[Note | None]) -> bool:
+    def _is_tabulated(self, store: Store, notes: Sequence[ComparisonRecord | None]) -> bool:
         """Whether the table of proximities is there, and made from the notes that are."""
         attributes = Tables(store).attributes(PROXIMITY)
         return attributes is not None and attributes.get("digest") == self._proximity_digest(self._current(notes))

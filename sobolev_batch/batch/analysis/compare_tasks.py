@@ -13,14 +13,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.store.comparison_records import Kind, Note, Notes
+from sobolev_batch.batch.store.comparison_records import ComparisonRecord, ComparisonRecords, Kind
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation
 from sobolev_batch.spectral.shells import shell_weights
-from sobolev_batch.spectral.transform.transform import Transform
+from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.proximity import proximity
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -86,7 +86,7 @@ def compare_by_witness(
     blocks: tuple[Block, ...],
     orders: tuple[float, ...],
     memory: float,
-) -> Note:
+) -> ComparisonRecord:
     """Store the witness function of a mesh against the reference, at its vertices, then a note.
 
     It is NaN at vertices that no triangle uses.
@@ -99,14 +99,14 @@ def compare_by_witness(
         memory: bytes that the NUFFT may take.
     """
 
-    def outcome() -> Note:
+    def outcome() -> ComparisonRecord:
         mesh = comparison.mesh.made_again(comparison.similarity)
         evaluation = Evaluation(
             # Others may lie anywhere, beyond the lattice's period too.
             mesh.used_coordinates,
             lattice,
             shell_weights(lattice, orders),
-            Transform(),
+            TransformSettings(),
             threads=1,
             memory=memory,
         )
@@ -118,12 +118,12 @@ def compare_by_witness(
         values = np.full((len(orders), len(mesh.vertices)), np.nan)
         values[:, mesh.used_vertices] = found
         checksum = Witnesses(comparison.store).write(comparison.mesh.row, values)
-        return Note(comparison.key, "complete", checksum=checksum)
+        return ComparisonRecord(comparison.key, "complete", checksum=checksum)
 
     return _noted(comparison, "witness", outcome)
 
 
-def compare_by_proximity(comparison: Comparison, points: int) -> Note:
+def compare_by_proximity(comparison: Comparison, points: int) -> ComparisonRecord:
     """Measure Hausdorff and Chamfer distances of a mesh from the reference, and store them as a note.
 
     Args:
@@ -131,11 +131,11 @@ def compare_by_proximity(comparison: Comparison, points: int) -> Note:
         points: drawn on each of the two.
     """
 
-    def outcome() -> Note:
+    def outcome() -> ComparisonRecord:
         mesh, reference = (
             stored.made_again(comparison.similarity) for stored in (comparison.mesh, comparison.reference)
         )
-        return Note(comparison.key, "complete", numbers=asdict(proximity(mesh, reference, points=points)))
+        return ComparisonRecord(comparison.key, "complete", numbers=asdict(proximity(mesh, reference, points=points)))
 
     return _noted(comparison, "proximity", outcome)
 
@@ -151,7 +151,7 @@ def _difference(comparison: Comparison, lattice: Lattice, block: Block, number: 
     return difference
 
 
-def _noted(comparison: Comparison, kind: Kind, outcome: Callable[[], Note]) -> Note:
+def _noted(comparison: Comparison, kind: Kind, outcome: Callable[[], ComparisonRecord]) -> ComparisonRecord:
     """Have a comparison made and its note written; a mesh that cannot be compared does not raise."""
     started = time.perf_counter()
     try:
@@ -161,7 +161,7 @@ def _noted(comparison: Comparison, kind: Kind, outcome: Callable[[], Note]) -> N
     except Exception as error:
         if not isinstance(error, InputError):
             _log.error("%s: %s failed for a reason that is not its mesh's", comparison.mesh.label, kind, exc_info=error)
-        note = Note(comparison.key, "failed", " ".join(str(error).split()) or type(error).__name__)
+        note = ComparisonRecord(comparison.key, "failed", " ".join(str(error).split()) or type(error).__name__)
     note = replace(note, seconds=time.perf_counter() - started)
-    Notes(comparison.store, kind).write(comparison.mesh.row, note)
+    ComparisonRecords(comparison.store, kind).write(comparison.mesh.row, note)
     return note

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import Assessed
+from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.rates import observed_rates
 
@@ -49,13 +49,13 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     )
 
 
-def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: Assessed) -> xr.Dataset:
+def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
     """`norm` (mesh, order) with its error, from values over (orders, meshes)."""
     return xr.Dataset(_with_errors("norm", ("mesh", "order"), norms), coords=_coordinates(rows, orders))
 
 
 def distances_dataset(
-    rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: Assessed
+    rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: NormEstimate
 ) -> xr.Dataset:
     """`distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
     return xr.Dataset(
@@ -67,9 +67,9 @@ def distances_dataset(
 def convergence_dataset(
     rows: Sequence[Row],
     orders: Sequence[float],
-    to_reference: Assessed,
+    to_reference: NormEstimate,
     proportion: Proportion,
-    reference_norms: Assessed,
+    reference_norms: NormEstimate,
     sizes: Reals,
     reference: str,
     accuracy: Accuracy | None,
@@ -118,7 +118,7 @@ def convergence_dataset(
     )
 
 
-def _with_errors(name: str, dimensions: tuple[str, ...], found: Assessed) -> dict[str, Any]:
+def _with_errors(name: str, dimensions: tuple[str, ...], found: NormEstimate) -> dict[str, Any]:
     """A number, its error and the parts of that; the axis of orders comes last."""
     parts = {
         name: found.values,

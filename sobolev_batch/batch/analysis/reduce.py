@@ -16,15 +16,16 @@ from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import deal
 from sobolev_batch.batch.cluster.outcomes import is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.workers import MEMORY, Crew
+from sobolev_batch.batch.cluster.workers import MEMORY, Workers
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
-from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, support_widths
+from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, support_widths
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made anew.
 TABLES_VERSION = 2
@@ -35,13 +36,13 @@ _Call = tuple[Callable[..., Any], tuple[Sequence[int], ...]]
 
 def tabulate_fields(
     client: Client,
-    crew: Crew,
+    crew: Workers,
     store: Store,
     plan: Plan,
     rows: Sequence[Row],
     records: Sequence[Record | None],
     notify: Notify,
-) -> Assessed | None:
+) -> NormEstimate | None:
     """Make the tables; the distances to the reference, or None where the tables were there.
 
     Raises:
@@ -102,7 +103,7 @@ def tabulate_fields(
     else:
         distances[..., 0] = to_reference
     _write_tables(store, plan, rows, records, norms, to_reference, proportions, distances, [rows[j] for j in others])
-    return Assessed(*to_reference)
+    return NormEstimate(*to_reference)
 
 
 def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
@@ -139,9 +140,9 @@ def _write_tables(
     convergence = convergence_dataset(
         rows,
         orders,
-        Assessed(*to_reference),
+        NormEstimate(*to_reference),
         Proportion(*proportions),
-        Assessed(*norms[..., reference]),
+        NormEstimate(*norms[..., reference]),
         sizes,
         plan.reference,
         plan.study.accuracy,
@@ -150,8 +151,8 @@ def _write_tables(
     replaced = tables.withdraw()
     store.write_qualities([record.quality if record else "" for record in records])
     tables.write("meshes", meshes, instead_of=replaced)
-    tables.write("norms", norms_dataset(rows, orders, Assessed(*norms)), instead_of=replaced)
-    pairs = distances_dataset(rows, others, orders, Assessed(*distances))
+    tables.write("norms", norms_dataset(rows, orders, NormEstimate(*norms)), instead_of=replaced)
+    pairs = distances_dataset(rows, others, orders, NormEstimate(*distances))
     tables.write("distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are there.
     digest = _reduction_digest(plan, rows, records)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.budget import Assessed, Sums, add_sums, assess, sums_of_shells
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, add_sums, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
@@ -89,7 +89,7 @@ class Reducer:
     def _read_at_once(self) -> int:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
-    def norms(self, rows: Sequence[int]) -> tuple[Assessed, Assessed, Proportion]:
+    def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Proportion]:
         """Norms of rows, their distances to the center and the parts of these, each over (orders, rows).
 
         Without a center, all but the norms is NaN.
@@ -113,7 +113,7 @@ class Reducer:
         norms = self._assess(sums_of_shells(own, self.lattice, self.orders), *of_rows)
         if self.center is None:
             unknown = np.full_like(norms.values, np.nan)
-            return norms, Assessed(*[unknown] * 4), Proportion(*[unknown] * 3)
+            return norms, NormEstimate(*[unknown] * 4), Proportion(*[unknown] * 3)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.center for row in rows], dtype=np.float64)
         areas = (of_rows[0] + self.areas[self.center]) * apart
@@ -121,7 +121,7 @@ class Reducer:
         distances = self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
         return norms, distances, Proportion.of_shells(to_center, products, of_center, self.lattice, self.orders)
 
-    def tile(self, rows: Sequence[int], others: Sequence[int]) -> Assessed:
+    def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Distances of rows to other rows, over (orders, rows, others).
 
         Args:
@@ -147,8 +147,8 @@ class Reducer:
         errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal
         return self._assess(sums, areas, errors)
 
-    def _assess(self, sums: Sums, areas: Reals, errors: Reals) -> Assessed:
-        return assess(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
+    def _assess(self, sums: Sums, areas: Reals, errors: Reals) -> NormEstimate:
+        return estimate_norms(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

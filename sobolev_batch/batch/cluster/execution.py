@@ -8,13 +8,13 @@ from itertools import islice
 from distributed import Client, Future, as_completed
 
 from sobolev_batch.batch.cluster.outcomes import is_suspect, outcomes
-from sobolev_batch.batch.cluster.workers import Crew
+from sobolev_batch.batch.cluster.workers import Workers
 
 # Tasks that the scheduler knows of at a time: enough to deal out well, while each costs it memory.
 _LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
 
 
-def many_in_flight(crew: Crew) -> int:
+def many_in_flight(crew: Workers) -> int:
     """How many tasks the scheduler may know of at a time where each is small."""
     return max(_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * crew.threads)
 

@@ -12,7 +12,7 @@ from distributed.core import Status
 
 from sobolev_batch.batch.cluster.gpus import Claim, claim_device, visible_devices
 from sobolev_batch.batch.cluster.versions import guarded, require_same_versions
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Crew, CrewMember, spare_bytes
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, spare_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
 
@@ -90,7 +90,7 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
                 claim.release()
 
 
-def enlist(client: Client, needed: Iterable[str] = ()) -> Crew:
+def enlist(client: Client, needed: Iterable[str] = ()) -> Workers:
     """Equip the workers of a cluster, those that join later too, and tell what they offer.
 
     Args:
@@ -107,7 +107,7 @@ def enlist(client: Client, needed: Iterable[str] = ()) -> Crew:
     found = {address: parts for address, parts in answers.items() if isinstance(parts, tuple)}
     if not found:
         raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
-    return Crew(tuple(CrewMember(address, *parts) for address, parts in sorted(found.items())))
+    return Workers(tuple(WorkerInfo(address, *parts) for address, parts in sorted(found.items())))
 
 
 def worry_about(client: Client, backend: str) -> str:

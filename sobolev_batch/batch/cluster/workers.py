@@ -16,7 +16,7 @@ GPU = "sobolev-batch-gpu"
 
 
 @dataclass(frozen=True)
-class CrewMember:
+class WorkerInfo:
     """One worker.
 
     Attributes:
@@ -47,16 +47,16 @@ def spare_bytes(limit: float | None) -> float:
 
 
 @dataclass(frozen=True)
-class Crew:
+class Workers:
     """All workers of a cluster at the time when a study begins."""
 
-    members: tuple[CrewMember, ...]
+    members: tuple[WorkerInfo, ...]
 
     @classmethod
-    def of_this_machine(cls, count: int) -> Crew:
+    def of_this_machine(cls, count: int) -> Workers:
         """The workers of a cluster that a run without a scheduler would start here."""
         spare = spare_bytes(psutil.virtual_memory().total / count)
-        return cls(tuple(CrewMember("this machine", 1, spare, "cpu", "") for _ in range(count)))
+        return cls(tuple(WorkerInfo("this machine", 1, spare, "cpu", "") for _ in range(count)))
 
     @property
     def threads(self) -> int:
@@ -73,7 +73,7 @@ class Crew:
         """Memory that the best equipped worker has for a task alone."""
         return max(member.spare_bytes for member in self.members)
 
-    def with_backend(self, wanted: Backends) -> Crew:
+    def with_backend(self, wanted: Backends) -> Workers:
         """The workers that can serve a study with this backend.
 
         Raises:
@@ -92,4 +92,4 @@ class Crew:
                 f"{reasons}{'; ...' if len(self.members) > 4 else ''}. "
                 "Start a worker on a machine with an NVIDIA GPU and the extra gpu, or ask for backend 'auto'"
             )
-        return Crew(equipped)
+        return Workers(equipped)

@@ -10,11 +10,12 @@ from distributed import Client, Future
 from sobolev_batch.batch.cluster.execution import deal, many_in_flight
 from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.workers import Crew
+from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.graph import Submitter
 from sobolev_batch.batch.fields.sizing import Layout, lay_out_rows
 from sobolev_batch.batch.fields.tasks import Job
-from sobolev_batch.batch.store.records import Record, utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import StoreError
@@ -24,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 def compute_fields(
     client: Client,
-    crew: Crew,
+    crew: Workers,
     store: Store,
     plan: Plan,
     rows: Sequence[Row],

@@ -8,7 +8,7 @@ from typing import Any
 
 from distributed import Client, Future
 
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Crew
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
 from sobolev_batch.batch.fields.large_mesh import add_partials, cut_mesh, store_block, transform_piece
 from sobolev_batch.batch.fields.sizing import Layout
 from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, finish_mesh
@@ -33,7 +33,7 @@ class Submitter:
     blocks: int
 
     @classmethod
-    def of(cls, client: Client, crew: Crew, backend: Backends, layouts: Iterable[Layout], blocks: int) -> Submitter:
+    def of(cls, client: Client, crew: Workers, backend: Backends, layouts: Iterable[Layout], blocks: int) -> Submitter:
         """The submitter for fields with these layouts."""
         largest = max((layout.largest_bytes for layout in layouts), default=0.0)
         return cls(client, largest > crew.share_bytes, backend == "gpu", blocks)

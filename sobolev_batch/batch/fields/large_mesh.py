@@ -24,7 +24,7 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import draws_for
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.transform import Transform, require_inside, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
@@ -47,7 +47,7 @@ class Cut:
 
     token: str = ""
     there: frozenset[int] = frozenset()
-    settings: Transform | None = None
+    settings: TransformSettings | None = None
     draws: Draws | None = None
     facts: Facts = field(default_factory=Facts)
     quality: Quality | None = None

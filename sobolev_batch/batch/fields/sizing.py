@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from sobolev_batch.batch.cluster.workers import Crew
+from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.dtypes import item_bytes
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.transform import Transform, memory_bytes
+from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes
 from sobolev_batch.surfaces.sources.registry import Size
 
 # Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
@@ -60,7 +60,7 @@ class Layout:
         return 2 * self.parts * sum(map(len, self.groups)) + 2
 
 
-def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Crew) -> tuple[dict[str, Layout], dict[str, str]]:
+def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Workers) -> tuple[dict[str, Layout], dict[str, str]]:
     """The layouts of rows by their labels, and for each that fits into no worker the reason.
 
     Raises:
@@ -76,7 +76,7 @@ def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Crew) -> tuple[dict[str,
     return layouts, refused
 
 
-def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Crew, rows: int) -> Layout:
+def lay_out(blocks: Sequence[Block], transform: TransformSettings, size: Size, crew: Workers, rows: int) -> Layout:
     """Fit a row's tasks into the memory of workers.
 
     Every task is kept within what a worker has for each of its threads, as long as that leaves a
@@ -93,7 +93,7 @@ def lay_out(blocks: Sequence[Block], transform: Transform, size: Size, crew: Cre
         ClusterError: no worker has the memory that it takes.
     """
     block = blocks[0]
-    block_bytes = float(block.size * item_bytes(transform.precision))
+    block_bytes = float(block.size * item_bytes(transform.dtype))
 
     def least(triangles: float) -> float:
         return LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from distributed import get_worker
 
 from sobolev_batch.batch.cluster.worker_plugin import backend_of
-from sobolev_batch.batch.store.records import Facts, Record, utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.study import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
@@ -25,7 +26,7 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import probe_block
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -56,7 +57,7 @@ class Job:
     member: Member
     similarity: Similarity
     lattice: Lattice
-    transform: Transform
+    transform: TransformSettings
     orders: tuple[float, ...]
     aim: Aim | None = None
     memory: float | None = None
@@ -129,7 +130,7 @@ def reason_of(job: Job, error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def settings_of(job: Job, surface: Surface) -> Transform:
+def settings_of(job: Job, surface: Surface) -> TransformSettings:
     """The settings of a field that is computed block by block: as forecast, not measured and mended."""
     if job.aim is None or isinstance(surface, Sphere):
         return job.transform

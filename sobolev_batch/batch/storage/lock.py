@@ -20,7 +20,7 @@ from typing import Self
 from uuid import uuid4
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import ClaimError, StoreError
 
 _log = logging.getLogger(__name__)

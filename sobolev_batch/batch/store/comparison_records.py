@@ -19,7 +19,7 @@ KINDS: tuple[Kind, ...] = ("witness", "proximity")
 
 
 @dataclass(frozen=True)
-class Note:
+class ComparisonRecord:
     """The outcome of one comparison of a mesh with the reference.
 
     Attributes:
@@ -60,7 +60,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Notes:
+class ComparisonRecords:
     """The notes of one kind in a store."""
 
     store: Store
@@ -78,7 +78,7 @@ class Notes:
         elif self.store.array(self.name).shape[0] < rows:
             self.store.resize(self.name, (rows,))
 
-    def read(self) -> list[Note | None]:
+    def read(self) -> list[ComparisonRecord | None]:
         """All notes, in the order of the store's rows; None where there is none that can be read."""
         return self._examine()[0]
 
@@ -86,7 +86,7 @@ class Notes:
         """What is wrong with the note of each row that has one which cannot be read."""
         return self._examine()[1]
 
-    def write(self, row: int, note: Note | None) -> None:
+    def write(self, row: int, note: ComparisonRecord | None) -> None:
         """Write the note of a row, or withdraw it."""
         array = self.store.array(self.name)
         with self.store.location.access("written"):
@@ -96,7 +96,7 @@ class Notes:
         """Take all of them away."""
         self.store.remove(self.name)
 
-    def _examine(self) -> tuple[list[Note | None], dict[int, str]]:
+    def _examine(self) -> tuple[list[ComparisonRecord | None], dict[int, str]]:
         if not self.store.has(self.name):
             return [None] * len(self.store.labels()), {}
         lines: Sequence[str | DamageError]
@@ -105,13 +105,13 @@ class Notes:
         except DamageError:
             # One of them at least: which, is seen one by one.
             lines = [self._line(row) for row in range(self.store.array(self.name).shape[0])]
-        notes: list[Note | None] = [None] * len(self.store.labels())
+        notes: list[ComparisonRecord | None] = [None] * len(self.store.labels())
         damaged = {}
         for row, line in enumerate(lines):
             try:
                 if isinstance(line, DamageError):
                     raise line
-                notes[row] = Note.from_json(line)
+                notes[row] = ComparisonRecord.from_json(line)
             except DamageError as error:
                 damaged[row] = error.what
         return notes, damaged
@@ -124,7 +124,7 @@ class Notes:
 
 
 def shortcomings(
-    labels: Sequence[str], notes: Mapping[Kind, Sequence[Note | None]], rows: Container[int]
+    labels: Sequence[str], notes: Mapping[Kind, Sequence[ComparisonRecord | None]], rows: Container[int]
 ) -> dict[str, str]:
     """What meshes lack that could not be compared, and why, by their labels.
 

@@ -17,7 +17,7 @@ from zarr.storage import MemoryStore
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import CLAIM_KEYS
-from sobolev_batch.batch.store.comparison_records import KINDS, Notes
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.store.store import (
     FIELD,
@@ -113,7 +113,7 @@ def _lay_out(store: Store, plan: Plan) -> None:
     root.create_array(
         FIELD,
         shape=(len(labels), *lattice.shape),
-        dtype=plan.choice.precision,
+        dtype=plan.choice.dtype,
         chunks=(1, *chunk),
         compressors=(Crc32cCodec(),),
         fill_value=complex(np.nan, np.nan),
@@ -183,7 +183,7 @@ def _check_same_study(store: Store, plan: Plan) -> None:
         for what, old, new in (
             ("the study", repr(study["name"]), repr(plan.study.name)),
             ("a lattice of", *map(_described, (study["lattice"], _lattice_entry(plan)["lattice"]))),
-            ("dtype", repr(study["dtype"]), repr(plan.choice.precision)),
+            ("dtype", repr(study["dtype"]), repr(plan.choice.dtype)),
         )
         if old != new and not (chosen and what != "the study" and study.get("choice"))
     ]
@@ -215,7 +215,7 @@ def _extend(store: Store, plan: Plan) -> None:
             # Not left out: what is not there counts as lost.
             texts = added if name == LABELS else [""] * len(added)
             store.array(name)[len(there) :] = np.array(texts, dtype=object)
-    for notes in (Notes(store, kind) for kind in KINDS):
+    for notes in (ComparisonRecords(store, kind) for kind in KINDS):
         # Arrays of one group that differ along `mesh` cannot be read together.
         if store.has(notes.name):
             notes.lay_out(len(there) + len(added))
@@ -246,7 +246,7 @@ def _described(lattice: dict[str, Any]) -> str:
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:
-    return {"lattice": {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}, "dtype": plan.choice.precision}
+    return {"lattice": {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}, "dtype": plan.choice.dtype}
 
 
 def _similarity_entry(similarity: Similarity) -> dict[str, Any]:

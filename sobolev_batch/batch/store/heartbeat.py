@@ -10,7 +10,8 @@ from types import TracebackType
 from typing import Self
 
 from sobolev_batch.batch.storage.lock import Claim, this_process
-from sobolev_batch.batch.store.records import RunRecord, RunState, utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.store.records import RunRecord, RunState
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import ClaimError, StoreError
 
@@ -22,7 +23,7 @@ HEARTBEAT_SECONDS = 10.0
 PATIENCE_SECONDS = 6 * HEARTBEAT_SECONDS
 
 
-class Journal:
+class Heartbeat:
     """Tells a store that a run is going on, from where, and how it ended.
 
     Attributes:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import calendar
 import json
-import time
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, Self
 
 from sobolev_batch.errors import StoreError
-
-# Seconds are enough for people; ISO 8601.
-_TIME = "%Y-%m-%dT%H:%M:%SZ"
 
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
@@ -132,13 +127,3 @@ class RunRecord:
             return cls(**table)  # type: ignore[arg-type]
         except TypeError as error:
             raise StoreError(f"the record of the latest run is damaged ({error}): {table}") from error
-
-
-def utc_now() -> str:
-    """The time, in UTC."""
-    return time.strftime(_TIME, time.gmtime())
-
-
-def age_seconds(moment: str) -> float:
-    """The time since a moment that `utc_now` has told, in seconds."""
-    return time.time() - calendar.timegm(time.strptime(moment, _TIME))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Claim, remove_claim
+from sobolev_batch.batch.storage.timestamps import age_seconds
 from sobolev_batch.batch.store.heartbeat import PATIENCE_SECONDS
-from sobolev_batch.batch.store.records import age_seconds
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import ClaimError, StoreError
 

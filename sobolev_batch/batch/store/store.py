@@ -34,7 +34,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.scratch import Scratch
 from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.batch.store.records import Record, RunRecord
-from sobolev_batch.batch.study.lattice_choice import Choice
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.errors import DamageError, StoreError
 
 _log = logging.getLogger(__name__)
@@ -444,7 +444,7 @@ class Store:
                 self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(value.to_bytes())
 
 
-def stored_choice(place: str | Path | Location) -> Choice | None:
+def stored_choice(place: str | Path | Location) -> LatticeChoice | None:
     """The lattice that the fields of a store were chosen to have; None without a store, or where it was given.
 
     Raises:
@@ -454,7 +454,7 @@ def stored_choice(place: str | Path | Location) -> Choice | None:
     if not store.is_there() or store.is_unfinished:
         return None
     table = store.attributes()["study"].get("choice")
-    return Choice.from_table(table) if table else None
+    return LatticeChoice.from_table(table) if table else None
 
 
 def checksum_of(values: NDArray[Any]) -> int:

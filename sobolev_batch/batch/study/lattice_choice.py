@@ -17,11 +17,12 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of, reach_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, lattice_of
-from sobolev_batch.spectral.dtypes import Precision
-from sobolev_batch.spectral.errors.budget import Assessed, support_widths
+from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.surfaces.shapes.extent import support_widths
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 
@@ -36,12 +37,12 @@ _LARGEST_GROWTH = 2.0
 
 
 @dataclass(frozen=True)
-class Choice:
+class LatticeChoice:
     """What all fields of a study have in common.
 
     Attributes:
         lattice: of all fields.
-        precision: of all fields.
+        dtype: of all fields.
         closest: for each order the smallest distance to the reference that a pilot showed; empty
             where the lattice was given.
         reasons: one line each, for people.
@@ -49,7 +50,7 @@ class Choice:
     """
 
     lattice: Lattice
-    precision: Precision
+    dtype: ComplexDtype
     closest: tuple[float, ...] = ()
     reasons: tuple[str, ...] = ()
     basis: str = ""
@@ -59,7 +60,7 @@ class Choice:
         return {
             "xi_max": self.lattice.xi_max,
             "M": self.lattice.M,
-            "dtype": self.precision,
+            "dtype": self.dtype,
             "closest": list(self.closest),
             "reasons": list(self.reasons),
             "basis": self.basis,
@@ -71,7 +72,7 @@ class Choice:
         lattice = Lattice(table["xi_max"], table["M"])
         return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"])
 
-    def grown(self, found: Assessed, orders: Sequence[float], accuracy: Accuracy) -> Choice | None:
+    def grown(self, found: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
         """A larger or finer lattice where distances (orders, meshes) fall short of an accuracy.
 
         None where they do not, where the lattice is not what limits them, or where no larger one fits
@@ -97,7 +98,7 @@ class Choice:
             return None
         lattice = lattice_of(highest, period, accuracy.largest_intervals)
         reason = f"grown from xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}, whose errors were too large"
-        return Choice(lattice, self.precision, self.closest, (*self.reasons, reason), self.basis)
+        return LatticeChoice(lattice, self.dtype, self.closest, (*self.reasons, reason), self.basis)
 
 
 def basis_of(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
@@ -116,7 +117,7 @@ def basis_of(study: Study, similarity: Similarity, reference: Mapping[str, Any])
 
 def choose(
     study: Study, similarity: Similarity, reference: Surface, members: Mapping[str, tuple[str, Member]], basis: str
-) -> Choice:
+) -> LatticeChoice:
     """The lattice and precision for the accuracy that a study asks for.
 
     The coarsest and the finest member of each family are compared with the reference on a small
@@ -154,14 +155,14 @@ def choose(
     # Each pair alone fits into the memory, or it would have been refused.
     lattice = lattice_of(xi_max, period, accuracy.largest_intervals)
     single = study.dtype is None and all(pilot.single for pilot in pilots.values())
-    precision: Precision = "complex64" if single else study.dtype or "complex128"
+    dtype: ComplexDtype = "complex64" if single else study.dtype or "complex128"
     closest = np.min([pilot.values for pilot in pilots.values()], axis=0)
     reasons = (
         f"xi_max {lattice.xi_max:.4g} for truncation, which {highest} needs most of {len(pilots)} pilot pairs",
         f"spacing {lattice.spacing:.4g} for aliasing: the surfaces reach over {widths.max():.4g} units of length",
-        f"{precision} for the smallest distance of a pilot, about {_listed(closest, study.orders)}",
+        f"{dtype} for the smallest distance of a pilot, about {_listed(closest, study.orders)}",
     )
-    return Choice(lattice, precision, tuple(closest.tolist()), reasons, basis)
+    return LatticeChoice(lattice, dtype, tuple(closest.tolist()), reasons, basis)
 
 
 def _pilots(members: Mapping[str, tuple[str, Member]], similarity: Similarity) -> dict[str, Surface]:

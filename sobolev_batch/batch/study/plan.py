@@ -9,14 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from sobolev_batch.batch.study.lattice_choice import Choice, basis_of, choose
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice, basis_of, choose
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, Transform, require_inside
+from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -68,7 +68,7 @@ class Plan:
     rows: tuple[Row, ...]
     reference: str
     blocks: tuple[Block, ...]
-    choice: Choice
+    choice: LatticeChoice
     sample: Sample | None = None
 
     @property
@@ -77,10 +77,10 @@ class Plan:
         return self.choice.lattice
 
     @property
-    def transform(self) -> Transform:
+    def transform(self) -> TransformSettings:
         """How fields are computed; where an accuracy is asked for, eps and tolerance follow for each."""
         given = self.study.transform
-        return given if self.study.accuracy is None else Transform(None, self.choice.precision, given.quadrature)
+        return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
 
     def aim(self, row: Row) -> Aim | None:
         """What the field of a row is computed for, where an accuracy is asked for."""
@@ -89,7 +89,7 @@ class Plan:
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
         return Aim(self.study.orders, self.study.accuracy, sample, closest)
 
-    def on(self, choice: Choice) -> Plan:
+    def on(self, choice: LatticeChoice) -> Plan:
         """The same study with its fields on another lattice."""
         rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
         return replace(self, rows=rows, choice=choice, blocks=_blocks(choice))
@@ -97,7 +97,7 @@ class Plan:
     @cached_property
     def item_bytes(self) -> int:
         """Bytes of one sample of a field."""
-        return 16 if self.choice.precision == "complex128" else 8
+        return 16 if self.choice.dtype == "complex128" else 8
 
     @property
     def field_bytes(self) -> int:
@@ -105,7 +105,7 @@ class Plan:
         return self.lattice.half.size * self.item_bytes
 
 
-def make_plan(study: Study, known: Choice | None = None) -> Plan:
+def make_plan(study: Study, known: LatticeChoice | None = None) -> Plan:
     """Resolve a study: list its surfaces, choose its similarity and lattice, identify every field.
 
     The reference is loaded, since the similarity depends on it, and a few pilots where an accuracy is
@@ -151,10 +151,10 @@ def _choice(
     members: Mapping[str, tuple[str, Member]],
     reference: str,
     surface: Surface,
-    known: Choice | None,
-) -> Choice:
+    known: LatticeChoice | None,
+) -> LatticeChoice:
     if study.lattice is not None:
-        return Choice(study.lattice, study.transform.precision)
+        return LatticeChoice(study.lattice, study.transform.dtype)
     basis = basis_of(study, similarity, members[reference][1].fingerprint())
     if known is not None and known.basis == basis:
         return known
@@ -162,8 +162,8 @@ def _choice(
     return choose(study, similarity, surface, others, basis)
 
 
-def _blocks(choice: Choice) -> tuple[Block, ...]:
-    item_bytes = 16 if choice.precision == "complex128" else 8
+def _blocks(choice: LatticeChoice) -> tuple[Block, ...]:
+    item_bytes = 16 if choice.dtype == "complex128" else 8
     return choice.lattice.split(_LARGEST_CHUNK_BYTES // item_bytes)
 
 
@@ -227,14 +227,14 @@ def _fingerprint(label: str, member: Member) -> str:
         return ""
 
 
-def _key(study: Study, similarity: Similarity, choice: Choice, fingerprint: str) -> str:
+def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprint: str) -> str:
     if not fingerprint:
         return ""
     parts = {
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
-        "transform": [study.transform.eps, choice.precision, study.transform.quadrature.method],
+        "transform": [study.transform.eps, choice.dtype, study.transform.quadrature.method],
         "numerics": NUMERICS_VERSION,
         # What is asked of a field follows from its distance to the reference.
         "accuracy": choice.basis,

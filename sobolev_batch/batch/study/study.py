@@ -16,11 +16,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
-from sobolev_batch.spectral.transform.transform import Transform
+from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.formats.contents import open_regular
 from sobolev_batch.surfaces.shapes.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -125,8 +125,8 @@ class Study:
     title: str
     lattice: Lattice | None
     accuracy: Accuracy | None
-    transform: Transform
-    dtype: Precision | None
+    transform: TransformSettings
+    dtype: ComplexDtype | None
     backend: Backends
     orders: tuple[float, ...]
     pairs: Literal["all", "reference"]
@@ -246,12 +246,12 @@ class _NormSection(_Section):
 
 class _TransformSection(_Section):
     eps: Number | None = None
-    dtype: Precision | None = None
+    dtype: ComplexDtype | None = None
     quadrature: str | int = "auto"
     backend: Backends = "auto"
 
-    def settings(self) -> Transform:
-        return Transform(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))
+    def settings(self) -> TransformSettings:
+        return TransformSettings(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))
 
 
 class _ScalingSection(_Section):

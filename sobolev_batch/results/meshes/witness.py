@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -16,7 +16,7 @@ Reals = NDArray[np.float64]
 
 
 def witness_at(
-    tree: xr.DataTree, label: str, orders: Sequence[float], points: Reals, dtype: Precision = "complex128"
+    tree: xr.DataTree, label: str, orders: Sequence[float], points: Reals, dtype: ComplexDtype = "complex128"
 ) -> Reals:
     """Values (orders, n) from the stored fields at points (n, 3) in the study's unit; see `witness`."""
     fields = tree["fourier"].to_dataset()["fourier"]

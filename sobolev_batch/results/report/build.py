@@ -14,7 +14,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.records import utc_now
+from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.plots import (
     MOST_VIEWS,

@@ -305,8 +305,8 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
         yield "witness", f"of order {minus(', '.join(f'{order:g}' for order in chosen))}, at the vertices of every mesh"
     if table.get("proximity") is not None:
         yield "proximity", "Hausdorff and Chamfer distances of every mesh to the reference"
-    precision = {"complex128": "double", "complex64": "single"}[study["dtype"]]
-    yield "arithmetic", f"{precision} precision{eps}"
+    dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]
+    yield "arithmetic", f"{dtype} precision{eps}"
     origin = ", ".join(f"{x:.6g}" for x in similarity["origin"])
     if own == 1 and not any(similarity["origin"]):
         yield "similarity", "none: lengths are in the meshes' own unit"

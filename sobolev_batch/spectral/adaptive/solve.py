@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, refined
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
-from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS, Assessed, Sums, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import shell_sums
-from sobolev_batch.spectral.transform.transform import Transform
+from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.surfaces.shapes.extent import AXIS_DIRECTIONS, support_widths
 from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
@@ -49,7 +50,7 @@ class Found:
         sums: of the difference of the fields.
     """
 
-    assessed: Assessed
+    assessed: NormEstimate
     lattice: Lattice
     fields: tuple[Field, ...]
     sums: Sums
@@ -90,10 +91,10 @@ def pursue(
             values = _ESTIMATE_CAUTION * estimate(samples, orders)
         _refuse_below_rounding(values, orders, accuracy, float(areas), what)
         goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(inexact)
-        precision = _precision(surfaces, lattice, goal)
+        dtype = _precision(surfaces, lattice, goal)
         fields = tuple(
             field_for(
-                surface, lattice, goal, Transform(precision=precision), sample=sample, extent=extent, threads=threads
+                surface, lattice, goal, TransformSettings(dtype=dtype), sample=sample, extent=extent, threads=threads
             )
             for surface, sample, extent in zip(surfaces, samples, extents, strict=True)
         )
@@ -211,7 +212,7 @@ def pilot_of(
         samples = _samples((surface, reference), lattice, orders)
         goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
         fields = [
-            field_for(each, lattice, goal, Transform(), sample=sample, threads=threads)
+            field_for(each, lattice, goal, TransformSettings(), sample=sample, threads=threads)
             for each, sample in zip((surface, reference), samples, strict=True)
         ]
         found = _assessed(fields, lattice, orders, np.array(area), widths)
@@ -263,7 +264,7 @@ def _of_pilot(accuracy: Accuracy) -> Accuracy:
     return replace(accuracy, rtol=max(accuracy.rtol, _PILOT_RTOL))
 
 
-def _precision(surfaces: Sequence[Surface], lattice: Lattice, goal: Goal) -> Precision:
+def _precision(surfaces: Sequence[Surface], lattice: Lattice, goal: Goal) -> ComplexDtype:
     return "complex64" if all(permits_single(surface, lattice, goal) for surface in surfaces) else "complex128"
 
 
@@ -277,5 +278,5 @@ def _assessed(fields: Sequence[Field], lattice: Lattice, orders: Sequence[float]
     whole = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
     sums = sums_of_shells(shell_sums(whole, None, lattice, lattice.half), lattice, orders)
     errors = np.sum([field.quality.probe.norms(lattice, orders) for field in fields], axis=0)
-    assessed = assess(sums, lattice, orders, areas=areas, widths=widths, discretisation=errors)
+    assessed = estimate_norms(sums, lattice, orders, areas=areas, widths=widths, discretisation=errors)
     return Found(assessed, lattice, tuple(fields), sums)

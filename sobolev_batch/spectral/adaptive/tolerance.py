@@ -15,14 +15,14 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.spectral.errors.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,
-    Assessed,
+    NormEstimate,
     Sums,
     aliased,
     image_weight,
     truncated,
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
-from sobolev_batch.spectral.transform.transform import FINEST_EPS, Transform, memory_bytes
+from sobolev_batch.spectral.transform.transform import FINEST_EPS, TransformSettings, memory_bytes
 
 Reals = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class Accuracy:
         if not (math.isfinite(self.memory) and self.memory > 0):
             raise InputError(f"memory must be a positive number of bytes, found {self.memory!r}")
 
-    def met(self, found: Assessed) -> NDArray[np.bool_]:
+    def met(self, found: NormEstimate) -> NDArray[np.bool_]:
         """Which numbers have an error within rtol of them; of a zero, only where nothing is uncertain about it."""
         return np.asarray(found.errors <= self.rtol * found.values)
 
@@ -107,7 +107,7 @@ class Accuracy:
     def _bytes(intervals: int) -> float:
         half = Lattice(1.0, intervals).half
         # What is asked for may lead to any eps, and the finest takes the finest grid.
-        return memory_bytes(half, Transform(FINEST_EPS["complex128"])) + 2 * 16 * half.size
+        return memory_bytes(half, TransformSettings(FINEST_EPS["complex128"])) + 2 * 16 * half.size
 
 
 def first_lattice(widths: Reals, reach: float, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:

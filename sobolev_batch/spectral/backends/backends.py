@@ -17,8 +17,8 @@ import numpy as np
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.arrays import Array
-from sobolev_batch.spectral.dtypes import Precision
-from sobolev_batch.spectral.transform.memory import Costs, Shape
+from sobolev_batch.spectral.backends.costs import Costs, Shape
+from sobolev_batch.spectral.dtypes import ComplexDtype
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ GPU_COSTS = Costs(
 _DEVICE = threading.RLock()
 
 
-class Plan(Protocol):
+class NufftPlan(Protocol):
     """A plan in three dimensions, as finufft and cufinufft make it: of type 1 where nothing else is said."""
 
     def setpts(self, x: Array, y: Array, z: Array) -> None:
@@ -93,7 +93,7 @@ class Backend(ABC):
         """An array of this backend, on the host; waits until it is computed."""
 
     @abstractmethod
-    def plan(self, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
+    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
         """A type-1 plan with the sign -1, whose modes of an axis of n samples start at -(n // 2)."""
 
 
@@ -104,8 +104,8 @@ class _Cpu(Backend):
     def download(self, array: Array) -> Array:
         return array
 
-    def plan(self, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
-        return _finufft_plan(1, -1, shape, eps=eps, precision=precision, oversampling=oversampling, threads=threads)
+    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
+        return _finufft_plan(1, -1, shape, eps=eps, dtype=dtype, oversampling=oversampling, threads=threads)
 
     def __reduce__(self) -> str:
         return "CPU"
@@ -155,20 +155,20 @@ class Gpu(Backend):
         """A copy on the host, once everything before it is computed."""
         return self.libraries.cupy.asnumpy(array)
 
-    def plan(self, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
+    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
         """A plan of cuFINUFFT with every option that it has a choice in.
 
         Raises:
             RuntimeError: cuFINUFFT could not make it; it does not say why.
         """
         # Defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac its own choice.
-        made: Plan = self.libraries.plan(
+        made: NufftPlan = self.libraries.plan(
             1,
             shape,
             n_trans=1,
             eps=eps,
             isign=-1,
-            dtype=precision,
+            dtype=dtype,
             modeord=0,
             upsampfac=oversampling,
             gpu_method=0,  # shared memory where the kernel's width leaves room for it, else global memory
@@ -190,21 +190,21 @@ class Gpu(Backend):
 CPU: Backend = _Cpu("cpu", "finufft", CPU_COSTS)
 
 
-def evaluation_plan(shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int) -> Plan:
+def evaluation_plan(shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
     """A type-2 plan on the processor with the sign +1, whose modes of an axis of n samples start at -(n // 2)."""
-    return _finufft_plan(2, 1, shape, eps=eps, precision=precision, oversampling=oversampling, threads=threads)
+    return _finufft_plan(2, 1, shape, eps=eps, dtype=dtype, oversampling=oversampling, threads=threads)
 
 
 def _finufft_plan(
-    kind: int, sign: int, shape: Shape, *, eps: float, precision: Precision, oversampling: float, threads: int
-) -> Plan:
+    kind: int, sign: int, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int
+) -> NufftPlan:
     # Its warnings speak of thread counts and of tolerances, which are checked before they get here.
-    made: Plan = finufft.Plan(
+    made: NufftPlan = finufft.Plan(
         kind,
         shape,
         eps=eps,
         isign=sign,
-        dtype=precision,
+        dtype=dtype,
         modeord=0,
         nthreads=threads,
         upsampfac=oversampling,
@@ -255,7 +255,7 @@ def try_out(backend: Gpu) -> None:
     """
     try:
         with backend.work():
-            plan = backend.plan((4, 6, 8), eps=1e-9, precision="complex128", oversampling=2.0, threads=1)
+            plan = backend.plan((4, 6, 8), eps=1e-9, dtype="complex128", oversampling=2.0, threads=1)
             origin = backend.upload(np.zeros(1))
             plan.setpts(origin, origin, origin)
             values = backend.download(plan.execute(np.exp(1j * origin)))

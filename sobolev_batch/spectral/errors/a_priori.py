@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
-from sobolev_batch.spectral.transform.transform import COARSEST_EPS, FINEST_EPS, Transform
+from sobolev_batch.spectral.transform.transform import COARSEST_EPS, FINEST_EPS, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
@@ -65,7 +65,7 @@ def permits_single(surface: Surface, lattice: Lattice, goal: Goal) -> bool:
     return bool(np.all(rounding <= _NUFFT_SHARE * np.array(goal.norms)))
 
 
-def settle(surface: Mesh | Smooth, lattice: Lattice, goal: Goal, transform: Transform) -> Transform:
+def settle(surface: Mesh | Smooth, lattice: Lattice, goal: Goal, transform: TransformSettings) -> TransformSettings:
     """The cheapest settings that are forecast to meet a goal, or the finest there are.
 
     Args:
@@ -81,7 +81,7 @@ def settle(surface: Mesh | Smooth, lattice: Lattice, goal: Goal, transform: Tran
     masses = _weight_masses(lattice, goal.orders)
     spread = _NUFFT_ERROR + 1 / math.sqrt(len(surface.triangles) if isinstance(surface, Mesh) else _FEWEST_NODES)
     eps = float(np.min(_NUFFT_SHARE * norms / (surface.area * spread * np.sqrt(masses))))
-    eps = min(max(eps, FINEST_EPS[transform.precision]), COARSEST_EPS)
+    eps = min(max(eps, FINEST_EPS[transform.dtype]), COARSEST_EPS)
     rest = (1 - _NUFFT_SHARE) * norms
     if isinstance(surface, Smooth):
         # What it promises at every frequency, at all of them.

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from scipy.special import gammaln, kve
 
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import shell_weights
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 
 Reals = NDArray[np.float64]
 
@@ -30,11 +30,6 @@ _TROUGH_PERIODS = 3.0
 # The energy of the difference of two surfaces is followed from the first of these shells, in
 # fractions of xi_max, to the second, and carried on from there.
 _WINDOWS = ((0.5, 0.75), (0.75, 1.0))
-
-_NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
-DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
-# Which of them are the axes x, y, z.
-AXIS_DIRECTIONS = tuple(int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3))
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -67,7 +62,7 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class Assessed:
+class NormEstimate:
     """Norms or distances with their errors, each (orders, ...).
 
     Attributes:
@@ -113,9 +108,9 @@ def outer_windows(lattice: Lattice) -> Reals:
     ).astype(np.float64)
 
 
-def assess(
+def estimate_norms(
     sums: Sums, lattice: Lattice, orders: Sequence[float], *, areas: Reals, widths: Reals, discretisation: Reals
-) -> Assessed:
+) -> NormEstimate:
     """Square roots of squared norms, with their errors.
 
     Args:
@@ -130,32 +125,13 @@ def assess(
     values = np.sqrt(totals)
     beyond = truncated(sums, lattice, orders, areas, widths)
     images = aliased(sums, lattice, orders, widths)
-    return Assessed(
+    return NormEstimate(
         values,
         np.sqrt(totals + beyond) - values,
         # The larger of the two sides: the square may come out too large as well as too small.
         np.maximum(np.sqrt(totals + images) - values, values - np.sqrt(np.maximum(totals - images, 0.0))),
         discretisation,
     )
-
-
-class Extent(Protocol):
-    """Anything that knows its lowest and highest x · direction for each of `DIRECTIONS`."""
-
-    @property
-    def lowest(self) -> Sequence[float]:
-        """In units of length, (13,)."""
-
-    @property
-    def highest(self) -> Sequence[float]:
-        """In units of length, (13,)."""
-
-
-def support_widths(extents: Sequence[Extent]) -> Reals:
-    """Extents (13,) of several surfaces together along `DIRECTIONS`, in units of length."""
-    lowest = np.min([extent.lowest for extent in extents], axis=0)
-    highest = np.max([extent.highest for extent in extents], axis=0)
-    return np.asarray(highest - lowest)
 
 
 def truncated(

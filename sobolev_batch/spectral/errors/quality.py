@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.errors.budget import DIRECTIONS
 from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere

@@ -14,7 +14,7 @@ from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolve
-from sobolev_batch.spectral.transform.transform import Transform
+from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
@@ -62,7 +62,7 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
 def probe_block(
     surface: Surface,
     lattice: Lattice,
-    settings: Transform,
+    settings: TransformSettings,
     orders: Sequence[float],
     block: Block,
     values: Complexes,
@@ -84,9 +84,9 @@ def probe_block(
     return probe
 
 
-def needs_probe(surface: Surface, settings: Transform) -> bool:
+def needs_probe(surface: Surface, settings: TransformSettings) -> bool:
     """Whether a field computed with these settings can have an error worth the name."""
-    return not isinstance(surface, Sphere) or settings.precision == "complex64"
+    return not isinstance(surface, Sphere) or settings.dtype == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:

@@ -15,9 +15,9 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.errors.budget import AXIS_DIRECTIONS
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.inputs import field_of, quality_of, triples_of
+from sobolev_batch.surfaces.shapes.extent import AXIS_DIRECTIONS
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

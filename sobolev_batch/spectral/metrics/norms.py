@@ -16,7 +16,7 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.adaptive.solve import pursue
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import DIRECTIONS, Assessed, assess, sums_of_shells, support_widths
+from sobolev_batch.spectral.errors.budget import NormEstimate, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import (
@@ -29,6 +29,7 @@ from sobolev_batch.spectral.metrics.inputs import (
     shells_of,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, support_widths
 from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
@@ -165,19 +166,19 @@ def _pursued(
         rtol=accuracy.rtol,
         xi_max=found.lattice.xi_max,
         M=found.lattice.M,
-        dtype=settings[0].precision,
+        dtype=settings[0].dtype,
         eps=[setting.accuracy for setting in settings],
         tolerance=[setting.rule_tolerance for setting in settings],
         points=[field.points for field in found.fields],
     )
 
 
-def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> Assessed:
+def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> NormEstimate:
     """The norm of what the fields add up to, with the error that follows from their qualities."""
     qualities = [quality_of(field) for field in fields]
     known = [quality for quality in qualities if quality is not None]
     complete = len(known) == len(qualities)
-    found = assess(
+    found = estimate_norms(
         sums_of_shells(sums, lattice, orders),
         lattice,
         orders,
@@ -188,17 +189,19 @@ def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Se
     if complete:
         return found
     unknown = np.full(len(orders), np.nan)
-    return Assessed(found.values, unknown, unknown, unknown)
+    return NormEstimate(found.values, unknown, unknown, unknown)
 
 
-def _closed_form(values: Reals, squares: Reals) -> Assessed:
+def _closed_form(values: Reals, squares: Reals) -> NormEstimate:
     """Values whose squares are exact up to a small part of some squared norms."""
     nothing = np.zeros_like(values)
     rounding = _CLOSED_FORM_ACCURACY * squares
-    return Assessed(values, nothing, nothing, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0))
+    return NormEstimate(
+        values, nothing, nothing, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0)
+    )
 
 
-def _dataset(name: str, order: Orders, found: Assessed) -> xr.Dataset:
+def _dataset(name: str, order: Orders, found: NormEstimate) -> xr.Dataset:
     """A number with its error and the parts of that."""
     parts = {
         name: found.values,

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.dtypes import Precision, item_bytes
+from sobolev_batch.spectral.dtypes import ComplexDtype, item_bytes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
 from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
 from sobolev_batch.spectral.transform.memory import Division, Load, divide
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.transform import DEFAULT_BATCH, Transform, require_points_inside
+from sobolev_batch.spectral.transform.transform import DEFAULT_BATCH, TransformSettings, require_points_inside
 
 # Of a given memory, what blocks of fields may take; the rest is for the NUFFT.
 _SHARE_OF_BLOCKS = 0.25
@@ -33,7 +33,7 @@ def witness(
     *,
     lattice: Lattice | None = None,
     eps: float | None = None,
-    dtype: Precision = "complex128",
+    dtype: ComplexDtype = "complex128",
     threads: int | None = None,
     memory: float | None = None,
 ) -> xr.DataArray:
@@ -70,7 +70,7 @@ def witness(
     Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
     """
     orders = check_orders(order)
-    settings = Transform(eps, dtype)
+    settings = TransformSettings(eps, dtype)
     coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
     known = Lattice.of(first)
@@ -99,7 +99,7 @@ class Evaluation:
     coordinates: NDArray[np.float64]
     lattice: Lattice
     weights: NDArray[np.float64]
-    settings: Transform
+    settings: TransformSettings
     threads: int | None = None
     memory: float | None = None
 
@@ -108,15 +108,15 @@ class Evaluation:
         """Samples that a block should have at most."""
         if self.memory is None:
             return BLOCK_SAMPLES
-        each = _SAMPLE_BYTES + len(self.weights) * item_bytes(self.settings.precision)
+        each = _SAMPLE_BYTES + len(self.weights) * item_bytes(self.settings.dtype)
         return max(1, min(BLOCK_SAMPLES, int(_SHARE_OF_BLOCKS * self.memory / each)))
 
     def of_block(self, block: Block, difference: NDArray[np.complexfloating]) -> NDArray[np.float64]:
         """What a block adds to the witness functions, (orders, n)."""
-        precision = self.settings.precision
+        dtype = self.settings.dtype
         weighted = difference * self.lattice.trapezoid_weights(block)
         shells = self.lattice.shells(block)
-        coefficients = np.empty((len(self.weights), *block.shape), dtype=precision)
+        coefficients = np.empty((len(self.weights), *block.shape), dtype=dtype)
         for row, weight in zip(coefficients, self.weights, strict=True):
             np.multiply(weighted, weight[shells], out=row, casting="same_kind")
         division = Division(DEFAULT_BATCH)
@@ -126,7 +126,7 @@ class Evaluation:
             division = divide(
                 block.shape,
                 self.settings.accuracy,
-                precision,
+                dtype,
                 Load(count, count, fill=1.0),
                 CPU.costs,
                 memory=left,
@@ -138,7 +138,7 @@ class Evaluation:
             self.lattice,
             block,
             eps=self.settings.accuracy,
-            precision=precision,
+            dtype=dtype,
             threads=self.threads or os.cpu_count() or 1,
             division=division,
         )

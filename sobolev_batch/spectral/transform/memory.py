@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -11,10 +11,9 @@ from itertools import product
 from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.dtypes import Precision, item_bytes
+from sobolev_batch.spectral.backends.costs import Costs, Shape, fastest_oversampling, spreading_nanoseconds
+from sobolev_batch.spectral.dtypes import ComplexDtype, item_bytes
 from sobolev_batch.spectral.lattice import Block
-
-Shape = tuple[int, int, int]
 
 # A batch holds a few pieces of triangles, and a piece at least eight times the largest rule.
 SMALLEST_BATCH = 1 << 12
@@ -23,44 +22,6 @@ _WIDEST_KERNEL = 16
 # The share of the lattice's period that a surface's bounding box fills, where it is not known. At an
 # aliasing error worth having it is far less.
 _USUAL_FILL = 0.3
-
-
-@dataclass(frozen=True)
-class Costs:
-    """What a NUFFT library takes, in nanoseconds and bytes; measured, and good for choices alone.
-
-    Attributes:
-        finest: the oversamplings of the fine grid that it can do, and the smallest eps that each was
-            measured to keep: the coarser the grid, the cheaper the FFT, the dearer the spreading of a
-            point, and the more a rounding error grows.
-        making: time of making a point and sorting it.
-        point: time of turning and spreading a point, without
-        spread_cell: that of one of its (kernel width)³ grid cells.
-        grid_cell: time of an FFT's grid cell.
-        point_bytes: of a batch, a point: coordinates, angles, strengths, phases, sorting, and what
-            making it takes.
-        triangle_bytes: of the choice of rules.
-        fixed_bytes: of plans and tables.
-        work_grids: grids that the FFT holds besides the fine one.
-        scattered: whether spreading holds a copy of the part of the grid that the surface reaches.
-        most_cells: of one fine grid.
-    """
-
-    finest: Mapping[Precision, Mapping[float, float]]
-    making: float
-    point: float
-    spread_cell: float
-    grid_cell: float
-    point_bytes: int
-    triangle_bytes: int
-    fixed_bytes: int
-    work_grids: int
-    scattered: bool
-    most_cells: int
-
-    def oversamplings(self, eps: float, precision: Precision) -> tuple[float, ...]:
-        """Those that keep an eps, the largest first."""
-        return tuple(sigma for sigma, finest in self.finest[precision].items() if eps >= finest)
 
 
 @dataclass(frozen=True)
@@ -95,15 +56,6 @@ class Division:
     oversampling: float | None = None
 
 
-def fastest_oversampling(points: float, samples: int, eps: float, precision: Precision, costs: Costs) -> float:
-    """The oversampling of the fine grid with which so many points are transformed fastest."""
-
-    def time(sigma: float) -> float:
-        return points * _spreading(sigma, eps, costs) + samples * sigma**3 * costs.grid_cell
-
-    return min(costs.oversamplings(eps, precision), key=time)
-
-
 def parts(block: Block, shape: Shape | None) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
     """The parts of a block, each with its place in an array of the block.
 
@@ -119,29 +71,27 @@ def parts(block: Block, shape: Shape | None) -> Iterator[tuple[Block, tuple[slic
         yield Block((i, j, k), shape), (x, y, z)
 
 
-def transform_bytes(
-    shape: Shape, eps: float, precision: Precision, load: Load, division: Division, costs: Costs
-) -> int:
+def transform_bytes(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> int:
     """Upper estimate of what transforming to a block of some shape takes, besides its result and the mesh.
 
     Args:
         shape: of the block.
         eps: accuracy.
-        precision: of the field.
+        dtype: of the field.
         load: what is transformed.
         division: how.
         costs: of the library.
     """
     part = division.shape or shape
     grids = 1 + costs.work_grids + (load.fill if costs.scattered else 0)
-    samples = _cells(shape, eps, precision, load, division, costs) * grids + math.prod(part)
+    samples = _cells(shape, eps, dtype, load, division, costs) * grids + math.prod(part)
     points = min(division.batch, load.most_points) * costs.point_bytes
     triangles = load.triangles * costs.triangle_bytes
-    return math.ceil(samples * item_bytes(precision) + points) + triangles + costs.fixed_bytes
+    return math.ceil(samples * item_bytes(dtype) + points) + triangles + costs.fixed_bytes
 
 
 def divide(
-    shape: Shape, eps: float, precision: Precision, load: Load, costs: Costs, *, memory: float, batch: int
+    shape: Shape, eps: float, dtype: ComplexDtype, load: Load, costs: Costs, *, memory: float, batch: int
 ) -> Division:
     """The division that fits into memory and is predicted to be the fastest.
 
@@ -151,7 +101,7 @@ def divide(
     Args:
         shape: of the block.
         eps: accuracy.
-        precision: of the field.
+        dtype: of the field.
         load: what is to be transformed.
         costs: of the library.
         memory: what may be taken besides the result and the mesh, in bytes.
@@ -162,10 +112,10 @@ def divide(
     """
 
     def taken(division: Division) -> int:
-        return transform_bytes(shape, eps, precision, load, division, costs)
+        return transform_bytes(shape, eps, dtype, load, division, costs)
 
     def fits(division: Division) -> bool:
-        cells = _cells(shape, eps, precision, load, division, costs)
+        cells = _cells(shape, eps, dtype, load, division, costs)
         return taken(division) <= memory and cells <= costs.most_cells
 
     undivided = Division(batch)
@@ -177,11 +127,11 @@ def divide(
     found: list[tuple[float, Division]] = []
     least = math.inf
     for points in batches:
-        for sigma in costs.oversamplings(eps, precision):
+        for sigma in costs.oversamplings(eps, dtype):
             for part in _shapes(shape, sigma):
                 division = Division(points, part, sigma)
                 if fits(division):
-                    found.append((_nanoseconds(shape, eps, precision, load, division, costs), division))
+                    found.append((_nanoseconds(shape, eps, dtype, load, division, costs), division))
                     break
             else:
                 least = min(least, taken(division))
@@ -215,27 +165,21 @@ def _axis(samples: int, sigma: float) -> int:
     return 2 * int(next_fast_len(-(-least // 2), real=True))
 
 
-def _cells(shape: Shape, eps: float, precision: Precision, load: Load, division: Division, costs: Costs) -> int:
+def _cells(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> int:
     """Cells of the largest fine grid that a division can lead to."""
     sigma = division.oversampling
     if sigma is None:
         # More points ask for more oversampling, never for less.
         points = min(division.batch, load.most_points)
-        sigma = fastest_oversampling(points, math.prod(shape), eps, precision, costs)
+        sigma = fastest_oversampling(points, math.prod(shape), eps, dtype, costs)
     return math.prod(_axis(samples, sigma) for samples in division.shape or shape)
 
 
-def _spreading(sigma: float, eps: float, costs: Costs) -> float:
-    """Predicted time of spreading a point, in nanoseconds."""
-    width = math.ceil(-math.log(eps) / (math.pi * math.sqrt(1 - 1 / sigma)))
-    return costs.point + costs.spread_cell * width**3
-
-
-def _nanoseconds(shape: Shape, eps: float, precision: Precision, load: Load, division: Division, costs: Costs) -> float:
+def _nanoseconds(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> float:
     """Predicted time of a division with a shape and an oversampling, in nanoseconds."""
-    part, sigma = division.shape or shape, division.oversampling or max(costs.finest[precision])
+    part, sigma = division.shape or shape, division.oversampling or max(costs.finest[dtype])
     count = math.prod(math.ceil(whole / step) for whole, step in zip(shape, part, strict=True))
     rounds = math.ceil(max(load.points, 1) / division.batch)
-    each = costs.making + count * _spreading(sigma, eps, costs)
-    cells = _cells(shape, eps, precision, load, division, costs)
+    each = costs.making + count * spreading_nanoseconds(sigma, eps, costs)
+    cells = _cells(shape, eps, dtype, load, division, costs)
     return load.points * each + rounds * count * cells * costs.grid_cell

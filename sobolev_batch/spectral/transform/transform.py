@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
-from sobolev_batch.spectral.dtypes import Complexes, Precision, item_bytes
+from sobolev_batch.spectral.backends.costs import Costs
+from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes, item_bytes
 from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.transform.memory import Costs, Division, Load, divide, transform_bytes
+from sobolev_batch.spectral.transform.memory import Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Surface
@@ -32,7 +33,7 @@ NUMERICS_VERSION = 3
 DEFAULT_BATCH = 1 << 21
 
 # What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
-FINEST_EPS: dict[Precision, float] = {"complex128": 1e-14, "complex64": 2e-7}
+FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
 # The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of
 # degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that found most of it.
@@ -47,13 +48,13 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Transform:
+class TransformSettings:
     """How fields are computed.
 
     Args:
         eps: accuracy of a field relative to the surface's area. None stands for 1e-9 in complex128
             and 1e-6 in complex64.
-        precision: "complex128" or "complex64".
+        dtype: "complex128" or "complex64".
         quadrature: see `Quadrature`.
         tolerance: largest error of the triangle rules on any one triangle, relative to its area, and of
             the nodes of a parametrised surface, relative to the whole area; None stands for eps.
@@ -63,19 +64,19 @@ class Transform:
     """
 
     eps: float | None = None
-    precision: Precision = "complex128"
+    dtype: ComplexDtype = "complex128"
     quadrature: Quadrature = field(default_factory=Quadrature)
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
-        if self.precision not in get_args(Precision):
-            raise InputError(f"dtype must be 'complex128' or 'complex64', found {self.precision!r}")
+        if self.dtype not in get_args(ComplexDtype):
+            raise InputError(f"dtype must be 'complex128' or 'complex64', found {self.dtype!r}")
         if self.eps is None:
-            object.__setattr__(self, "eps", 1e-9 if self.precision == "complex128" else 1e-6)
-        finest = FINEST_EPS[self.precision]
+            object.__setattr__(self, "eps", 1e-9 if self.dtype == "complex128" else 1e-6)
+        finest = FINEST_EPS[self.dtype]
         if not finest <= self.accuracy <= COARSEST_EPS:
             raise InputError(
-                f"eps must lie between {finest:g} and {COARSEST_EPS:g} in {self.precision}, found {self.eps!r}"
+                f"eps must lie between {finest:g} and {COARSEST_EPS:g} in {self.dtype}, found {self.eps!r}"
             )
 
     @property
@@ -117,7 +118,7 @@ def transform_block(
     surface: Surface,
     lattice: Lattice,
     block: Block,
-    settings: Transform,
+    settings: TransformSettings,
     *,
     backend: Backend = CPU,
     threads: int = 1,
@@ -146,7 +147,7 @@ def transform_block(
             parametrised surface does not settle.
     """
     if isinstance(surface, Sphere):
-        return Transformed(_closed_form(surface, lattice, block, settings.precision), 0, "closed form")
+        return Transformed(_closed_form(surface, lattice, block, settings.dtype), 0, "closed form")
     require_inside(surface, lattice)
     division = Division(batch)
     if memory is not None:
@@ -163,7 +164,7 @@ def transform_block(
 
 
 def _on_gpu(
-    surface: Mesh | Smooth, lattice: Lattice, block: Block, settings: Transform, batch: int, backend: Gpu
+    surface: Mesh | Smooth, lattice: Lattice, block: Block, settings: TransformSettings, batch: int, backend: Gpu
 ) -> Transformed | str:
     """The transform of a surface by a GPU, or why it failed.
 
@@ -171,7 +172,7 @@ def _on_gpu(
     """
     try:
         with backend.work():
-            room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.precision)
+            room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.dtype)
             for _ in range(_ATTEMPTS):
                 division, taken = _division(surface, lattice, block, settings, backend.costs, memory=room, batch=batch)
                 backend.make_room(taken)
@@ -197,7 +198,7 @@ def _computed(
     surface: Mesh | Smooth,
     lattice: Lattice,
     block: Block,
-    settings: Transform,
+    settings: TransformSettings,
     division: Division,
     backend: Backend,
     threads: int,
@@ -211,7 +212,7 @@ def _computed(
         lattice,
         block,
         eps=settings.accuracy,
-        precision=settings.precision,
+        dtype=settings.dtype,
         threads=threads,
         backend=backend,
         shape=division.shape,
@@ -222,7 +223,7 @@ def _computed(
 
 def memory_bytes(
     block: Block,
-    settings: Transform,
+    settings: TransformSettings,
     batch: int = DEFAULT_BATCH,
     *,
     memory: float | None = None,
@@ -241,19 +242,17 @@ def memory_bytes(
         triangles: of the mesh; each takes some bytes while its rule is chosen.
     """
     load = Load(math.inf, triangles=triangles)
-    needed: float = transform_bytes(
-        block.shape, settings.accuracy, settings.precision, load, Division(batch), CPU.costs
-    )
+    needed: float = transform_bytes(block.shape, settings.accuracy, settings.dtype, load, Division(batch), CPU.costs)
     if memory is not None:
         needed = min(needed, memory)
-    return block.size * item_bytes(settings.precision) + math.ceil(needed)
+    return block.size * item_bytes(settings.dtype) + math.ceil(needed)
 
 
 def _division(
     surface: Mesh | Smooth,
     lattice: Lattice,
     block: Block,
-    settings: Transform,
+    settings: TransformSettings,
     costs: Costs,
     *,
     memory: float,
@@ -264,22 +263,22 @@ def _division(
     Raises:
         InputError: the memory is too little.
     """
-    shape, eps, precision = block.shape, settings.accuracy, settings.precision
+    shape, eps, dtype = block.shape, settings.accuracy, settings.dtype
     low, high = surface.bounds
     fill = float(np.prod((high - low) / (2 * lattice.half_period)))
     triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
     load = Load(math.inf, triangles=triangles, fill=fill)
-    if transform_bytes(shape, eps, precision, load, Division(batch), costs) > memory:
+    if transform_bytes(shape, eps, dtype, load, Division(batch), costs) > memory:
         # Only now do the points need counting.
         points, most = settings.quadrature.sizes(surface, lattice.highest_frequency, settings.rule_tolerance)
         load = replace(load, points=points, most_points=most)
-    division = divide(shape, eps, precision, load, costs, memory=memory, batch=batch)
-    return division, transform_bytes(shape, eps, precision, load, division, costs)
+    division = divide(shape, eps, dtype, load, costs, memory=memory, batch=batch)
+    return division, transform_bytes(shape, eps, dtype, load, division, costs)
 
 
-def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, precision: Precision) -> Complexes:
+def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, dtype: ComplexDtype) -> Complexes:
     """The transform of a sphere, slab by slab: whole temporaries would take several times the block."""
-    values: Complexes = np.empty(block.shape, dtype=precision)
+    values: Complexes = np.empty(block.shape, dtype=dtype)
     step = max(1, _SLAB // math.prod(block.shape[1:]))
     for first in range(0, block.shape[0], step):
         count = min(step, block.shape[0] - first)

@@ -37,7 +37,7 @@ TriangleCounts = Annotated[
 ]
 
 
-class Decimate(NestedSource):
+class DecimateSource(NestedSource):
     """Simplifications of one mesh by quadric edge collapse.
 
     M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),

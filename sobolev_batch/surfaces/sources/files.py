@@ -24,7 +24,7 @@ _LONGEST_NAME = 1000
 _MOST_PATHS = 100_000
 
 
-class Files(Source):
+class FileSource(Source):
     """Mesh files.
 
     Attributes:

@@ -41,7 +41,7 @@ Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
 Levels = Annotated[tuple[Level, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
 
 
-class Icospheres(Source):
+class IcosphereSource(Source):
     """Icosahedral triangulations T_N of the unit sphere.
 
     Attributes:
@@ -73,7 +73,7 @@ class IcosphereMember(Member):
         return Size(triangles, _MAKING_BYTES * triangles)
 
 
-class Spheres(Source):
+class SphereSource(Source):
     """A sphere in closed form.
 
     Attributes:
@@ -126,7 +126,7 @@ class SmoothMember(Member):
         return self.identity
 
 
-class Ellipsoids(Source):
+class EllipsoidSource(Source):
     """An ellipsoid as a smooth surface.
 
     Attributes:
@@ -157,7 +157,7 @@ class Ellipsoids(Source):
         return (SmoothMember("ellipsoid", -1, self.shape, self.identity),)
 
 
-class EllipsoidLevels(Ellipsoids):
+class EllipsoidLevelsSource(EllipsoidSource):
     """Icospheres with their vertices moved onto an ellipsoid.
 
     Attributes:
@@ -192,7 +192,7 @@ class EllipsoidMember(Member):
         return Size(triangles, _MAKING_BYTES * triangles)
 
 
-class Tori(Source):
+class TorusSource(Source):
     """A torus as a smooth surface, its axis along z.
 
     Attributes:
@@ -225,7 +225,7 @@ class Tori(Source):
         return (SmoothMember("torus", -1, self.shape, self.identity),)
 
 
-class TorusGrids(Tori):
+class TorusGridSource(TorusSource):
     """Grids of points on a torus, each cell of them cut into two triangles.
 
     Attributes:

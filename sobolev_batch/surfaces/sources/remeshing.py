@@ -26,7 +26,7 @@ from sobolev_batch.surfaces.sources.registry import (
 _VERTICES_PER_CLUSTER = 10
 
 
-class Remesh(NestedSource):
+class RemeshSource(NestedSource):
     """Even remeshings of one mesh by clustering its vertices into cells of like area.
 
     S. Valette, J.-M. Chassery, "Approximated centroidal Voronoi diagrams for uniform polygonal mesh

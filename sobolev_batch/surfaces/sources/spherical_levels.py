@@ -17,7 +17,7 @@ from sobolev_batch.surfaces.sources.generated import Levels
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member, NestedSource, Size, Source, sole_member
 
 
-class SphericalLevels(NestedSource):
+class SphericalLevelsSource(NestedSource):
     """Coarse versions of a surface whose vertices follow an icosahedral refinement.
 
     The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:

@@ -22,9 +22,9 @@ from sobolev_batch.batch.analysis.compare import Comparer
 from sobolev_batch.batch.analysis.compare_tasks import Comparison, Stored, compare_by_proximity, compare_by_witness
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
-from sobolev_batch.batch.cluster.workers import Crew, CrewMember
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.run import Summary
-from sobolev_batch.batch.store.comparison_records import KINDS, Kind, Note, Notes
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, ComparisonRecords, Kind
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import make_plan
@@ -267,13 +267,16 @@ def test_a_task_that_outlives_its_run_is_not_believed(
     store: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It writes values of other orders into the array of the next run, and a note of its own."""
-    other, straggler = asking(witness={"orders": [-3.0, -5.0]}), Note("of another run", "complete", checksum=1)
+    other, straggler = (
+        asking(witness={"orders": [-3.0, -5.0]}),
+        ComparisonRecord("of another run", "complete", checksum=1),
+    )
     make = Comparer._make
 
     def make_and_spoil(self: Comparer, kind: Kind, *arguments: Any) -> None:
         make(self, kind, *arguments)
         if kind == "witness":
-            Notes(self.store, kind).write(1, straggler)
+            ComparisonRecords(self.store, kind).write(1, straggler)
 
     monkeypatch.setattr(Comparer, "_make", make_and_spoil)
     sb.run(other, store, client)
@@ -478,7 +481,7 @@ def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path
     """The old mesh may come back after a run for another one that ended between its values and their note."""
     place = tmp_path / "s.zarr"
     sb.run(of_files(files), place, client)
-    old = {note.key for note in Notes(Store.open(place), "witness").read() if note is not None}
+    old = {note.key for note in ComparisonRecords(Store.open(place), "witness").read() if note is not None}
     assert len(old) == 2
     for name, level in (("a.ply", 2), ("b.ply", 1)):
         write_sphere(files / name, level, radius=0.7)
@@ -489,7 +492,7 @@ def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path
 
     with pytest.raises(Killed):
         sb.run(of_files(files), place, client, on_progress=end)
-    assert not old & {note.key for note in Notes(Store.open(place), "witness").read() if note is not None}
+    assert not old & {note.key for note in ComparisonRecords(Store.open(place), "witness").read() if note is not None}
 
 
 def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, client: Client) -> None:
@@ -497,7 +500,7 @@ def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, 
     place = tmp_path / "s.zarr"
     write_sphere(files / "a.ply", 6)
     sb.run(of_files(files), place, client)
-    Notes(Store.open(place), "witness").write(0, None)
+    ComparisonRecords(Store.open(place), "witness").write(0, None)
     write_sphere(files / "a.ply", 2)
     sb.run(of_files(files), place, client)
     assert_right(place, of_files(files))
@@ -516,7 +519,7 @@ def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
     note = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity), 100)
     assert note.status == "failed"
     assert "is not the mesh whose field is stored" in note.reason
-    assert Notes(here, "proximity").read()[1] == note
+    assert ComparisonRecords(here, "proximity").read()[1] == note
 
 
 def test_a_mesh_that_failed_is_left_out(store_path: Path, tmp_path: Path, client: Client) -> None:
@@ -538,7 +541,7 @@ def test_a_mesh_that_failed_is_left_out(store_path: Path, tmp_path: Path, client
 def test_too_little_memory_is_foreseen(store: Path, client: Client) -> None:
     study = asking(witness={"orders": [-2.0]})
     here, plan = Store.open(store), make_plan(study)
-    small = Crew((CrewMember("tcp://small", 1, 2e8, "cpu", ""),))
+    small = Workers((WorkerInfo("tcp://small", 1, 2e8, "cpu", ""),))
     reasons = Comparer.of(here, plan, plan.rows, here.records()).carry_out(client, small, lambda progress: None)
     assert sorted(reasons) == ["ico/0", "ico/1", "ico/2", "ico/3"]
     assert reasons["ico/0"].startswith("no witness: it takes about")
@@ -616,11 +619,11 @@ def test_sections_that_make_no_sense(section: dict[str, Any], words: str) -> Non
 
 
 def test_notes_survive_as_text() -> None:
-    note = Note("key", "complete", "", {"chamfer": 0.1}, 7, 0.5)
-    assert Note.from_json(note.to_json()) == note
-    assert Note.from_json("") is None
+    note = ComparisonRecord("key", "complete", "", {"chamfer": 0.1}, 7, 0.5)
+    assert ComparisonRecord.from_json(note.to_json()) == note
+    assert ComparisonRecord.from_json("") is None
     with pytest.raises(sb.DamageError):
-        Note.from_json('{"key": 1')
+        ComparisonRecord.from_json('{"key": 1')
 
 
 def test_what_was_not_compared_gives_status_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

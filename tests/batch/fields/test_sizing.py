@@ -5,23 +5,23 @@ from __future__ import annotations
 import pytest
 
 from sobolev_batch import ClusterError, Lattice
-from sobolev_batch.batch.cluster.workers import Crew, CrewMember
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.sizing import lay_out
 from sobolev_batch.spectral.backends.backends import CPU_COSTS
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.memory import Load, divide
-from sobolev_batch.spectral.transform.transform import Transform, memory_bytes
+from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes
 from sobolev_batch.surfaces.sources.registry import Size
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
 LARGE = Lattice(5.0, 512).split(1 << 24)
-TRANSFORM = Transform()
+TRANSFORM = TransformSettings()
 
 
-def crew(*spare_gigabytes: float, threads: int = 1) -> Crew:
-    return Crew(
+def crew(*spare_gigabytes: float, threads: int = 1) -> Workers:
+    return Workers(
         tuple(
-            CrewMember(f"tcp://{number}", threads, 1e9 * spare, "cpu", "")
+            WorkerInfo(f"tcp://{number}", threads, 1e9 * spare, "cpu", "")
             for number, spare in enumerate(spare_gigabytes)
         )
     )
@@ -36,7 +36,7 @@ def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
 
 
 @pytest.mark.parametrize("workers", [crew(4), crew(4, 4), crew(64, 64, 64, threads=8)])
-def test_a_huge_mesh_is_cut_into_the_same_parts_on_any_cluster(workers: Crew) -> None:
+def test_a_huge_mesh_is_cut_into_the_same_parts_on_any_cluster(workers: Workers) -> None:
     assert lay_out(ONE_CHUNK, TRANSFORM, Size(20_000_000, 2e9), workers, rows=1).parts == 10
 
 

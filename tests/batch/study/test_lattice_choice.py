@@ -15,12 +15,12 @@ from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, dis
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study import lattice_choice as choice_module
-from sobolev_batch.batch.study.lattice_choice import Choice
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.spectral.adaptive.solve import pilot_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import Assessed
+from sobolev_batch.spectral.errors.budget import NormEstimate
 from tests.support.studies import small_table, variable
 
 RTOL = 1e-3
@@ -125,11 +125,11 @@ def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client
 
 def test_growth_goes_by_what_is_short() -> None:
     accuracy, orders = Accuracy(1e-3), (-4.0,)
-    choice = Choice(Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
+    choice = LatticeChoice(Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
 
-    def grown(truncation: float, aliasing: float) -> Choice | None:
+    def grown(truncation: float, aliasing: float) -> LatticeChoice | None:
         parts = [np.array([[value]]) for value in (1.0, truncation, aliasing, 0.0)]
-        return choice.grown(Assessed(*parts), orders, accuracy)
+        return choice.grown(NormEstimate(*parts), orders, accuracy)
 
     assert grown(1e-4, 1e-5) is None
     cut = grown(1e-2, 1e-5)
@@ -139,7 +139,7 @@ def test_growth_goes_by_what_is_short() -> None:
     assert folded is not None
     assert folded.lattice.spacing < choice.lattice.spacing
     narrow = Accuracy(1e-3, 3.1e8)
-    assert choice.grown(Assessed(*(np.array([[v]]) for v in (1.0, 0.9, 0.9, 0.0))), orders, narrow) is None
+    assert choice.grown(NormEstimate(*(np.array([[v]]) for v in (1.0, 0.9, 0.9, 0.0))), orders, narrow) is None
 
 
 def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Path) -> None:

@@ -147,7 +147,7 @@ def test_no_family_is_called_reference(name: str) -> None:
     [
         "os:system",
         "os.system",
-        "sobolev_batch.surfaces.sources.files:Files",
+        "sobolev_batch.surfaces.sources.files:FileSource",
         "__import__('os')",
         "../files",
         "files\n",

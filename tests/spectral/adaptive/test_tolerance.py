@@ -20,9 +20,9 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, good_intervals
-from sobolev_batch.spectral.errors.budget import support_widths
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.surfaces.shapes.extent import support_widths
 from tests.support.shapes import CENTRED_BOX as BOX
 
 

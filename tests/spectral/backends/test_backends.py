@@ -18,18 +18,18 @@ from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fouri
 from sobolev_batch.spectral.backends import backends, cuda
 from sobolev_batch.spectral.backends.arrays import combine, sums_of_runs
 from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.transform import Transform, Transformed, transform_block
+from sobolev_batch.spectral.transform.transform import Transformed, TransformSettings, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 from tests.support.repository import PACKAGE, imported
 
 LATTICE = Lattice(5.0, 32)
-DOUBLE = Transform(1e-13)
+DOUBLE = TransformSettings(1e-13)
 
 
 def uneven() -> Mesh:
@@ -45,7 +45,7 @@ def uneven() -> Mesh:
     )
 
 
-def on(backend: backends.Backend, mesh: Mesh, settings: Transform = DOUBLE, **options: Any) -> Transformed:
+def on(backend: backends.Backend, mesh: Mesh, settings: TransformSettings = DOUBLE, **options: Any) -> Transformed:
     return transform_block(mesh, LATTICE, LATTICE.half, settings, backend=backend, **options)
 
 
@@ -56,7 +56,7 @@ def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, toleranc
     assert np.abs(found.values - expected.values).max() < tolerance * mesh.area
 
 
-def rules_in_use(mesh: Mesh, settings: Transform) -> set[str]:
+def rules_in_use(mesh: Mesh, settings: TransformSettings) -> set[str]:
     groups = settings.quadrature._groups(mesh, LATTICE.highest_frequency, settings.rule_tolerance)
     kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
     return {"split" if group.splits else kinds.get(group.rule, "interior") for group in groups}
@@ -69,7 +69,7 @@ MESHES: list[Callable[[], Mesh]] = [*(lambda level=level: icosphere(level) for l
 @pytest.mark.parametrize("quadrature", ["auto", "gauss8", 7])
 def test_the_fake_agrees_with_the_processor(make: Callable[[], Mesh], quadrature: str | int) -> None:
     mesh = make()
-    settings = Transform(1e-13, quadrature=Quadrature(quadrature))
+    settings = TransformSettings(1e-13, quadrature=Quadrature(quadrature))
     found = on(Device().backend(), mesh, settings)
     assert found.backend == "cufinufft"
     assert_agree(found, on(CPU, mesh, settings), mesh)
@@ -77,7 +77,7 @@ def test_the_fake_agrees_with_the_processor(make: Callable[[], Mesh], quadrature
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
 def test_every_kind_of_rule_agrees(tolerance: float) -> None:
-    mesh, settings = uneven(), Transform(1e-13, tolerance=tolerance)
+    mesh, settings = uneven(), TransformSettings(1e-13, tolerance=tolerance)
     if tolerance == 1e-2:
         assert rules_in_use(mesh, settings) == {"corners", "midpoints", "interior", "split"}
     found = on(Device().backend(), mesh, settings)
@@ -86,7 +86,7 @@ def test_every_kind_of_rule_agrees(tolerance: float) -> None:
 
 
 def test_single_precision_agrees_to_its_own_accuracy() -> None:
-    mesh, settings = uneven(), Transform(1e-6, "complex64")
+    mesh, settings = uneven(), TransformSettings(1e-6, "complex64")
     found = on(Device().backend(), mesh, settings)
     assert found.backend == "cufinufft"
     assert_agree(found, on(CPU, mesh, settings), mesh, 1e-5)
@@ -105,7 +105,7 @@ def test_batches_and_blocks_agree(block: Block) -> None:
 
 @pytest.mark.parametrize("eps", [1e-5, 1e-9])
 def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog: pytest.LogCaptureFixture) -> None:
-    mesh, settings, lattice = icosphere(5), Transform(eps), Lattice(5.0, 64)
+    mesh, settings, lattice = icosphere(5), TransformSettings(eps), Lattice(5.0, 64)
     expected = transform_block(mesh, lattice, lattice.half, settings)
     device = Device(capacity=7.5e7)
     found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
@@ -117,7 +117,7 @@ def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog:
 
 
 def test_what_is_foreseen_of_a_device_is_what_it_takes() -> None:
-    mesh, settings = icosphere(6), Transform(1e-9)
+    mesh, settings = icosphere(6), TransformSettings(1e-9)
     device = Device()
     on(device.backend(), mesh, settings, batch=200_000)
     allowed = device.most_used / 0.9
@@ -141,7 +141,7 @@ def test_out_of_memory_is_tried_again_in_smaller_parts(
     where: str, times: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     mesh, lattice, device = icosphere(5), Lattice(5.0, 64), Device(failures=[(where, "memory")] * times)
-    settings = Transform(1e-9)
+    settings = TransformSettings(1e-9)
     found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
     assert found.backend == "cufinufft"
     assert_agree(found, transform_block(mesh, lattice, lattice.half, settings), mesh, 5e-9)
@@ -197,9 +197,9 @@ def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left()
 
 def test_memory_bounds_the_processor_that_steps_in() -> None:
     mesh, device = icosphere(3), Device(failures=[("execute", "error")])
-    found = on(device.backend(), mesh, Transform(1e-9), memory=1.2e7)
+    found = on(device.backend(), mesh, TransformSettings(1e-9), memory=1.2e7)
     assert found.backend.startswith("finufft after")
-    assert np.array_equal(found.values, on(CPU, mesh, Transform(1e-9), memory=1.2e7).values)
+    assert np.array_equal(found.values, on(CPU, mesh, TransformSettings(1e-9), memory=1.2e7).values)
     with pytest.raises(InputError, match="give at least"):
         on(Device().backend(), mesh, memory=1e6)
 
@@ -215,10 +215,10 @@ def test_two_threads_take_turns() -> None:
 def test_fields_carry_their_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Device().backend()
     mesh = icosphere(2)
-    assert compute_field(mesh, LATTICE, Transform(), [-2.0], backend=backend).backend == "cufinufft"
+    assert compute_field(mesh, LATTICE, TransformSettings(), [-2.0], backend=backend).backend == "cufinufft"
     goal = Goal((-2.0,), (1e-3,))
-    assert field_for(mesh, LATTICE, goal, Transform(), backend=backend).backend == "cufinufft"
-    assert field_for(Sphere(), LATTICE, goal, Transform(), backend=backend).backend == "closed form"
+    assert field_for(mesh, LATTICE, goal, TransformSettings(), backend=backend).backend == "cufinufft"
+    assert field_for(Sphere(), LATTICE, goal, TransformSettings(), backend=backend).backend == "closed form"
     monkeypatch.setattr(backends, "gpu_backend", lambda: backend)
     attributes = {name: fourier_transform(mesh, LATTICE, backend=name).attrs["backend"] for name in ("gpu", "auto")}
     assert attributes == {"gpu": "cufinufft", "auto": "cufinufft"}
@@ -478,13 +478,13 @@ def test_a_gpu_agrees_with_the_processor(gpu: Gpu, make: Callable[[], Mesh]) -> 
     assert_agree(found, on(CPU, mesh), mesh)
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("complex128", 1e-12), ("complex64", 1e-5)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("complex128", 1e-12), ("complex64", 1e-5)])
 @pytest.mark.parametrize("rule_tolerance", [1e-2, 1e-4])
 def test_a_gpu_agrees_in_both_precisions(
-    gpu: Gpu, precision: Precision, tolerance: float, rule_tolerance: float
+    gpu: Gpu, dtype: ComplexDtype, tolerance: float, rule_tolerance: float
 ) -> None:
     mesh = uneven()
-    settings = Transform(1e-13 if precision == "complex128" else 1e-6, precision, tolerance=rule_tolerance)
+    settings = TransformSettings(1e-13 if dtype == "complex128" else 1e-6, dtype, tolerance=rule_tolerance)
     found = on(gpu, mesh, settings, batch=20_000)
     assert found.backend == "cufinufft"
     assert_agree(found, on(CPU, mesh, settings), mesh, tolerance)

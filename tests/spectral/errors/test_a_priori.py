@@ -11,7 +11,7 @@ import trimesh
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.errors.a_priori import Census, Goal, loosest_tolerance, permits_single, settle
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
 
 LATTICE = Lattice(3.0, 32)
@@ -36,14 +36,14 @@ def test_settled_fields_keep_their_goal_and_are_not_wasteful(name: str, order: f
     points = []
     for relative in (1e-2, 1e-4, 1e-6, 1e-8):
         goal = Goal((order,), (relative * scale,))
-        settings = settle(mesh, LATTICE, goal, Transform())
+        settings = settle(mesh, LATTICE, goal, TransformSettings())
         made = transform_block(mesh, LATTICE, LATTICE.half, settings)
         error = norm(exact.copy(data=made.values - exact.values), order)["norm"].item()
         # The forecast is no bound: the probe says what came of it, and whoever needs it tightens.
         assert error < 4 * goal.norms[0]
         points.append(made.points)
     assert points == sorted(points)
-    careful = transform_block(mesh, LATTICE, LATTICE.half, Transform(1e-8)).points
+    careful = transform_block(mesh, LATTICE, LATTICE.half, TransformSettings(1e-8)).points
     assert points[-1] <= careful
 
 
@@ -52,7 +52,7 @@ def test_probed_fields_keep_their_goal(name: str) -> None:
     mesh, orders = MESHES[name], (-2.0, -8.0)
     exact = fourier_transform(mesh, LATTICE, 1e-13)
     goal = Goal(orders, tuple((1e-5 * norm(exact, orders)["norm"].values).tolist()))
-    field = field_for(mesh, LATTICE, goal, Transform())
+    field = field_for(mesh, LATTICE, goal, TransformSettings())
     errors = norm(exact.copy(data=field.values - exact.values), orders)["norm"].values
     assert (errors <= goal.norms).all()
     assert (field.quality.probe.norms(LATTICE, orders) <= goal.norms).all()
@@ -62,7 +62,7 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
     mesh, lattice, orders = icosphere(5), Lattice(2.5, 24), (-4.0, -10.0)
     exact = fourier_transform(mesh, lattice, 1e-13)
     for tolerance in (0.2, 1e-2, 1e-3):
-        settings = Transform(1e-13, tolerance=tolerance)
+        settings = TransformSettings(1e-13, tolerance=tolerance)
         made = transform_block(mesh, lattice, lattice.half, settings)
         true = norm(exact.copy(data=made.values - exact.values), orders)["norm"].values
         forecast = Census.of(mesh).quadrature_error(lattice, orders, tolerance)
@@ -82,7 +82,7 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
     area = Sphere().area
     assert permits_single(Sphere(), LATTICE, Goal((-2.0,), (1e-4 * area,)))
     assert not permits_single(Sphere(), LATTICE, Goal((-2.0,), (1e-8 * area,)))
-    field = field_for(Sphere(), LATTICE, Goal((-2.0,), (1e-4 * area,)), Transform(precision="complex64"))
+    field = field_for(Sphere(), LATTICE, Goal((-2.0,), (1e-4 * area,)), TransformSettings(dtype="complex64"))
     # The rounding of a closed form to single precision is an error like any other.
     exact = fourier_transform(Sphere(), LATTICE)
     true = norm(exact.copy(data=field.values - exact.values), -2.0)["norm"].item()
@@ -90,7 +90,7 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
 
 
 def test_settings_keep_precision_and_quadrature() -> None:
-    given = Transform(precision="complex64")
+    given = TransformSettings(dtype="complex64")
     settled = settle(BOX, LATTICE, Goal((-2.0,), (1e-9,)), given)
     assert replace(settled, eps=given.eps, tolerance=None) == given
     assert settled.accuracy == 2e-7

@@ -26,13 +26,13 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.errors.budget import DIRECTIONS
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.quadrature import meshes as quadrature
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolve
-from sobolev_batch.spectral.transform.transform import Transform, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.support.fake_device import Device
 from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
@@ -154,7 +154,7 @@ def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
 
 @pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
 def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
-    settings = Transform(1e-13)
+    settings = TransformSettings(1e-13)
     whole = transform_block(surface, LATTICE, LATTICE.half, settings)
     assert whole.points > 1000
     for block in LATTICE.split(4000):
@@ -329,7 +329,7 @@ def test_a_gpu_gets_the_same_nodes() -> None:
     device = Device()
     for surface in SMOOTH:
         found, expected = (
-            transform_block(surface, LATTICE, LATTICE.half, Transform(1e-13), backend=backend, batch=1 << 13)
+            transform_block(surface, LATTICE, LATTICE.half, TransformSettings(1e-13), backend=backend, batch=1 << 13)
             for backend in (device.backend(), CPU)
         )
         assert (found.backend, expected.backend) == ("cufinufft", "finufft")
@@ -340,7 +340,8 @@ def test_a_gpu_gets_the_same_nodes() -> None:
 def test_little_memory_makes_parts_and_not_other_numbers() -> None:
     surface, lattice = SMOOTH[1], Lattice(4.0, 64)
     whole, parts = (
-        transform_block(surface, lattice, lattice.half, Transform(1e-9), memory=memory) for memory in (None, 1.5e7)
+        transform_block(surface, lattice, lattice.half, TransformSettings(1e-9), memory=memory)
+        for memory in (None, 1.5e7)
     )
     assert whole.points == parts.points
     assert 0 < np.abs(whole.values - parts.values).max() < 1e-8 * surface.area

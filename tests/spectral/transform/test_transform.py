@@ -12,15 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.dtypes import Precision
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
-from sobolev_batch.spectral.transform.transform import Transform, memory_bytes, transform_block
+from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes, transform_block
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.sources.files import Files
+from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -52,7 +52,7 @@ def bumpy(rng: np.random.Generator) -> Mesh:
 def cortex(rng: np.random.Generator) -> Mesh:
     pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
     path = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
-    (member,) = Files(paths=(path,), distribution="nilearn").members(Path())
+    (member,) = FileSource(paths=(path,), distribution="nilearn").members(Path())
     mesh = member.load()
     scaled = Similarity.to_unit_ball(mesh).apply(mesh)
     assert isinstance(scaled, Mesh)
@@ -81,7 +81,7 @@ def test_single_precision_reaches_its_own_accuracy() -> None:
 
 def test_every_block_of_the_lattice_equals_the_same_part_of_the_whole() -> None:
     lattice, mesh = Lattice(4.0, 20), icosphere(2)
-    settings = Transform(1e-12)
+    settings = TransformSettings(1e-12)
     whole = transform_block(mesh, lattice, lattice.half, settings).values
     for block in (*lattice.split(600), Block((-3, 4, 2), (5, 2, 4)), Block((10, -10, 0), (1, 1, 1))):
         part = transform_block(mesh, lattice, block, settings).values
@@ -97,29 +97,29 @@ def test_parts_of_a_mesh_add_up() -> None:
 
 def test_batches_change_nothing_but_rounding() -> None:
     lattice, mesh = Lattice(3.0, 16), icosphere(3)
-    settings = Transform(1e-12)
+    settings = TransformSettings(1e-12)
     one = transform_block(mesh, lattice, lattice.half, settings).values
     many = transform_block(mesh, lattice, lattice.half, settings, batch=4_000).values
     assert np.abs(one - many).max() < 1e-11 * mesh.area
 
 
 @pytest.mark.parametrize("memory", [2.5e7, 1.2e7, 9.9e6])
-@pytest.mark.parametrize("precision", ["complex128", "complex64"])
-def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: float, precision: Precision) -> None:
+@pytest.mark.parametrize("dtype", ["complex128", "complex64"])
+def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: float, dtype: ComplexDtype) -> None:
     lattice, mesh = Lattice(5.0, 64), bumpy(np.random.default_rng(5))
-    settings = Transform(1e-9 if precision == "complex128" else 1e-6, precision)
+    settings = TransformSettings(1e-9 if dtype == "complex128" else 1e-6, dtype)
     whole = transform_block(mesh, lattice, lattice.half, settings)
     assert memory_bytes(lattice.half, settings, triangles=len(mesh.triangles)) > 3 * memory
     divided = transform_block(mesh, lattice, lattice.half, settings, memory=memory)
     assert divided.points == whole.points
-    assert divided.values.dtype == precision
+    assert divided.values.dtype == dtype
     assert not np.array_equal(divided.values, whole.values)
     assert np.abs(divided.values - whole.values).max() < 5 * settings.accuracy * mesh.area
 
 
 def test_enough_memory_changes_nothing() -> None:
     lattice, mesh = Lattice(5.0, 32), bumpy(np.random.default_rng(5))
-    settings = Transform(1e-9)
+    settings = TransformSettings(1e-9)
     ample = memory_bytes(lattice.half, settings, triangles=len(mesh.triangles))
     whole, same = (transform_block(mesh, lattice, lattice.half, settings, memory=memory) for memory in (None, ample))
     assert np.array_equal(whole.values, same.values)
@@ -128,11 +128,11 @@ def test_enough_memory_changes_nothing() -> None:
 def test_states_the_smallest_memory() -> None:
     lattice, mesh = Lattice(5.0, 32), icosphere(2)
     with pytest.raises(InputError, match=r"^1 MB .* 33 x 33 x 17 samples: give at least [\d.]+ MB") as caught:
-        transform_block(mesh, lattice, lattice.half, Transform(), memory=1e6)
+        transform_block(mesh, lattice, lattice.half, TransformSettings(), memory=1e6)
     least = float(str(caught.value).split("at least ")[1].split(" MB")[0]) * 1e6
-    transform_block(mesh, lattice, lattice.half, Transform(), memory=least)
+    transform_block(mesh, lattice, lattice.half, TransformSettings(), memory=least)
     with pytest.raises(InputError, match="give at least"):
-        transform_block(mesh, lattice, lattice.half, Transform(), memory=least - 1.1e5)
+        transform_block(mesh, lattice, lattice.half, TransformSettings(), memory=least - 1.1e5)
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_the_papers_quadrature_stays_available() -> None:
     lattice, mesh = Lattice(5.0, 32), icosphere(4)
     paper = fourier_transform(mesh, lattice, 1e-12, quadrature="gauss8")
     assert np.abs(paper - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
-    settings = Transform(1e-6, quadrature=Quadrature("gauss8"))
+    settings = TransformSettings(1e-6, quadrature=Quadrature("gauss8"))
     assert transform_block(mesh, lattice, lattice.half, settings).points == 64 * 5120
 
 
@@ -233,13 +233,13 @@ def test_refuses_meshes_that_would_fold() -> None:
 
 
 @pytest.mark.parametrize(
-    ("eps", "precision"), [(1e-15, "complex128"), (0.5, "complex128"), (1e-9, "complex64"), (np.nan, "complex128")]
+    ("eps", "dtype"), [(1e-15, "complex128"), (0.5, "complex128"), (1e-9, "complex64"), (np.nan, "complex128")]
 )
-def test_refuses_accuracies_out_of_reach(eps: float, precision: str) -> None:
+def test_refuses_accuracies_out_of_reach(eps: float, dtype: str) -> None:
     with pytest.raises(InputError, match="eps must lie between"):
-        Transform(eps, precision)  # type: ignore[arg-type]
+        TransformSettings(eps, dtype)  # type: ignore[arg-type]
 
 
 def test_refuses_other_precisions() -> None:
     with pytest.raises(InputError, match="dtype must be"):
-        Transform(1e-6, "float64")  # type: ignore[arg-type]
+        TransformSettings(1e-6, "float64")  # type: ignore[arg-type]
