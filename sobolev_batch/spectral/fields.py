@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,8 +20,8 @@ from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
-from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 # Where nobody says which orders a field is for.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
@@ -115,7 +115,6 @@ def compute_field(
     orders: Sequence[float],
     *,
     sample: Sample | None = None,
-    extent: Quality | None = None,
     backend: Backend = CPU,
     threads: int = 1,
     memory: float | None = None,
@@ -128,7 +127,6 @@ def compute_field(
         settings: how.
         orders: that it is probed for.
         sample: of the surface, drawn for these orders and `USUAL_DEGREE`, where there is one.
-        extent: the surface's quality but for its probe, where it is known.
         backend: where to compute the transform; the probe's exact side stays on the processor.
         threads: to compute with.
         memory: see `transform_block`.
@@ -144,8 +142,7 @@ def compute_field(
         probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
     else:
         probe = probe_block(surface, lattice, settings, orders, block, made.values)
-    quality = Quality.of_surface(surface, probe) if extent is None else replace(extent, probe=probe)
-    return Field(made.values, quality, settings, made.points, made.backend)
+    return Field(made.values, Quality.of_surface(surface, probe), settings, made.points, made.backend)
 
 
 def field_for(
@@ -155,7 +152,6 @@ def field_for(
     transform: TransformSettings,
     *,
     sample: Sample | None = None,
-    extent: Quality | None = None,
     backend: Backend = CPU,
     threads: int = 1,
     memory: float | None = None,
@@ -168,7 +164,6 @@ def field_for(
         goal: what its error may be.
         transform: whose precision and quadrature are kept.
         sample: see `compute_field`.
-        extent: likewise.
         backend: likewise.
         threads: to compute with.
         memory: see `transform_block`.
@@ -177,7 +172,7 @@ def field_for(
         The first of a few attempts that keeps the goal, or the last.
     """
     if isinstance(surface, Sphere):
-        return compute_field(surface, lattice, transform, goal.orders, sample=sample, extent=extent)
+        return compute_field(surface, lattice, transform, goal.orders, sample=sample)
     for _ in range(_ATTEMPTS):
         settings = settle(surface, lattice, goal, transform)
         field = compute_field(
@@ -186,7 +181,6 @@ def field_for(
             settings,
             goal.orders,
             sample=sample,
-            extent=extent,
             backend=backend,
             threads=threads,
             memory=memory,

@@ -12,10 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Sphere, icosphere
-from sobolev_batch.spectral.errors.probe import Probe
-from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.surfaces.shapes.extent import support_widths
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.decimation import DecimatedMember
 from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -90,9 +88,9 @@ def _setting(rng: np.random.Generator, pair: Pair) -> Setting:
 
 def _given(rng: np.random.Generator, pair: Pair) -> Given:
     """A lattice whose period leaves between a third of a unit and three units of room around the surfaces."""
-    qualities = [Quality.of_surface(surface, Probe()) for surface in pair]
-    reach = max(float(np.abs([quality.lowest, quality.highest]).max()) for quality in qualities)
-    widest = float(support_widths(qualities).max())
+    extent = Extent.union([surface.extent for surface in pair])
+    reach = float(np.abs([extent.lowest, extent.highest]).max())
+    widest = float(extent.widths.max())
     xi_max = rng.uniform(2.0, 6.0)
     period = max(2.1 * reach, widest + rng.uniform(0.3, 3.0))
     lattice = Lattice(float(xi_max), 2 * int(np.ceil(xi_max * period)))

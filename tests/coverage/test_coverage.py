@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, Sphere, icosphere
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.coverage.cases import KINDS, ORDERS, all_cases, cases_of
 from tests.coverage.judging import Tally, Verdict, judge
 from tests.coverage.matern import kernel, radial_integral

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform
 from sobolev_batch.spectral.exact.spheres import sphere_inner_product
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.coverage.matern import (
     Sides,
     divided_points,

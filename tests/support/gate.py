@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sobolev_batch.batch.fields import tasks
 from sobolev_batch.batch.fields.tasks import Job
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.files import FileMember
 
 # Dask may load this twice.

@@ -25,7 +25,7 @@ from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.metrics.decomposition import Proportion
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, support_widths
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made anew.
 TABLES_VERSION = 2
@@ -117,7 +117,8 @@ def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center:
     areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
     for i, quality in qualities.items():
         areas[i], errors[:, i] = quality.area, quality.probe.norms(lattice, orders)
-    widths = support_widths(list(qualities.values())) if qualities else np.zeros(len(DIRECTIONS))
+    extents = [quality.extent for quality in qualities.values()]
+    widths = Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS))
     checksums = {i: record.checksums for i, record in enumerate(records) if record is not None}
     return Reducer(store, lattice, plan.blocks, orders, center, areas, errors, widths, checksums)
 

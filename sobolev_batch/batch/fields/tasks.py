@@ -28,8 +28,9 @@ from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)

@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of, reach_of
+from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, lattice_of
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.probe import Probe
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.surfaces.shapes.extent import support_widths
-from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
@@ -138,8 +137,8 @@ def choose(
     if accuracy is None:
         raise ValueError("only a study that asks for an accuracy leaves a choice")
     surfaces = _pilots(members, similarity)
-    extents = [Quality.of_surface(surface, Probe()) for surface in (reference, *surfaces.values())]
-    widths, reach = _REACH_MARGIN * support_widths(extents), _REACH_MARGIN * reach_of(extents)
+    extent = Extent.union([surface.extent for surface in (reference, *surfaces.values())])
+    widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
     pilots: dict[str, Pilot] = {
         label: pilot_of(surface, reference, study.orders, accuracy, widths, reach, what=label)
         for label, surface in surfaces.items()

@@ -18,8 +18,9 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.names import shown
 from sobolev_batch.surfaces.sources.registry import Member, sole_member
 

@@ -13,16 +13,15 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, l
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
 from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.probe import Probe
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import shell_sums
 from sobolev_batch.spectral.transform.transform import TransformSettings
-from sobolev_batch.surfaces.shapes.extent import AXIS_DIRECTIONS, support_widths
-from sobolev_batch.surfaces.shapes.similarity import Similarity, Surface
+from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 
@@ -79,10 +78,11 @@ def pursue(
     Raises:
         AccuracyError: a pilot shows that it cannot be met within the memory.
     """
-    surfaces, extents = _centered(surfaces)
-    widths = support_widths(extents)
-    areas = np.array(sum(extent.area for extent in extents))
-    lattice, pilot = first_lattice(widths, reach_of(extents), orders, accuracy)
+    surfaces = _centered(surfaces)
+    extent = Extent.union([surface.extent for surface in surfaces])
+    widths = extent.widths
+    areas = np.array(sum(surface.area for surface in surfaces))
+    lattice, pilot = first_lattice(widths, extent.reach, orders, accuracy)
     inexact = max(1, sum(not isinstance(surface, Sphere) for surface in surfaces))
     values: Reals | None = None
     for remaining in reversed(range(_ROUNDS)):
@@ -93,10 +93,8 @@ def pursue(
         goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(inexact)
         dtype = _precision(surfaces, lattice, goal)
         fields = tuple(
-            field_for(
-                surface, lattice, goal, TransformSettings(dtype=dtype), sample=sample, extent=extent, threads=threads
-            )
-            for surface, sample, extent in zip(surfaces, samples, extents, strict=True)
+            field_for(surface, lattice, goal, TransformSettings(dtype=dtype), sample=sample, threads=threads)
+            for surface, sample in zip(surfaces, samples, strict=True)
         )
         found = _assessed(fields, lattice, orders, areas, widths)
         values = found.assessed.values
@@ -128,25 +126,14 @@ def _next(
         return larger, True
 
 
-def _centered(surfaces: Sequence[Surface]) -> tuple[Sequence[Surface], list[Quality]]:
-    """The surfaces moved together to where a lattice's period is centred, which no distance notices; their extents."""
-    extents = [Quality.of_surface(surface, Probe()) for surface in surfaces]
-    lowest = np.min([extent.lowest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
-    highest = np.max([extent.highest for extent in extents], axis=0)[list(AXIS_DIRECTIONS)]
+def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
+    """Return the surfaces moved together to the centre of a lattice's period, which no distance notices."""
+    lowest, highest = Extent.union([surface.extent for surface in surfaces]).box
     if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
-        return surfaces, extents
+        return surfaces
     x, y, z = ((lowest + highest) / 2).tolist()
     move = Similarity(1.0, (x, y, z))
-    moved = [move.apply(surface) for surface in surfaces]
-    return moved, [Quality.of_surface(surface, Probe()) for surface in moved]
-
-
-def reach_of(extents: Sequence[Quality]) -> float:
-    """The largest |coordinate| of surfaces, in units of length."""
-    axes = list(AXIS_DIRECTIONS)
-    return float(
-        max(np.abs(np.array(part)[axes]).max() for extent in extents for part in (extent.lowest, extent.highest))
-    )
+    return [move.apply(surface) for surface in surfaces]
 
 
 def _refuse_below_rounding(values: Reals, orders: Sequence[float], accuracy: Accuracy, area: float, what: str) -> None:

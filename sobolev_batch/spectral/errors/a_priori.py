@@ -19,8 +19,8 @@ from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
 from sobolev_batch.spectral.transform.transform import COARSEST_EPS, FINEST_EPS, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 

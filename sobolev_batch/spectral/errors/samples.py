@@ -16,9 +16,9 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolve
 from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.shells import Complexes, Orders, Reals, shell_sums
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 Operand = Surface | xr.DataArray
 

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.inputs import field_of, quality_of, triples_of
-from sobolev_batch.surfaces.shapes.extent import AXIS_DIRECTIONS
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -189,7 +188,8 @@ def _box(field: xr.DataArray, lattice: Lattice, reach: float | None) -> list[tup
         return [(-reach, reach)] * 3
     if quality is None:
         raise InputError("the field does not say how far its surface reaches: pass reach=...")
-    return [(quality.lowest[direction], quality.highest[direction]) for direction in AXIS_DIRECTIONS]
+    lower, upper = quality.extent.box
+    return list(zip(lower.tolist(), upper.tolist(), strict=True))
 
 
 def _extended(field: xr.DataArray, planes: int) -> Complexes:

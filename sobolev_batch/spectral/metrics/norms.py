@@ -29,9 +29,9 @@ from sobolev_batch.spectral.metrics.inputs import (
     shells_of,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, support_widths
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
@@ -183,7 +183,7 @@ def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Se
         lattice,
         orders,
         areas=np.array(sum(quality.area for quality in known)),
-        widths=support_widths(known) if complete else np.zeros(len(DIRECTIONS)),
+        widths=Extent.union([quality.extent for quality in known]).widths if complete else np.zeros(len(DIRECTIONS)),
         discretisation=np.sum([quality.probe.norms(lattice, orders) for quality in known], axis=0),
     )
     if complete:

@@ -20,9 +20,9 @@ from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.transform.memory import Division, Load, divide, transform_bytes
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 # Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
 # another version are then computed again instead of being compared with new ones.
@@ -287,7 +287,7 @@ def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, dtype: ComplexD
     return values
 
 
-def require_inside(surface: Mesh | Smooth, lattice: Lattice) -> None:
+def require_inside(surface: Surface, lattice: Lattice) -> None:
     """Refuse a surface that does not fit into the lattice's period, where its points would fold.
 
     Raises:

@@ -1,10 +1,11 @@
-"""Extents of surfaces along fixed directions: how far they reach, and how far apart they are at least."""
+"""Extents of surfaces along fixed directions: how wide they are, and how far they reach."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,25 +13,41 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
+# The axes, the diagonals of faces and those of the cube: unit vectors (13, 3).
 DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
-# Which of them are the axes x, y, z.
-AXIS_DIRECTIONS = tuple(int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3))
+_AXES = [int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3)]
 
 
-class Extent(Protocol):
-    """Anything that knows its lowest and highest x · direction for each of `DIRECTIONS`."""
+@dataclass(frozen=True)
+class Extent:
+    """The least and the greatest x · direction over a surface, for each of `DIRECTIONS`.
+
+    Attributes:
+        lowest: (13,), in units of length.
+        highest: (13,), in units of length.
+    """
+
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
+
+    @classmethod
+    def union(cls, extents: Sequence[Extent]) -> Self:
+        """Return the extent of several surfaces together."""
+        lowest = np.min([extent.lowest for extent in extents], axis=0)
+        highest = np.max([extent.highest for extent in extents], axis=0)
+        return cls(tuple(lowest.tolist()), tuple(highest.tolist()))
 
     @property
-    def lowest(self) -> Sequence[float]:
-        """In units of length, (13,)."""
+    def widths(self) -> Reals:
+        """Width along each direction (13,), in units of length."""
+        return np.subtract(self.highest, self.lowest)
 
     @property
-    def highest(self) -> Sequence[float]:
-        """In units of length, (13,)."""
+    def box(self) -> tuple[Reals, Reals]:
+        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
+        return np.array(self.lowest)[_AXES], np.array(self.highest)[_AXES]
 
-
-def support_widths(extents: Sequence[Extent]) -> Reals:
-    """Extents (13,) of several surfaces together along `DIRECTIONS`, in units of length."""
-    lowest = np.min([extent.lowest for extent in extents], axis=0)
-    highest = np.max([extent.highest for extent in extents], axis=0)
-    return np.asarray(highest - lowest)
+    @property
+    def reach(self) -> float:
+        """Largest |coordinate|, in units of length."""
+        return float(np.abs(self.box).max())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 # From the first corner to the second and to the third, (3, k) each: one row an axis.
@@ -137,6 +138,36 @@ class Mesh:
         """Lower and upper corner of the bounding box of the vertices that triangles use, (3,) each."""
         used = self.used_coordinates
         return _frozen(used.min(axis=1)), _frozen(used.max(axis=1))
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent of the vertices that triangles use along `DIRECTIONS`."""
+        coordinates = self.used_coordinates
+        lowest, highest = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
+        for first in range(0, coordinates.shape[1], _SLICE):
+            along = DIRECTIONS @ coordinates[:, first : first + _SLICE]
+            np.minimum(lowest, along.min(axis=1), out=lowest)
+            np.maximum(highest, along.max(axis=1), out=highest)
+        return Extent(tuple(lowest.tolist()), tuple(highest.tolist()))
+
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Centre of the bounding box, and the distance from there to the farthest vertex that a triangle uses.
+
+        Flat meshes have one too, unlike a minimal sphere from a convex hull.
+        """
+        lower, upper = self.bounds
+        center = lower + (upper - lower) / 2
+        radius = float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
+        return (float(center[0]), float(center[1]), float(center[2])), radius
+
+    def moved(self, scale: float, origin: tuple[float, float, float]) -> Mesh:
+        """Return the mesh after x -> scale * (x - origin)."""
+        vertices = self.vertices - np.asarray(origin)
+        vertices *= scale
+        # Read-only, so that the mesh takes it over: of huge meshes a copy would count.
+        vertices.setflags(write=False)
+        return Mesh(vertices, self.triangles)
 
     @cached_property
     def used_vertices(self) -> NDArray[np.int64]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.interval import Interval
 
 Reals = NDArray[np.float64]
@@ -144,6 +145,12 @@ class Smooth(ABC):
         axes = np.concatenate([-np.eye(3), np.eye(3)])
         highest = self.highest_along(axes)
         return -highest[:3], highest[3:]
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent along `DIRECTIONS`."""
+        lowest, highest = -self.highest_along(-DIRECTIONS), self.highest_along(DIRECTIONS)
+        return Extent(tuple(lowest.tolist()), tuple(highest.tolist()))
 
     @property
     def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # The square of a larger one overflows.
 _LARGEST_RADIUS = 1e150
@@ -43,3 +48,24 @@ class Sphere:
     def area(self) -> float:
         """Area, in squared units of length."""
         return 4 * math.pi * self.radius**2
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent along `DIRECTIONS`."""
+        along = DIRECTIONS @ np.asarray(self.center)
+        return Extent(tuple((along - self.radius).tolist()), tuple((along + self.radius).tolist()))
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
+        return self.extent.box
+
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Centre and radius of the sphere itself."""
+        return self.center, self.radius
+
+    def moved(self, scale: float, origin: tuple[float, float, float]) -> Sphere:
+        """Return the sphere after x -> scale * (x - origin)."""
+        x, y, z = (scale * (c - o) for c, o in zip(self.center, origin, strict=True))
+        return Sphere(scale * self.radius, (x, y, z))

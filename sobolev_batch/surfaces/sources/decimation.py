@@ -12,7 +12,7 @@ from pydantic import Field
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     Fingerprint,

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.globs import expand
 from sobolev_batch.surfaces.sources.names import flaw, folded, shown, twins
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member, Size, Source, at_most, file_digest

@@ -22,7 +22,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, fie
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.contents import bounded_length, open_regular
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.names import shown
 
 # Of levels, or of triangle counts of one mesh.

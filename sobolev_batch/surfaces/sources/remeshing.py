@@ -10,7 +10,7 @@ import numpy as np
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.decimation import TriangleCounts, reduced_size, whole_mesh
 from sobolev_batch.surfaces.sources.registry import (
     Fingerprint,

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.decimation import reduced_size
 from sobolev_batch.surfaces.sources.generated import Levels
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member, NestedSource, Size, Source, sole_member

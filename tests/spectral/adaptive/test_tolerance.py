@@ -20,9 +20,6 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, good_intervals
-from sobolev_batch.spectral.errors.probe import Probe
-from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.surfaces.shapes.extent import support_widths
 from tests.support.shapes import CENTRED_BOX as BOX
 
 
@@ -162,7 +159,7 @@ def test_intervals_suit_ffts() -> None:
 
 
 def test_first_lattices_hold_the_surfaces_with_room_for_their_images() -> None:
-    widths = support_widths([Quality.of_surface(Sphere(), Probe())])
+    widths = Sphere().extent.widths
     for order in (-3.0, -6.0, -12.0):
         loose, tight = (first_lattice(widths, 1.0, [order], Accuracy(rtol))[0] for rtol in (1e-2, 1e-6))
         assert 1 / loose.spacing > 2.5

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.errors.budget import Sums, truncated
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]

@@ -10,7 +10,7 @@ from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icospher
 from sobolev_batch.spectral.errors.budget import Sums, add_sums, sums_of_shells
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import shell_sums
-from sobolev_batch.surfaces.shapes.similarity import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 LATTICE = Lattice(4.0, 24)
 ORDERS = (-2.0, -7.5)

@@ -278,8 +278,8 @@ def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
     found = Quality.from_json(fourier_transform(surface, LATTICE, threads=1).attrs["quality"])
     points = np.concatenate([part for part, _ in surface.nodes((301, 301))], axis=1)
     assert found.area == surface.area
-    assert np.array(found.highest) == pytest.approx((DIRECTIONS @ points).max(axis=1), abs=1e-3)
-    assert np.array(found.lowest) == pytest.approx((DIRECTIONS @ points).min(axis=1), abs=1e-3)
+    assert np.array(found.extent.highest) == pytest.approx((DIRECTIONS @ points).max(axis=1), abs=1e-3)
+    assert np.array(found.extent.lowest) == pytest.approx((DIRECTIONS @ points).min(axis=1), abs=1e-3)
     assert len(found.probe.shells) == 32 + 8
 
 

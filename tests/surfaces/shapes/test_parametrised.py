@@ -63,7 +63,7 @@ def test_similarities_follow_each_other() -> None:
     assert isinstance(moved, ParametrisedSurface)
     assert moved.positions(u, v) == pytest.approx(twice, abs=1e-13)
     assert moved.area == pytest.approx(0.36 * surface.area, rel=1e-12)
-    tangents = Similarity(2.0).apply(angular_ball(True)).tangents(u, v)  # type: ignore[union-attr]
+    tangents = Similarity(2.0).apply(angular_ball(True)).tangents(u, v)
     assert tangents is not None
     assert tangents[0] == pytest.approx(2 * np.stack(ball_derivatives(u, v)[0]), rel=1e-15)
 
@@ -72,7 +72,7 @@ def test_surfaces_of_picklable_functions_are_picklable() -> None:
     surface = Similarity(0.5, (1.0, 0.0, 0.0)).apply(turned_torus(Torus(1.0, 0.3)))
     again = pickle.loads(pickle.dumps(surface))
     u, v = np.random.default_rng(8).uniform(0, 6, (2, 5))
-    assert np.array_equal(again.positions(u, v), surface.positions(u, v))  # type: ignore[union-attr]
+    assert np.array_equal(again.positions(u, v), surface.positions(u, v))
     assert again.area == surface.area
 
 
