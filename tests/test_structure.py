@@ -12,8 +12,8 @@ import sobolev_batch
 from tests.support.repository import PACKAGE, imported
 
 # Each may import those before it.
-LAYERS = ("errors", "surfaces", "spectral", "batch", "results", "cli")
-MOST_NAMES_OF_A_FOLDER = 13
+LAYERS = ("errors", "parameters", "surfaces", "spectral", "batch", "results", "cli")
+MOST_NAMES_OF_A_FOLDER = 12
 
 Path = tuple[str, ...]
 

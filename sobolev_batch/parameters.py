@@ -1,0 +1,85 @@
+"""Parameters of the public interface: sizes of memory, and names that were spelt differently before."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+from pydantic import ByteSize, TypeAdapter, ValidationError
+
+from sobolev_batch.errors import InputError
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+_BYTE_SIZE = TypeAdapter(ByteSize)
+
+
+def byte_count(memory: float | str) -> int:
+    """Return a size of memory in bytes.
+
+    Args:
+        memory: Number of bytes, or a text such as "4GB" or "800MiB".
+
+    Raises:
+        InputError: It is neither, or not positive.
+
+    >>> byte_count("4GB"), byte_count("800MiB"), byte_count(2e9)
+    (4000000000, 838860800, 2000000000)
+    """
+    try:
+        count = int(_BYTE_SIZE.validate_python(memory))
+    except (ValidationError, ValueError, OverflowError):
+        count = 0
+    if count <= 0 or isinstance(memory, bool):
+        raise InputError(
+            f"memory must be a positive number of bytes, or a size such as '4GB' or '800MiB', found {memory!r}"
+        )
+    return count
+
+
+def format_bytes(count: float) -> str:
+    """Return a number of bytes as people read it.
+
+    >>> format_bytes(4e9)
+    '4.0GB'
+    """
+    return ByteSize(count).human_readable(decimal=True)
+
+
+def renamed_parameters(**names: str) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
+    """Let a function take parameters under their old names for one more release, with a DeprecationWarning.
+
+    Args:
+        **names: New name of each parameter, by its old one.
+
+    >>> @renamed_parameters(orders="order")
+    ... def double(order):
+    ...     return 2 * order
+    >>> double(order=3)
+    6
+    """
+
+    def decorate(function: Callable[P, Result]) -> Callable[P, Result]:
+        @wraps(function)
+        def call(*arguments: P.args, **options: P.kwargs) -> Result:
+            for old in names.keys() & options.keys():
+                new = names[old]
+                if new in options:
+                    raise TypeError(
+                        f"{function.__name__}() got both {new!r} and its old name {old!r}; give {new!r} alone"
+                    )
+                warnings.warn(
+                    f"the parameter {old!r} of {function.__name__}() is now called {new!r}; "
+                    f"{old!r} will be refused from the next release on",
+                    DeprecationWarning,
+                    stacklevel=2,
+                )
+                options[new] = options.pop(old)
+            return function(*arguments, **options)
+
+        return call
+
+    return decorate
