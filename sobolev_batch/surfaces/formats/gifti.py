@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import unpacked_limit
+from sobolev_batch.surfaces.formats.raw_files import unpacked_limit
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import read_contents, unpacked_limit
 from sobolev_batch.surfaces.formats.polygons import merge_coincident
+from sobolev_batch.surfaces.formats.raw_files import read_contents, unpacked_limit
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 

@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import bounded_length, is_gzipped, open_regular, read_bytes, unpacked_limit
 from sobolev_batch.surfaces.formats.gifti import parse_gifti
 from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply
+from sobolev_batch.surfaces.formats.raw_files import (
+    bounded_length,
+    is_gzipped,
+    open_regular,
+    read_bytes,
+    unpacked_limit,
+)
 from sobolev_batch.surfaces.formats.stl import parse_stl
 from sobolev_batch.surfaces.formats.text_formats import parse_obj, parse_off
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -45,13 +51,25 @@ _BYTES_PER_TRIANGLE = {
 def read_mesh(path: str | Path) -> Mesh:
     """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
 
-    The format follows from the name. Double precision is kept where the file has it. Polygons are
-    cut into fans of triangles, which is exact for convex ones. STL and glTF vertices that coincide
-    exactly are merged, since these formats repeat them; all other vertices stay as they are.
+    The format follows from the name. Coordinates keep the precision of the file. Polygons are cut into fans
+    of triangles, which is exact for convex ones. STL and glTF repeat vertices, so those that coincide exactly
+    are merged; vertices of other formats stay as they are.
+
+    Args:
+        path: Path of the file.
 
     Raises:
-        MeshError: the file is missing, of no known format, damaged, or does not hold a valid mesh;
-            the message starts with its path.
+        MeshError: The file is missing, of no known format, damaged, or holds no valid mesh; the message
+            starts with the path.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import sobolev_batch as sb
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "triangle.off")
+    ...     _ = path.write_text("OFF\\n3 1 0\\n0 0 0\\n1 0 0\\n0 1 0\\n3 0 1 2\\n")
+    ...     sb.read_mesh(path)
+    Mesh(3 vertices, 1 triangles)
     """
     path = Path(path)
     suffix = mesh_format(path).removesuffix(".gz")

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from sobolev_batch import MeshError, Sphere, StudyError, icosphere
 from sobolev_batch.surfaces.sources import registry as sources
-from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, sole_member
+from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, single_member
 from tests.support.members import BALL, listed, loaded, members
 from tests.support.mesh_files import off
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
@@ -217,10 +217,10 @@ def test_a_dump_tells_everything_of_nested_sources() -> None:
 
 
 def test_a_sole_member_is_the_only_one() -> None:
-    assert sole_member(parse_source(BALL), Path()).name == "3"
+    assert single_member(parse_source(BALL), Path()).name == "3"
     many = parse_source({"source": "icosphere", "levels": list(range(8))})
     with pytest.raises(StudyError, match=r"exactly one surface is needed here, but the source makes 8: 0, 1, 2, 3, 4$"):
-        sole_member(many, Path())
+        single_member(many, Path())
 
 
 # All sources.
