@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.raw_files import bounded_length, open_regular
+from sobolev_batch.surfaces.formats.raw_files import checked_length, open_regular
 
 
 def file_digest(path: Path) -> str:
@@ -18,7 +18,7 @@ def file_digest(path: Path) -> str:
     """
     try:
         with open_regular(path) as file:
-            bounded_length(file)
+            checked_length(file)
             return hashlib.file_digest(file, "sha256").hexdigest()
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
