@@ -206,7 +206,7 @@ class IcosphereMember(TriangulationMember):
     @property
     def triangles(self) -> int:
         """Number of triangles."""
-        return 20 * 4**self.level
+        return 20 << (2 * self.level)
 
     def load(self) -> Surface:
         """Make the mesh."""
@@ -260,4 +260,5 @@ class TorusMember(TriangulationMember):
 
 def _parameters(shape: ClosedForm) -> list[float]:
     """Return the parameters of a surface, in the order of its fields."""
-    return np.hstack(astuple(shape)).tolist()
+    values: list[float] = np.hstack(astuple(shape)).tolist()
+    return values
