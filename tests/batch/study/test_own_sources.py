@@ -89,17 +89,17 @@ def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path) -> None:
 
     table = {
         "study": {"name": "archive"},
-        "lattice": {"xi_max": 2.0, "M": 8},
+        "lattice": {"xi_max": 2.0, "M": 16},
         "norm": {"orders": [-3.0]},
         "reference": {"source": "sphere"},
         "family": [{"name": "scan", "source": "zip", "archive": "scans.zip"}],
     }
     with thread_client(1) as client:
-        write_archive(small=0.5, large=1.0)
+        write_archive(small=0.2, large=0.3)
         study = Study.from_table(table, folder=tmp_path)
         store = tmp_path / "results.zarr"
         assert run(study, store, client).computed == ("scan/boxes/large.off", "scan/boxes/small.off", "reference")
-        write_archive(small=0.6, large=1.0)
+        write_archive(small=0.1, large=0.3)
         assert run(study, store, client).computed == ("scan/boxes/small.off",)
 
 
