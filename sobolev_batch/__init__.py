@@ -17,6 +17,7 @@ What there is:
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
 - Surfaces: `Mesh`, `read_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two
   `Interval`; a `Similarity` scales and moves them.
+- Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
 - For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
 - Studies: `Study`, `run` and its `Summary`, `submit` and its `Submission`.
 - Stores: `open_store`, `write_witness`, `verify` and its `Verification`, `release`.
@@ -57,15 +58,17 @@ if TYPE_CHECKING:
     from sobolev_batch.spectral.metrics.spectrum import spectrum
     from sobolev_batch.spectral.metrics.witness import witness
     from sobolev_batch.surfaces.formats.readers import read_mesh
+    from sobolev_batch.surfaces.proximity import Proximity, proximity
     from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
     from sobolev_batch.surfaces.shapes.icosphere import icosphere
     from sobolev_batch.surfaces.shapes.interval import Interval
     from sobolev_batch.surfaces.shapes.mesh import Mesh
     from sobolev_batch.surfaces.shapes.parametrised import ParametrisedSurface
-    from sobolev_batch.surfaces.shapes.proximity import Proximity, proximity
     from sobolev_batch.surfaces.shapes.similarity import Similarity
     from sobolev_batch.surfaces.shapes.sphere import Sphere
     from sobolev_batch.surfaces.shapes.torus import Torus
+    from sobolev_batch.surfaces.sources.conformance import check_source
+    from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member, Source, SurfaceMember
 
 __all__ = [
     "AccuracyError",
@@ -75,10 +78,12 @@ __all__ = [
     "ClusterError",
     "DamageError",
     "Ellipsoid",
+    "ExpectedSize",
     "InputError",
     "Interval",
     "Lattice",
     "LatticeError",
+    "Member",
     "Mesh",
     "MeshError",
     "OrderError",
@@ -87,14 +92,17 @@ __all__ = [
     "Similarity",
     "SobolevAccessor",
     "SobolevBatchError",
+    "Source",
     "Sphere",
     "StoreError",
     "Study",
     "StudyError",
     "Submission",
     "Summary",
+    "SurfaceMember",
     "Torus",
     "Verification",
+    "check_source",
     "distance",
     "fourier_transform",
     "icosphere",
@@ -124,26 +132,31 @@ _MODULES = {
     "ClusterError": "errors",
     "DamageError": "errors",
     "Ellipsoid": "surfaces.shapes.ellipsoid",
+    "ExpectedSize": "surfaces.sources.registry",
     "InputError": "errors",
     "Interval": "surfaces.shapes.interval",
     "Lattice": "spectral.lattice",
     "LatticeError": "errors",
+    "Member": "surfaces.sources.registry",
     "Mesh": "surfaces.shapes.mesh",
     "MeshError": "errors",
     "OrderError": "errors",
     "ParametrisedSurface": "surfaces.shapes.parametrised",
-    "Proximity": "surfaces.shapes.proximity",
+    "Proximity": "surfaces.proximity",
     "Similarity": "surfaces.shapes.similarity",
     "SobolevAccessor": "results.accessor",
     "SobolevBatchError": "errors",
+    "Source": "surfaces.sources.registry",
     "Sphere": "surfaces.shapes.sphere",
     "StoreError": "errors",
     "Study": "batch.study.study",
     "StudyError": "errors",
     "Submission": "batch.submit",
     "Summary": "batch.run",
+    "SurfaceMember": "surfaces.sources.registry",
     "Torus": "surfaces.shapes.torus",
     "Verification": "batch.verify",
+    "check_source": "surfaces.sources.conformance",
     "distance": "spectral.metrics.norms",
     "fourier_transform": "spectral.fields",
     "icosphere": "surfaces.shapes.icosphere",
@@ -151,7 +164,7 @@ _MODULES = {
     "norm": "spectral.metrics.norms",
     "open_store": "results.open",
     "proportion": "spectral.metrics.decomposition",
-    "proximity": "surfaces.shapes.proximity",
+    "proximity": "surfaces.proximity",
     "read_mesh": "surfaces.formats.readers",
     "release": "batch.store.release",
     "run": "batch.run",

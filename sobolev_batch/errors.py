@@ -1,20 +1,20 @@
-"""The exceptions of the package: one tree, plain messages, safe to pickle between processes."""
+"""Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
 
 class SobolevBatchError(Exception):
     """Base of every error that the package raises on purpose.
 
-    Each takes one message, and nothing else, so that it survives the trip from a worker to the
-    client. The message names the file or mesh, what was found, what was expected, what to do.
+    All arguments reach `Exception`, so that errors survive the trip from a worker to the client. The message
+    names the file or mesh, what was found, what was expected, and what to do.
     """
 
 
 class InputError(SobolevBatchError):
-    """What the caller handed over is wrong; computing again would not help."""
+    """The input is wrong; computing again would not help."""
 
 
 class MeshError(InputError):
-    """A mesh, or the file that should hold one, is not usable."""
+    """A mesh, or the file that should hold it, is not usable."""
 
 
 class LatticeError(InputError):
@@ -22,15 +22,15 @@ class LatticeError(InputError):
 
 
 class OrderError(InputError):
-    """A Sobolev order for which the norm of a surface measure is infinite."""
+    """The norm of a surface measure is infinite for a Sobolev order."""
 
 
 class AccuracyError(InputError):
-    """An accuracy is out of reach within the memory that may be used.
+    """An accuracy is impossible within the allowed memory.
 
     Attributes:
-        requested: the rtol that was asked for.
-        reachable: the smallest one that is expected to be met.
+        requested: Requested rtol.
+        reachable: Smallest rtol that is expected to be met.
     """
 
     def __init__(self, message: str, requested: float, reachable: float) -> None:
@@ -43,7 +43,7 @@ class AccuracyError(InputError):
 
 
 class StudyError(InputError):
-    """A study file is malformed or asks for something that does not exist."""
+    """A study file is malformed, or asks for something that does not exist."""
 
 
 class StoreError(InputError):
@@ -51,15 +51,15 @@ class StoreError(InputError):
 
 
 class ClaimError(StoreError):
-    """Another run has a store to itself."""
+    """Another run holds the lock of a store."""
 
 
 class DamageError(StoreError):
-    """What is stored is not what was stored.
+    """Stored data are not as they were written.
 
     Attributes:
-        what: is wrong, without saying with what.
-        row: of the field, where it is one.
+        what: Description of the damage, without the name of the data.
+        row: Row of the damaged field; None where it is no field.
     """
 
     def __init__(self, message: str, what: str, row: int | None = None) -> None:
@@ -72,11 +72,11 @@ class DamageError(StoreError):
 
 
 class BackendError(SobolevBatchError):
-    """A GPU was asked for and cannot be used: a library, the driver or the device is missing or fails."""
+    """A GPU was requested and cannot be used: a library, the driver or the device is missing or fails."""
 
 
 class ClusterError(SobolevBatchError):
-    """The Dask cluster cannot be reached or stopped serving."""
+    """The Dask cluster cannot be reached, or stopped serving."""
 
 
 class AddressError(ClusterError, InputError):

@@ -10,7 +10,7 @@ from sobolev_batch.cli.group import cli
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import distance
 from sobolev_batch.surfaces.formats.readers import read_mesh
-from sobolev_batch.surfaces.shapes.proximity import proximity
+from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 

@@ -10,6 +10,20 @@ from sobolev_batch.surfaces.sources.registry import Member, parse_source
 
 BALL: dict[str, Any] = {"source": "icosphere", "levels": [3]}
 
+# A table of each source; box.off must lie in the folder of the study.
+KINDS: dict[str, dict[str, Any]] = {
+    "icosphere": {"source": "icosphere", "levels": [1, 0]},
+    "sphere": {"source": "sphere", "radius": 2.0, "center": [1, 2, 3]},
+    "ellipsoid": {"source": "ellipsoid", "axes": [3, 2, 1], "center": [1, 2, 3]},
+    "ellipsoid-levels": {"source": "ellipsoid-levels", "axes": [3, 2, 1], "levels": [1, 0]},
+    "torus": {"source": "torus", "R": 2, "r": 0.5, "center": [1, 2, 3]},
+    "torus-grid": {"source": "torus-grid", "R": 2, "r": 0.5, "levels": [1, 0]},
+    "files": {"source": "files", "paths": ["box.off"]},
+    "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
+    "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
+    "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
+}
+
 
 def members(table: dict[str, Any], folder: Path = Path()) -> tuple[Member, ...]:
     """The members of the source that a table names."""

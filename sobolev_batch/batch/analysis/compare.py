@@ -27,7 +27,7 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import StoreError
-from sobolev_batch.surfaces.shapes.proximity import POINT_BYTES, TRIANGLE_BYTES
+from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES
 
 _log = logging.getLogger(__name__)
 
@@ -238,7 +238,7 @@ class Comparer:
 
         def making(row: int) -> float:
             made = MESH_BYTES * self.complete[row].facts.triangles
-            return max(self.rows[row].member.expected_size().making_bytes, made)
+            return max(self.rows[row].member.expected_size().projected_bytes, made)
 
         if kind == "witness":
             vertices = self.complete[i].facts.vertices

@@ -21,8 +21,8 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation
 from sobolev_batch.spectral.shells import shell_weights
 from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.proximity import proximity
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.registry import Member
 

@@ -93,7 +93,7 @@ def cut_mesh(job: Job, count: int) -> Cut:
         facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe())
         size = math.ceil(len(mesh.triangles) / count)
         token, there = uuid4().hex, set()
-        for number, piece in mesh.parts(size):
+        for number, piece in mesh.batches(size):
             job.store.scratch.write(job.row, token, number, piece)
             there.add(number)
     except StoreError:

@@ -13,7 +13,7 @@ from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.dtypes import item_bytes
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes
-from sobolev_batch.surfaces.sources.registry import Size
+from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 # Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
 # cluster, so that the same sums are formed on any; smaller ones only where memory is short. The
@@ -66,7 +66,7 @@ def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Workers) -> tuple[dict[s
     Raises:
         ClusterError: the lattice itself fits into no worker, whatever the mesh.
     """
-    lay_out(plan.blocks, plan.transform, Size(), crew, len(rows))
+    lay_out(plan.blocks, plan.transform, ExpectedSize(), crew, len(rows))
     layouts, refused = {}, {}
     for row in rows:
         try:
@@ -76,7 +76,9 @@ def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Workers) -> tuple[dict[s
     return layouts, refused
 
 
-def lay_out(blocks: Sequence[Block], transform: TransformSettings, size: Size, crew: Workers, rows: int) -> Layout:
+def lay_out(
+    blocks: Sequence[Block], transform: TransformSettings, size: ExpectedSize, crew: Workers, rows: int
+) -> Layout:
     """Fit a row's tasks into the memory of workers.
 
     Every task is kept within what a worker has for each of its threads, as long as that leaves a
@@ -108,7 +110,7 @@ def lay_out(blocks: Sequence[Block], transform: TransformSettings, size: Size, c
     part = size.triangles if whole else _PART_TRIANGLES
     while not whole and fixed(part) + least(part) > crew.share_bytes and part > _FEWEST_TRIANGLES:
         part //= 2
-    making = max(size.making_bytes, MESH_BYTES * size.triangles)
+    making = max(size.projected_bytes, MESH_BYTES * size.triangles)
     needed = max(making, fixed(part) + least(part))
     if needed > crew.largest_bytes:
         raise ClusterError(

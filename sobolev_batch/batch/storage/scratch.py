@@ -45,7 +45,7 @@ class Scratch:
             if archive is None:
                 raise ValueError("it is not there")
             with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
-                return Mesh.of_checked(arrays["vertices"], arrays["triangles"])
+                return Mesh.from_checked(arrays["vertices"], arrays["triangles"])
         except (ValueError, KeyError, zipfile.BadZipFile) as error:
             raise StoreError(
                 f"{self.location}: piece {number} of the mesh of row {row} cannot be read ({error}); "

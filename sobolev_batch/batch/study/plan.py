@@ -21,8 +21,8 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.names import shown
-from sobolev_batch.surfaces.sources.registry import Member, sole_member
+from sobolev_batch.surfaces.sources.names import quoted
+from sobolev_batch.surfaces.sources.registry import Member, single_member
 
 _log = logging.getLogger(__name__)
 
@@ -187,7 +187,7 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
             members[label] = family.name, member
     if not isinstance(study.reference, FamilyReference):
         try:
-            members[REFERENCE_LABEL] = REFERENCE_LABEL, sole_member(study.reference, study.folder)
+            members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(study.reference, study.folder)
         except StudyError as error:
             raise StudyError(f"reference: {error}") from error
     return members
@@ -208,7 +208,7 @@ def _reference_label(study: Study, members: Mapping[str, tuple[str, Member]]) ->
     label = f"{study.reference.family}/{study.reference.member}"
     if label not in members:
         raise StudyError(
-            f"reference: the family {study.reference.family!r} has no member {shown(study.reference.member)}"
+            f"reference: the family {study.reference.family!r} has no member {quoted(study.reference.member)}"
         )
     return label
 

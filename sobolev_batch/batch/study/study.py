@@ -21,10 +21,10 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.transform import TransformSettings
-from sobolev_batch.surfaces.formats.contents import open_regular
-from sobolev_batch.surfaces.shapes.proximity import DEFAULT_POINTS, MOST_POINTS
+from sobolev_batch.surfaces.formats.raw_files import open_regular
+from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.sources.names import flaw, folded, shown, twins
+from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_source
 
 REFERENCE_LABEL = "reference"
@@ -48,7 +48,7 @@ _LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.
 
 def _name(text: str) -> str:
     """Names become labels in the store and never paths or keys."""
-    wrong = flaw(text, _LONGEST_NAME, "/\\")
+    wrong = name_problem(text, _LONGEST_NAME, "/\\")
     if wrong is not None:
         raise ValueError(
             f"a name is 1 to {_LONGEST_NAME} visible characters, blanks only between them, without / and \\; {wrong}"
@@ -57,7 +57,7 @@ def _name(text: str) -> str:
 
 
 def _title(text: str) -> str:
-    wrong = flaw(text, _LONGEST_TITLE) if text else None
+    wrong = name_problem(text, _LONGEST_TITLE) if text else None
     if wrong is not None:
         raise ValueError(f"a title is one line of up to {_LONGEST_TITLE} visible characters and blanks; {wrong}")
     return text
@@ -179,14 +179,14 @@ class Study:
         except ValidationError as error:
             raise StudyError(_explain(error)) from error
         families = tuple(_family(i, entry) for i, entry in enumerate(document.family))
-        same = twins(family.name for family in families)
+        same = duplicate_names(family.name for family in families)
         if same:
-            found = ", ".join(shown(name) for group in same[:3] for name in group[:3])
+            found = ", ".join(quoted(name) for group in same[:3] for name in group[:3])
             raise StudyError(
                 "family: names must differ by more than case and the spelling of accents, "
                 f"found {found} twice; rename one"
             )
-        if any(folded(family.name) == REFERENCE_LABEL for family in families):
+        if any(caseless_key(family.name) == REFERENCE_LABEL for family in families):
             raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
         try:
             orders = _distinct(check_orders(document.norm.orders))
@@ -313,7 +313,7 @@ class _FamilyName(_Section):
 
 
 def _family(index: int, entry: dict[str, Any]) -> Family:
-    where = f"family {shown(entry.get('name', index + 1))}"
+    where = f"family {quoted(entry.get('name', index + 1))}"
     parameters = {key: value for key, value in entry.items() if key != "name"}
     try:
         name = _FamilyName.model_validate({key: entry[key] for key in ("name",) if key in entry}).name
@@ -329,7 +329,7 @@ def _reference(entry: dict[str, Any], families: tuple[Family, ...]) -> Source | 
         if entry.get("source") == "family":
             section = _FamilyReferenceSection.model_validate({k: v for k, v in entry.items() if k != "source"})
             if section.family not in {family.name for family in families}:
-                raise StudyError(f"no family is named {shown(section.family)}")
+                raise StudyError(f"no family is named {quoted(section.family)}")
             return FamilyReference(section.family, section.member)
         return parse_source(entry)
     except ValidationError as error:
@@ -390,12 +390,12 @@ def _require_modest(table: object) -> None:
         elif isinstance(value, str) and len(value) > _LONGEST_TEXT:
             raise StudyError(f"{_place(place)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
         elif isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-            raise StudyError(f"{_place(place)}: integers go up to {_LARGEST_INTEGER}, found {shown(value)}")
+            raise StudyError(f"{_place(place)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
 
 
 def _place(location: Sequence[object]) -> str:
     """Where a value stands, with dots between keys; keys that are no words are quoted."""
-    return ".".join(str(key) if flaw(str(key), 40) is None else shown(key) for key in location[:8]) or "study"
+    return ".".join(str(key) if name_problem(str(key), 40) is None else quoted(key) for key in location[:8]) or "study"
 
 
 def _explain(error: ValidationError) -> str:
@@ -409,7 +409,7 @@ def _explain(error: ValidationError) -> str:
             lines.append(f"{where} is missing")
         else:
             message = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{where}: {message[0].lower() + message[1:]}, found {shown(item['input'])}")
+            lines.append(f"{where}: {message[0].lower() + message[1:]}, found {quoted(item['input'])}")
     more = error.error_count() - len(lines)
     return "; ".join(lines) + (f"; and {more} more" if more else "")
 

@@ -1,6 +1,6 @@
-"""GIFTI files, parsed by the library nibabel after a look at what they would make it do.
+"""GIFTI files, parsed by the library nibabel after a check of their XML.
 
-The library expands entities, unpacks data of any size, takes what dimensions it is told, and warns of
+The library expands entities, unpacks data of any size, believes any dimensions, and only warns of
 missing arrays. Specification: "GIFTI surface data format" 1.0 (2011), https://www.nitrc.org/projects/gifti.
 """
 
@@ -18,25 +18,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import unpacked_limit
+from sobolev_batch.surfaces.formats.raw_files import unpacked_limit
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
 
 _MOST_DIMENSIONS = 6
-_STEP_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 20
 
 
 def parse_gifti(data: bytes, path: Path) -> Raw:
-    """Vertices and triangles of a GIFTI surface.
+    """Return the vertices and triangles of a GIFTI surface.
 
     Args:
-        data: the contents of the file.
-        path: of the file; files that it refers to are refused.
+        data: Contents of the file.
+        path: Path of the file; unused, since references to other files are refused.
 
     Raises:
-        MeshError: anything but one point set and one triangle array, or data that do not fit what is announced.
+        MeshError: The file has not exactly one point set and one triangle array, or its data do not fit
+            their announced sizes.
     """
-    _Inspection(data)
+    _XmlCheck(data)
     image = nibabel.GiftiImage.from_bytes(data)
     points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
     triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
@@ -47,12 +48,12 @@ def parse_gifti(data: bytes, path: Path) -> Raw:
     return np.asarray(points[0].data), np.asarray(triangles[0].data)
 
 
-class _Inspection:
-    """One pass over the XML that keeps nothing; it raises where the library had better not look.
+class _XmlCheck:
+    """One pass over the XML, which refuses what would harm the library and keeps nothing.
 
     Raises:
-        MeshError: entities, data in another file, odd dimensions, another number of arrays than announced,
-            or packed data that are larger than announced or than `unpacked_limit`.
+        MeshError: The file has entities, data in another file, odd dimensions, another number of arrays than
+            announced, or packed data that are larger than announced or than `unpacked_limit`.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -60,7 +61,7 @@ class _Inspection:
         self._announced: int | None = None
         self._arrays = 0
         self._encoding, self._bytes = "", 0
-        self._blocks: list[str] | None = None
+        self._texts: list[str] | None = None
         parser = expat.ParserCreate()
         parser.buffer_text = True
         parser.EntityDeclHandler = self._entity
@@ -75,7 +76,7 @@ class _Inspection:
         raise MeshError(f"the XML declares the entity {name[:40]!r}; a GIFTI file has none, write it without")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
-        # The library, too, takes the text before an inner element for all of the data.
+        # The library, too, takes the text before an inner element as all of the data.
         self._flush()
         if name == "GIFTI" and "NumberOfDataArrays" in attributes:
             self._announced = int(attributes["NumberOfDataArrays"])
@@ -86,32 +87,32 @@ class _Inspection:
                 raise MeshError("its data lie in another file; write it with them inside")
             self._bytes = _array_bytes(attributes)
         elif name == "Data":
-            self._blocks = []
+            self._texts = []
 
     def _end(self, name: str) -> None:
         self._flush()
         if name == "Data":
-            self._blocks = None
+            self._texts = None
 
     def _text(self, text: str) -> None:
-        if self._blocks is not None:
-            self._blocks.append(text)
+        if self._texts is not None:
+            self._texts.append(text)
 
     def _flush(self) -> None:
-        if not self._blocks:
+        if not self._texts:
             return
-        text = "".join(self._blocks)
-        self._blocks = []
+        text = "".join(self._texts)
+        self._texts = []
         if "GZip" in self._encoding or "GZ" in self._encoding:
             self._unpack(text)
         elif self._encoding.upper().endswith("ASCII") and not text.strip():
             raise MeshError(f"array {self._arrays} of the file is empty")
 
     def _unpack(self, text: str) -> None:
-        """Count what data unpack to, a megabyte at a time, and drop it."""
+        """Count the bytes that data unpack to, a megabyte at a time, without keeping them."""
         packer, packed, total = zlib.decompressobj(), base64.b64decode(text), 0
         while packed and not packer.eof:
-            total += len(packer.decompress(packed, _STEP_BYTES))
+            total += len(packer.decompress(packed, _CHUNK_BYTES))
             packed = packer.unconsumed_tail
             if total > self._bytes:
                 raise MeshError(
@@ -123,7 +124,7 @@ class _Inspection:
 
 
 def _array_bytes(attributes: dict[str, str]) -> int:
-    """The size that a DataArray announces."""
+    """Return the size that a DataArray announces."""
     count = int(attributes.get("Dimensionality", 0))
     if not 1 <= count <= _MOST_DIMENSIONS:
         raise MeshError(f"an array of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")

@@ -1,7 +1,7 @@
-"""glTF 2.0 scenes, text and binary, as far as they are about triangles.
+"""Triangles of glTF 2.0 scenes, text and binary.
 
-Read here since the library at hand leaves out primitives, placements and encodings in silence. What
-this module does not understand it refuses. Specification: Khronos Group, "glTF 2.0" (2021).
+They are read here because the library at hand silently leaves out primitives, placements and encodings.
+This reader refuses what it does not understand. Specification: Khronos Group, "glTF 2.0" (2021).
 """
 
 from __future__ import annotations
@@ -18,56 +18,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import read_contents, unpacked_limit
 from sobolev_batch.surfaces.formats.polygons import merge_coincident
+from sobolev_batch.surfaces.formats.raw_files import read_regular, unpacked_limit
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Required extensions that leave the positions of vertices as they stand in the accessors.
+# Required extensions that do not change the positions of vertices.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "KHR_xmp")
 
 
 def parse_gltf(data: bytes, path: Path) -> Raw:
-    """Vertices and triangles of the default scene, in its own frame; coinciding vertices are merged.
+    """Return the vertices and triangles of the default scene, in its own frame; coinciding vertices are merged.
 
     Args:
-        data: the file, .gltf or .glb.
-        path: where it lies; buffers in files of their own are found from there.
+        data: Contents of the file, .gltf or .glb.
+        path: Path of the file; its folder holds buffers in files of their own.
 
     Raises:
-        MeshError: a damaged file, a buffer outside the file's folder, or something that this reader
-            does not understand.
+        MeshError: The file is damaged, a buffer lies outside its folder, or this reader does not understand it.
     """
     tree, binary = _document(data)
     required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
     if required:
         raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
     buffers = _Buffers(tree, binary, path)
-    parts: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+    placed: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
     total = 0
     for matrix, mesh in _placed_meshes(tree):
         for vertices, triangles in _primitives(tree["meshes"][mesh], buffers):
-            parts.append((vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
+            placed.append((vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
             total += vertices.nbytes + triangles.nbytes
-            # Any number of nodes may place one mesh, and any number of parts use one array.
+            # Any number of nodes may place one mesh, and any number of primitives use one array.
             most = unpacked_limit(len(data) + buffers.loaded_bytes)
             if total > most:
                 raise MeshError(f"its scene repeats parts until they take more than {most} bytes; export it unfolded")
-    if not parts:
+    if not placed:
         raise MeshError("the file's scene has no faces")
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    triangles = np.concatenate([part[1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
-    return merge_coincident(np.concatenate([vertices for vertices, _ in parts]), triangles)
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in placed)])
+    triangles = np.concatenate([indices + offset for (_, indices), offset in zip(placed, offsets[:-1], strict=True)])
+    return merge_coincident(np.concatenate([vertices for vertices, _ in placed]), triangles)
 
 
 def buffer_paths(data: bytes, path: Path) -> list[Path]:
-    """The files beside a glTF file that hold its buffers.
+    """Return the files beside a glTF file that hold its buffers.
 
     Raises:
-        MeshError: a damaged file, or a buffer outside the file's folder.
+        MeshError: The file is damaged, or a buffer lies outside its folder.
     """
     tree, _ = _document(data)
     uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
@@ -80,16 +79,16 @@ class _Buffers:
     def __init__(self, tree: dict[str, Any], binary: bytes | None, path: Path) -> None:
         self._tree, self._binary, self._path = tree, binary, path
         self._loaded: dict[int, bytes] = {}
-        # By path: buffers of a document may be one file under several names.
+        # By path, since several buffers may be one file under different names.
         self._files: dict[Path, bytes] = {}
 
     @property
     def loaded_bytes(self) -> int:
-        """The size of the files that were read."""
+        """Size of the files that were read."""
         return sum(map(len, self._files.values()))
 
     def array(self, index: int, kind: str) -> NDArray[Any]:
-        """The values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
+        """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
         accessor = self._tree["accessors"][index]
         if accessor["type"] != kind:
             raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
@@ -99,28 +98,28 @@ class _Buffers:
         dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
         stride = view.get("byteStride", dtype.itemsize * width)
         offset = accessor.get("byteOffset", 0)
-        needed = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
+        end = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
         if stride < dtype.itemsize * width:
             raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
-        if min(offset, count) < 0 or needed > view["byteLength"]:
+        if min(offset, count) < 0 or end > view["byteLength"]:
             raise MeshError(
                 f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold"
             )
         start = view.get("byteOffset", 0)
-        held = self._bytes(view["buffer"])
-        if start < 0 or start + view["byteLength"] > len(held):
-            raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(held)}")
-        values: NDArray[Any] = np.ndarray((count, width), dtype, held, start + offset, (stride, dtype.itemsize))
+        buffer = self._bytes(view["buffer"])
+        if start < 0 or start + view["byteLength"] > len(buffer):
+            raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
+        values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
         return values[:, 0] if kind == "SCALAR" else values
 
     def _bytes(self, index: int) -> bytes:
         if index not in self._loaded:
             uri = self._tree["buffers"][index].get("uri")
             announced = self._tree["buffers"][index]["byteLength"]
-            found = self._load(index, uri)
-            if len(found) < announced:
-                raise MeshError(f"buffer {index} announces {announced} bytes, found {len(found)}")
-            self._loaded[index] = found
+            buffer = self._load(index, uri)
+            if len(buffer) < announced:
+                raise MeshError(f"buffer {index} announces {announced} bytes, found {len(buffer)}")
+            self._loaded[index] = buffer
         return self._loaded[index]
 
     def _load(self, index: int, uri: str | None) -> bytes:
@@ -133,7 +132,7 @@ class _Buffers:
         beside = _beside(self._path, uri)
         if beside not in self._files:
             try:
-                self._files[beside] = read_contents(beside, gzipped=False)
+                self._files[beside] = read_regular(beside, gzipped=False)
             except MeshError as error:
                 raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
         return self._files[beside]
@@ -142,14 +141,14 @@ class _Buffers:
 def _beside(path: Path, uri: str) -> Path:
     name, folder = unquote(uri), path.parent.resolve()
     outside = "://" in name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts
-    # A link may lead anywhere.
+    # A link may lead out of the folder too.
     if outside or not (folder / name).resolve().is_relative_to(folder):
         raise MeshError(f"its buffer {uri[:80]!r} lies outside the file's folder; put it there")
     return (folder / name).resolve()
 
 
 def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
-    """The JSON of a file and, of a binary one, its second chunk."""
+    """Return the JSON of a file and the second chunk of a binary one."""
     binary = None
     if data[:4] == b"glTF":
         version, length = struct.unpack_from("<II", data, 4)
@@ -172,7 +171,7 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
 
 
 def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[NDArray[np.float64], int]]:
-    """Each mesh of the default scene with the matrix that places it."""
+    """Yield the index of each mesh of the default scene, with the matrix that places it."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes")
     if scenes:
@@ -180,15 +179,15 @@ def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[NDArray[np.float64], 
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in children]
-    waiting = [(index, np.eye(4)) for index in reversed(roots)]
-    seen: set[int] = set()
-    while waiting:
-        index, above = waiting.pop()
-        if index in seen or not 0 <= index < len(nodes):
+    pending = [(index, np.eye(4)) for index in reversed(roots)]
+    visited: set[int] = set()
+    while pending:
+        index, parent_matrix = pending.pop()
+        if index in visited or not 0 <= index < len(nodes):
             raise MeshError(f"node {index} of the scene is missing or has two parents")
-        seen.add(index)
-        matrix = above @ _matrix(nodes[index])
-        waiting += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
+        visited.add(index)
+        matrix = parent_matrix @ _matrix(nodes[index])
+        pending += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
         if "mesh" in nodes[index]:
             yield matrix, nodes[index]["mesh"]
 
@@ -209,7 +208,7 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _primitives(mesh: dict[str, Any], buffers: _Buffers) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-    """Positions and triangles of each primitive that has any; points and lines have no area."""
+    """Yield positions and triangles of each primitive that has area, so no points or lines."""
     for primitive in mesh["primitives"]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
@@ -223,7 +222,7 @@ def _primitives(mesh: dict[str, Any], buffers: _Buffers) -> Iterator[tuple[NDArr
         bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
         if bad.size:
             raise MeshError(
-                f"{bad.size} of {len(triangles)} triangles of a part have indices outside 0..{len(vertices) - 1}"
+                f"{bad.size} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
             )
         yield vertices, triangles
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import fans_of_lists
+from sobolev_batch.surfaces.formats.polygons import triangle_fans_of_lists
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
-# A header ends within so many bytes: room for a thousand lines, and no more to look through for a plan.
+# A header ends within so many bytes: room for a thousand lines, and quick to look through.
 HEADER_BYTES = 1 << 16
 
 _END = b"end_header"
@@ -25,67 +25,67 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _MOST_DIGITS = 18
 _SHORT, _LONG = (b"short", b"ushort", b"int16", b"uint16"), (b"int", b"uint", b"float", b"int32", b"uint32", b"float32")
 _TYPE_BYTES = dict.fromkeys(_SHORT, 2) | dict.fromkeys(_LONG, 4) | dict.fromkeys((b"double", b"float64"), 8)
-# A digit and what ends it.
+# A digit and the character that ends it.
 _TEXT_BYTES = 2
 
 
 def parse_ply(data: bytes, path: Path) -> Raw:
-    """Vertices and triangles of a PLY file, in its own precision.
+    """Return the vertices and triangles of a PLY file, in its own precision.
 
     Args:
-        data: the contents of the file.
-        path: of the file; a PLY file refers to no others.
+        data: Contents of the file.
+        path: Path of the file; unused, since a PLY file refers to no others.
 
     Raises:
-        MeshError: no vertices or faces, or counts that do not fit what follows.
+        MeshError: There are no vertices or faces, or the counts do not fit the contents.
     """
     start = data.find(_END, 0, HEADER_BYTES)
-    header, length = _Header.of(data[: max(start, 0)]), len(data) - start - len(_END)
+    header, length = _Header.parsed(data[: max(start, 0)]), len(data) - start - len(_END)
     counts = header.counts
     if start < 0 or "vertex" not in counts or "face" not in counts:
         raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
-    # A count beyond what can follow would only reserve memory.
+    # The library would reserve memory for any count.
     if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
     entries = sum(counts.values())
     lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if header.text else entries
     if lines != entries:
         raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
-    # A real file where it is binary, since of any other stream the library reads row by row.
+    # A real file for binary data: the library reads other streams row by row.
     with TemporaryFile() as stream:
         source, total = (data, 0) if header.text else (stream, stream.write(data))
         del data
         try:
-            # Reads all faces at once; the library refuses it where one of them is no triangle.
+            # Reads all faces at once; the library refuses where one of them is no triangle.
             ply = _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
         except (PlyElementParseError, KeyError):
             ply = _read(source, {})
-        # Of a text the lines were counted.
-        left = 0 if header.text else total - stream.tell()
-    if left:
-        raise MeshError(f"the PLY header announces {counts}, but {left} bytes more follow")
+        # The lines of a text were counted above.
+        unread = 0 if header.text else total - stream.tell()
+    if unread:
+        raise MeshError(f"the PLY header announces {counts}, but {unread} bytes more follow")
     vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
     return vertices, _triangles(ply["face"])
 
 
 def announced_sizes(header: bytes) -> tuple[int, int, bool]:
-    """How many vertices and faces the beginning of a file announces, 0 where it does not, and whether it is a text.
+    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text.
 
     Raises:
-        MeshError: a count that is none.
+        MeshError: A count is no integer.
     """
-    found = _Header.of(header.partition(_END)[0])
-    return found.counts.get("vertex", 0), found.counts.get("face", 0), found.text
+    parsed = _Header.parsed(header.partition(_END)[0])
+    return parsed.counts.get("vertex", 0), parsed.counts.get("face", 0), parsed.text
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What a header announces.
+    """The announcements of a header.
 
     Attributes:
-        counts: of each element.
-        least_bytes: the fewest that can follow it.
-        text: whether what follows is text.
+        counts: Number of entries of each element.
+        least_bytes: Smallest possible length of these entries.
+        text: True where they are text.
     """
 
     counts: dict[str, int]
@@ -93,8 +93,8 @@ class _Header:
     text: bool
 
     @classmethod
-    def of(cls, header: bytes) -> _Header:
-        """The header of which these are the lines; the library complains of those that are malformed."""
+    def parsed(cls, header: bytes) -> _Header:
+        """Return a header from its bytes; the library complains of malformed lines."""
         counts: dict[str, int] = {}
         row_bytes: dict[str, int] = {}
         element, text = "", False
@@ -131,4 +131,4 @@ def _triangles(faces: PlyElement) -> NDArray[np.int64]:
     corners = faces[names[0]]
     if corners.ndim == 2:
         return np.asarray(corners, dtype=np.int64)
-    return fans_of_lists(corners)
+    return triangle_fans_of_lists(corners)

@@ -1,4 +1,4 @@
-"""Polygons into triangles."""
+"""Polygons cut into triangles, and vertices merged."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import MeshError
 
 
-def fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cut each polygon into the fan of triangles around its first corner, exact for convex ones.
 
     Args:
-        corners: vertex indices of all polygons, one after the other.
-        sizes: the number of corners of each polygon.
+        corners: Vertex indices of all polygons, one after the other.
+        sizes: Number of corners of each polygon.
 
     Returns:
-        (m, 3) int64, the triangles of a polygon next to each other.
+        Vertex indices of triangles (m, 3), int64; those of a polygon lie next to each other.
 
     Raises:
-        MeshError: no polygons, or one of fewer than three corners.
+        MeshError: There are no polygons, or one has fewer than three corners.
     """
     if not len(sizes):
         raise MeshError("the file has no faces")
@@ -32,24 +32,25 @@ def fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int
         return corners.reshape(-1, 3)
     starts = np.cumsum(sizes) - sizes
     polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
-    within = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    rank = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
     first = starts[polygon]
-    return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1)
+    return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
 
 
-def fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
-    """The same from one sequence of vertex indices per polygon."""
+def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
+    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
     if not len(polygons):
         raise MeshError("the file has no faces")
     sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
-    return fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
+    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
 
 
 def merge_coincident(
     vertices: NDArray[np.floating], triangles: NDArray[np.int64]
 ) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Merge vertices with exactly the same coordinates; for formats that repeat them."""
+    """Merge vertices with exactly the same coordinates, for formats that repeat them."""
     if not np.isfinite(vertices).all():
-        return vertices, triangles  # left for the mesh to refuse, with the entries that are wrong
-    merged, index = np.unique(vertices, axis=0, return_inverse=True)
-    return merged, index.reshape(-1)[triangles]
+        # The mesh refuses them and names the entries.
+        return vertices, triangles
+    merged, indices = np.unique(vertices, axis=0, return_inverse=True)
+    return merged, indices.reshape(-1)[triangles]

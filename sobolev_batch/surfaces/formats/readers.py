@@ -1,4 +1,4 @@
-"""Mesh files into meshes: which parser reads which, and what every one of them must hold."""
+"""Readers of mesh files: the parser of each format, and predictions of sizes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.contents import bounded_length, is_gzipped, open_regular, read_bytes, unpacked_limit
 from sobolev_batch.surfaces.formats.gifti import parse_gifti
 from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply
+from sobolev_batch.surfaces.formats.raw_files import (
+    checked_length,
+    is_gzipped,
+    open_regular,
+    read_unpacked,
+    unpacked_limit,
+)
 from sobolev_batch.surfaces.formats.stl import parse_stl
 from sobolev_batch.surfaces.formats.text_formats import parse_obj, parse_off
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -23,14 +29,15 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 Raw = tuple[NDArray[Any], NDArray[Any]]
 
 _LONGEST_REASON = 250
-# What gzip makes of mesh files, about.
+# Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
-# Of PLY files: the least bytes of a vertex and of a face; bytes of a vertex in double precision and of a corner;
-# how much more reading takes row by row than at once; and what a vertex takes beyond the one for every two triangles
-# that the table counts in.
+# Smallest possible sizes of a vertex and a face in a PLY file.
 _LEAST_VERTEX_BYTES, _LEAST_FACE_BYTES = 3, 4
-_VERTEX_BYTES, _CORNER_BYTES, _TEXT_FACTOR, _VERTEX_MEMORY = 24, 4.4, 7.0, 70.0
-# Of each triangle in a file without anything but positions and triangles, and at the measured peak of reading it.
+# Usual sizes in a PLY file: of a vertex in double precision, and of a corner.
+_VERTEX_BYTES, _CORNER_BYTES = 24, 4.4
+# Memory of reading a PLY file: factor of reading row by row, and bytes of each vertex beyond one for two triangles.
+_TEXT_FACTOR, _VERTEX_MEMORY = 7.0, 70.0
+# Bytes of each triangle, in a file of nothing but positions and triangles, and at the measured peak of reading it.
 _BYTES_PER_TRIANGLE = {
     ".ply": (19, 90),
     ".obj": (35, 420),
@@ -43,25 +50,37 @@ _BYTES_PER_TRIANGLE = {
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
+    r"""Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
 
-    The format follows from the name. Double precision is kept where the file has it. Polygons are
-    cut into fans of triangles, which is exact for convex ones. STL and glTF vertices that coincide
-    exactly are merged, since these formats repeat them; all other vertices stay as they are.
+    The format follows from the name. Coordinates keep the precision of the file. Polygons are cut into fans
+    of triangles, which is exact for convex ones. STL and glTF repeat vertices, so those that coincide exactly
+    are merged; vertices of other formats stay as they are.
+
+    Args:
+        path: Path of the file.
 
     Raises:
-        MeshError: the file is missing, of no known format, damaged, or does not hold a valid mesh;
-            the message starts with its path.
+        MeshError: The file is missing, of no known format, damaged, or holds no valid mesh; the message
+            starts with the path.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import sobolev_batch as sb
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "triangle.off")
+    ...     _ = path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    ...     sb.read_mesh(path)
+    Mesh(3 vertices, 1 triangles)
     """
     path = Path(path)
     suffix = mesh_format(path).removesuffix(".gz")
     if suffix not in _PARSERS:
         raise MeshError(f"{path}: no mesh format has this name; known are {', '.join(_PARSERS)}, each also with .gz")
-    data = [read_bytes(path)]
+    data = [read_unpacked(path)]
     try:
-        # What overflows becomes infinite, and is refused for that.
+        # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
-            # The parser alone holds the bytes, and lets go of them as soon as it can.
+            # Only the parser holds the bytes, so that it can free them early.
             vertices, triangles = _PARSERS[suffix](data.pop(), path)
             for array in (vertices, triangles):
                 array.setflags(write=False)
@@ -71,70 +90,69 @@ def read_mesh(path: str | Path) -> Mesh:
     except MemoryError as error:
         raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
     except Exception as error:
-        # Damaged input makes the parsers raise anything from struct.error to RecursionError.
+        # On damaged input parsers raise anything from struct.error to RecursionError.
         raise MeshError(f"{path}: not a readable {suffix} file: {type(error).__name__}: {_shortened(error)}") from error
 
 
 def expected_size(path: Path) -> tuple[int, float]:
-    """About how many triangles a file holds, and the bytes of memory that reading it takes at its peak.
+    """Estimate the number of triangles in a file, and the peak of the memory in bytes that reading it takes.
 
-    From the length of the file, but for PLY, whose header tells; never more than a file of this length
-    can hold, and zero where it cannot be read.
+    The estimate rests on the header of a PLY file, and on the length of others. It never exceeds what a file
+    of this length can hold. Both are zero where the file cannot be read.
     """
     suffix = mesh_format(path)
-    bare = suffix.removesuffix(".gz")
-    if bare not in _BYTES_PER_TRIANGLE:
+    unpacked_suffix = suffix.removesuffix(".gz")
+    if unpacked_suffix not in _BYTES_PER_TRIANGLE:
         return 0, 0.0
-    each_in_file, each_in_memory = _BYTES_PER_TRIANGLE[bare]
+    file_bytes, memory_bytes = _BYTES_PER_TRIANGLE[unpacked_suffix]
     try:
         with open_regular(path) as file:
-            length = bounded_length(file)
+            length = checked_length(file)
             if suffix.endswith(".gz"):
                 length = min(_PACKING * length, unpacked_limit(length))
-            if bare == ".ply":
+            if unpacked_suffix == ".ply":
                 unpacked = gzip.GzipFile(fileobj=file) if suffix.endswith(".gz") else file
                 return _announced_size(unpacked.read(HEADER_BYTES), length)
         if suffix == ".gltf":
             length += sum(buffer.stat().st_size for buffer in set(companion_files(path)))
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
         return 0, 0.0
-    triangles = int(length / each_in_file)
-    return triangles, triangles * each_in_memory
+    triangles = int(length / file_bytes)
+    return triangles, triangles * memory_bytes
 
 
 def _announced_size(header: bytes, length: int) -> tuple[int, float]:
-    """The same of a PLY file of this length, whose header may announce anything."""
+    """Estimate the same for a PLY file of this length, whose header may announce anything."""
     vertices, faces, text = announced_sizes(header)
     vertices, faces = min(vertices, length // _LEAST_VERTEX_BYTES), min(faces, length // _LEAST_FACE_BYTES)
-    # Faces with more corners than three show in the length of the file.
+    # The length of the file shows whether faces have more than three corners.
     corners = (length - vertices * _VERTEX_BYTES) / max(faces, 1) / _CORNER_BYTES
     triangles = faces if text or corners < 4 else 2 * faces
-    each_in_memory = _BYTES_PER_TRIANGLE[".ply"][1] * (_TEXT_FACTOR if text or triangles > faces else 1)
-    return triangles, triangles * each_in_memory + _VERTEX_MEMORY * max(0.0, vertices - triangles / 2)
+    memory_bytes = _BYTES_PER_TRIANGLE[".ply"][1] * (_TEXT_FACTOR if text or triangles > faces else 1)
+    return triangles, triangles * memory_bytes + _VERTEX_MEMORY * max(0.0, vertices - triangles / 2)
 
 
 def mesh_format(path: Path) -> str:
-    """The suffix, in lower case, that says how a file is read, .gz included."""
+    """Return the suffix in lower case, .gz included, which decides on the parser."""
     name = path.name.lower()
     return Path(name.removesuffix(".gz")).suffix + (".gz" if name.endswith(".gz") else "")
 
 
 def mesh_stem(path: Path) -> str:
-    """The file's name without its format and compression."""
-    bare = path.name[: -len(".gz")] if is_gzipped(path) else path.name
-    return Path(bare).stem
+    """Return the name of a file without its format and compression."""
+    return Path(path.name[: -len(".gz")] if is_gzipped(path) else path.name).stem
 
 
 def companion_files(path: Path) -> list[Path]:
-    """The further files that a mesh file consists of: the buffers of a glTF file.
+    """Return the further files that a mesh file consists of: the buffers of a glTF file.
 
     Raises:
-        MeshError: the file cannot be read.
+        MeshError: The file cannot be read.
     """
     if mesh_format(path).removesuffix(".gz") not in (".gltf", ".glb"):
         return []
     try:
-        return buffer_paths(read_bytes(path), path)
+        return buffer_paths(read_unpacked(path), path)
     except MeshError:
         raise
     except Exception as error:
@@ -142,7 +160,7 @@ def companion_files(path: Path) -> list[Path]:
 
 
 def _shortened(error: Exception) -> str:
-    """What an error says, on one line; what it quotes of a file may be of any length."""
+    """Return the message of an error on one line; it may quote any length of a file."""
     reason = " ".join(str(error).split()) or "no details"
     return reason if len(reason) <= _LONGEST_REASON else reason[: _LONGEST_REASON - 3] + "..."
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.polygons import merge_coincident
+from sobolev_batch.surfaces.formats.text_formats import decoded_text, parsed_numbers
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
@@ -15,10 +16,10 @@ _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribut
 
 
 def parse_stl(data: bytes) -> Raw:
-    """Vertices and triangles of an STL file; corners that coincide exactly are merged.
+    """Return the vertices and triangles of an STL file; corners that coincide exactly are merged.
 
     Raises:
-        MeshError: a size that does not fit the announced count, or malformed text.
+        MeshError: The size does not fit the announced count, or the text is malformed.
     """
     announced = int.from_bytes(data[80:_HEADER_BYTES], "little")
     if len(data) >= _HEADER_BYTES and len(data) == _HEADER_BYTES + _RECORD.itemsize * announced:
@@ -26,9 +27,9 @@ def parse_stl(data: bytes) -> Raw:
     elif data.lstrip()[:5].lower() == b"solid":
         corners = _text_corners(data)
     else:
-        held = (len(data) - _HEADER_BYTES) / _RECORD.itemsize
+        count = (len(data) - _HEADER_BYTES) / _RECORD.itemsize
         raise MeshError(
-            f"a binary STL file of {len(data)} bytes holds {held:.2f} triangles, but its header announces {announced}"
+            f"a binary STL file of {len(data)} bytes holds {count:.2f} triangles, but its header announces {announced}"
         )
     if not len(corners):
         raise MeshError("the file has no faces")
@@ -37,8 +38,8 @@ def parse_stl(data: bytes) -> Raw:
 
 def _text_corners(data: bytes) -> NDArray[np.float64]:
     corners: list[list[float]] = []
-    facet, within, in_solid = 0, 0, False
-    for line in data.decode("utf-8", errors="replace").split("\n"):
+    facet, facet_corners, in_solid = 0, 0, False
+    for line in decoded_text(data).split("\n"):
         words = line.split()
         match words[0].lower() if words else "":
             case "":
@@ -46,29 +47,20 @@ def _text_corners(data: bytes) -> NDArray[np.float64]:
             case "solid" | "endsolid" as word:
                 in_solid = word == "solid"
             case "facet":
-                facet, within = facet + 1, 0
+                facet, facet_corners = facet + 1, 0
             case "vertex":
-                corners.append(_corner(words[1:], facet))
-                within += 1
+                if len(words) != 4:
+                    raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
+                corners.append(parsed_numbers(words[1:], f"facet {facet}"))
+                facet_corners += 1
             case "endfacet":
-                if within != 3:
-                    raise MeshError(f"facet {facet} has {within} vertices, expected three")
-                within = 0
+                if facet_corners != 3:
+                    raise MeshError(f"facet {facet} has {facet_corners} vertices, expected three")
+                facet_corners = 0
             case "outer" | "endloop":
                 continue
             case other:
                 raise MeshError(f"after facet {facet}: {other[:40]!r} is no word of an STL file")
-    if in_solid or within:
+    if in_solid or facet_corners:
         raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
     return np.array(corners, dtype=np.float64).reshape(-1, 3)
-
-
-def _corner(words: list[str], facet: int) -> list[float]:
-    if len(words) != 3:
-        raise MeshError(f"facet {facet} has a vertex of {len(words)} coordinates, expected three")
-    try:
-        if any("_" in word for word in words):
-            raise ValueError("Python's spelling, not that of any mesh format")
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise MeshError(f"facet {facet} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error

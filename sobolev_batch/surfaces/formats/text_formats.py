@@ -1,7 +1,7 @@
-"""OBJ and OFF files, as far as they are about vertices and faces.
+"""Vertices and faces of OBJ and OFF files.
 
-Both are read here because the libraries at hand lose or change faces in silence where a line is not
-what they expect; every line and every announced count is checked instead.
+Both are read here because the libraries at hand silently lose or change faces where a line is not what
+they expect. This reader checks every line and every announced count.
 """
 
 from __future__ import annotations
@@ -12,53 +12,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import fans
+from sobolev_batch.surfaces.formats.polygons import triangle_fans
 
 Raw = tuple[NDArray[np.float64], NDArray[np.int64]]
 
-# x y z, with a weight, a colour, or both.
+# Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
-# Numbers per vertex line beside x y z, and per face line behind the corners: a colour or its index.
+# Further numbers per vertex line, by the kind of file, and per face line: a colour or its index.
 _OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
-# Of an index or count: any that fits into 64 bits, and a few that nobody has.
+# Digits of an index or count: all that fit into 64 bits.
 _MOST_DIGITS = 18
 
 
 def parse_obj(data: bytes) -> Raw:
-    """Vertices (n, 3) and triangles (m, 3) of an OBJ file; all its objects and groups together.
+    """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together.
 
     Raises:
-        MeshError: a vertex or face line that is malformed; the message counts them from 1.
+        MeshError: A vertex or face line is malformed; the message counts them from 1.
     """
     vertices: list[list[float]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    for line in _text(data).replace("\\\n", " ").split("\n"):
+    for line in decoded_text(data).replace("\\\n", " ").split("\n"):
         words = line.partition("#")[0].split()
         if not words:
             continue
         if words[0] == "v":
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
                 raise MeshError(f"vertex {len(vertices) + 1} has {len(words) - 1} coordinates, expected three")
-            vertices.append(_numbers(words[1:4], f"vertex {len(vertices) + 1}"))
+            vertices.append(parsed_numbers(words[1:4], f"vertex {len(vertices) + 1}"))
         elif words[0] == "f":
             corners += (_obj_corner(word, len(vertices), len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), fans(
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangle_fans(
         np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
     )
 
 
 def parse_off(data: bytes) -> Raw:
-    """Vertices (n, 3) and triangles (m, 3) of an OFF file in text.
+    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text.
 
     Raises:
-        MeshError: counts that do not fit the lines, or a malformed line.
+        MeshError: The counts do not fit the lines, or a line is malformed.
     """
-    text = _text(data)
+    text = decoded_text(data)
     if text and not text.endswith("\n"):
-        # A last number may have lost digits: nothing else would tell.
+        # Without a line end, the last number may have lost digits.
         last = text.rsplit("\n", 1)[-1].partition("#")[0].split()
         if last and not _complete_face(last):
             raise MeshError("the OFF file breaks off in its last line")
@@ -81,10 +81,11 @@ def parse_off(data: bytes) -> Raw:
     polygons = [_off_polygon(words, number) for number, words in enumerate(rows[vertex_count:], 1)]
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), fans(corners, sizes)
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangle_fans(corners, sizes)
 
 
-def _text(data: bytes) -> str:
+def decoded_text(data: bytes) -> str:
+    """Return the text of a file with line feeds at the ends of its lines."""
     return data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -93,26 +94,31 @@ def _is_count(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) <= _MOST_DIGITS
 
 
-def _numbers(words: list[str], what: str) -> list[float]:
+def parsed_numbers(words: list[str], owner: str) -> list[float]:
+    """Return words as numbers.
+
+    Raises:
+        MeshError: A word is no number; the message starts with the owner, such as "vertex 7".
+    """
     try:
         if any("_" in word for word in words):
             raise ValueError("Python's spelling, not that of any mesh format")
         return [float(word) for word in words]
     except ValueError as error:
-        raise MeshError(f"{what} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
+        raise MeshError(f"{owner} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
 
 
-def _integer(word: str, what: str) -> int:
+def _integer(word: str, owner: str) -> int:
     if len(word) > _MOST_DIGITS or "_" in word:
-        raise MeshError(f"{what} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}")
+        raise MeshError(f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}")
     try:
         return int(word)
     except ValueError as error:
-        raise MeshError(f"{what} has an index that is not an integer: {word[:80]!r}") from error
+        raise MeshError(f"{owner} has an index that is not an integer: {word[:80]!r}") from error
 
 
 def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
-    """The index from 0 of a corner such as 7, 7/1, 7//3 or -1; negative ones count back from its line."""
+    """Return the index from 0 of a corner such as 7, 7/1, 7//3 or -1; negative ones count back from their line."""
     index = _integer(word.partition("/")[0], f"face {face}")
     if index == 0:
         raise MeshError(f"face {face} has the vertex index 0; OBJ counts from 1")
@@ -126,7 +132,7 @@ def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
 def _off_vertex(words: list[str], number: int, expected: int) -> list[float]:
     if len(words) != expected:
         raise MeshError(f"vertex {number} has {len(words)} numbers, expected {expected}")
-    return _numbers(words, f"vertex {number}")[:3]
+    return parsed_numbers(words, f"vertex {number}")[:3]
 
 
 def _off_polygon(words: list[str], number: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Extents of surfaces along fixed directions: how wide they are, and how far they reach."""
+"""Extents of surfaces along fixed directions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
-# The axes, the diagonals of faces and those of the cube: unit vectors (13, 3).
+# The axes, the diagonals of the faces and those of the cube: unit vectors (13, 3).
 DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
 _AXES = [int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3)]
 
@@ -23,8 +23,8 @@ class Extent:
     """The least and the greatest x · direction over a surface, for each of `DIRECTIONS`.
 
     Attributes:
-        lowest: (13,), in units of length.
-        highest: (13,), in units of length.
+        lowest: Least values (13,), in units of length.
+        highest: Greatest values (13,), in units of length.
     """
 
     lowest: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Intervals that a surface's parameters run over: their quadrature rules, and derivatives of values at the nodes."""
+"""Intervals of parameters, with their quadrature rules and the derivatives of interpolants."""
 
 from __future__ import annotations
 
@@ -11,22 +11,28 @@ from numpy.typing import NDArray
 from scipy.special import roots_legendre
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.sphere import is_finite_number
+from sobolev_batch.surfaces.shapes.surface import is_finite_number
 
 Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Interval:
-    """What a parameter of a surface runs over.
+    """The interval of a parameter of a surface.
 
     Args:
-        low: where it begins.
-        high: where it ends; above ``low``.
-        periodic: whether the surface closes smoothly from its end to its beginning.
+        low: Beginning.
+        high: End, above ``low``.
+        periodic: True where the surface closes smoothly from the end to the beginning.
 
     Raises:
-        InputError: ends that are not finite numbers in ascending order.
+        InputError: The ends are not finite numbers in ascending order.
+
+    >>> import numpy as np
+    >>> import sobolev_batch as sb
+    >>> nodes, weights = sb.Interval(0.0, np.pi).rule(12)
+    >>> f"{weights @ np.sin(nodes):.12f}"
+    '2.000000000000'
     """
 
     low: float
@@ -45,47 +51,49 @@ class Interval:
 
     @property
     def length(self) -> float:
-        """From one end to the other."""
+        """Distance between the ends."""
         return self.high - self.low
 
     def rule(self, count: int) -> tuple[Reals, Reals]:
-        """Nodes and weights (count,) of a quadrature rule that converges spectrally on smooth functions.
+        """Return nodes and weights (count,) of a quadrature rule that converges spectrally on smooth functions.
 
-        The trapezoidal rule where periodic (L. N. Trefethen, J. A. C. Weideman 2014,
-        doi:10.1137/130932132), Gauss-Legendre otherwise, whose nodes leave out the ends.
+        Periodic intervals have the trapezoidal rule (L. N. Trefethen, J. A. C. Weideman 2014,
+        doi:10.1137/130932132). Others have Gauss-Legendre, whose nodes leave out the ends.
         """
         if self.periodic:
             step = self.length / count
             return np.asarray(self.low + step * np.arange(count)), np.full(count, step, dtype=np.float64)
-        nodes, weights = _gauss(count)
+        nodes, weights = _gauss_legendre(count)
         return self.low + self.length / 2 * (1 + nodes), self.length / 2 * weights
 
     def derivative(self, values: Reals, axis: int) -> Reals:
-        """The derivative at the nodes of the interpolant through values there.
+        """Return the derivative, at the nodes of the `rule`, of the interpolant through values at them.
+
+        The interpolant is a trigonometric polynomial where periodic, which needs an odd number of nodes,
+        and a polynomial otherwise (H. Wang, S. Xiang 2012, doi:10.1090/S0025-5718-2011-02549-4). For
+        functions that the nodes resolve, the error is about n or n² roundings of the largest value.
 
         Args:
-            values: float64, at the nodes of the `rule` along ``axis``.
-            axis: of ``values``.
+            values: Values at the nodes, float64, of any shape.
+            axis: Axis of ``values`` that runs over the nodes.
 
         Returns:
-            float64, in the shape of ``values``: of the trigonometric polynomial where periodic, which
-            needs an odd number of nodes, and of the polynomial otherwise (H. Wang, S. Xiang 2012,
-            doi:10.1090/S0025-5718-2011-02549-4). On what the nodes resolve its error is rounding: about
-            n or n² rounding errors of the largest value.
+            Derivatives, float64, in the shape of ``values``.
         """
         count = values.shape[axis]
         if self.periodic:
-            waves = 2j * np.pi / self.length * np.arange(count // 2 + 1)
-            spectrum = np.moveaxis(np.fft.rfft(values, axis=axis), axis, -1) * waves
+            frequencies = 2j * np.pi / self.length * np.arange(count // 2 + 1)
+            spectrum = np.moveaxis(np.fft.rfft(values, axis=axis), axis, -1) * frequencies
             return np.asarray(np.moveaxis(np.fft.irfft(spectrum, count), -1, axis))
         matrix = 2 / self.length * _differentiation(count)
         return np.asarray(np.moveaxis(np.moveaxis(values, axis, -1) @ matrix.T, -1, axis))
 
 
 @lru_cache(maxsize=64)
-def _gauss(count: int) -> tuple[Reals, Reals]:
+def _gauss_legendre(count: int) -> tuple[Reals, Reals]:
+    """Return nodes and weights (count,) on [-1, 1]."""
     nodes = np.asarray(roots_legendre(count)[0], dtype=np.float64)
-    # The weights that come with them lack four digits near the ends, which derivatives there would show.
+    # SciPy's weights lack four digits near the ends, where derivatives would show it.
     before, current = np.ones(count), nodes.copy()
     for degree in range(2, count + 1):
         before, current = current, ((2 * degree - 1) * nodes * current - (degree - 1) * before) / degree
@@ -94,12 +102,12 @@ def _gauss(count: int) -> tuple[Reals, Reals]:
 
 @lru_cache(maxsize=4)
 def _differentiation(count: int) -> Reals:
-    """The matrix (count, count) that takes values at the Gauss-Legendre nodes on [-1, 1] to derivatives there."""
-    nodes, weights = _gauss(count)
+    """Return the matrix (count, count) from values at the Gauss-Legendre nodes on [-1, 1] to derivatives there."""
+    nodes, weights = _gauss_legendre(count)
     barycentric = np.sqrt((1 - nodes**2) * weights) * (-1.0) ** np.arange(count)
-    gaps = nodes[:, None] - nodes
-    np.fill_diagonal(gaps, 1.0)
-    matrix = barycentric / barycentric[:, None] / gaps
+    differences = nodes[:, None] - nodes
+    np.fill_diagonal(differences, 1.0)
+    matrix = barycentric / barycentric[:, None] / differences
     np.fill_diagonal(matrix, 0.0)
     # Constants have the derivative zero, to the last digit.
     np.fill_diagonal(matrix, -matrix.sum(axis=1))

@@ -1,48 +1,46 @@
-"""Spheres as closed-form surfaces: no mesh stands between them and their transform."""
+"""Spheres as closed-form surfaces."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
-
-# The square of a larger one overflows.
-_LARGEST_RADIUS = 1e150
-
-
-def is_finite_number(value: object) -> bool:
-    """Whether a value is a finite real number, and no truth value."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point, checked_point, is_finite_number, moved_point
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """The sphere of a radius and centre, in the user's unit of length.
+    """A sphere, in the user's unit of length. Its Fourier transform has a closed form.
+
+    Args:
+        radius: Radius.
+        center: Centre.
 
     Raises:
-        InputError: a radius that is not positive and finite, or a centre that is not three finite
-            numbers.
+        InputError: The radius is not positive and finite, or the centre is not three finite numbers.
+
+    >>> import sobolev_batch as sb
+    >>> sphere = sb.Sphere(2.0, center=(1.0, 0.0, 0.0))
+    >>> f"{sphere.area:.4f}"
+    '50.2655'
     """
 
     radius: float = 1.0
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not (is_finite_number(self.radius) and self.radius > 0):
             raise InputError(f"a sphere's radius must be positive and finite, found {self.radius}")
-        if float(self.radius) > _LARGEST_RADIUS:
-            raise InputError(f"a sphere's radius must be at most {_LARGEST_RADIUS:g}, found {self.radius}")
-        if len(self.center) != 3 or not all(map(is_finite_number, self.center)):
-            raise InputError(f"a sphere's center must be three finite numbers, found {self.center}")
+        if float(self.radius) > LARGEST_LENGTH:
+            raise InputError(f"a sphere's radius must be at most {LARGEST_LENGTH:g}, found {self.radius}")
         object.__setattr__(self, "radius", float(self.radius))
-        object.__setattr__(self, "center", tuple(float(x) for x in self.center))
+        object.__setattr__(self, "center", checked_point(self.center, "a sphere's center"))
 
     @property
     def area(self) -> float:
@@ -61,11 +59,10 @@ class Sphere:
         return self.extent.box
 
     @property
-    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
-        """Centre and radius of the sphere itself."""
+    def bounding_sphere(self) -> tuple[Point, float]:
+        """Centre and radius of the sphere."""
         return self.center, self.radius
 
-    def moved(self, scale: float, origin: tuple[float, float, float]) -> Sphere:
+    def moved(self, scale: float, origin: Point) -> Sphere:
         """Return the sphere after x -> scale * (x - origin)."""
-        x, y, z = (scale * (c - o) for c, o in zip(self.center, origin, strict=True))
-        return Sphere(scale * self.radius, (x, y, z))
+        return Sphere(scale * self.radius, moved_point(self.center, scale, origin))

@@ -1,36 +1,39 @@
-"""The sources of surfaces that are made, not read: smooth ones, and triangulations that converge to them.
+"""Sources of closed-form surfaces, and of triangulations that converge to them.
 
-`sphere`, `ellipsoid` and `torus` are the smooth ones, `icosphere`, `ellipsoid-levels` and `torus-grid` their levels.
+`sphere`, `ellipsoid` and `torus` are closed forms; `icosphere`, `ellipsoid-levels` and `torus-grid` triangulate them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
 from sobolev_batch.surfaces.shapes.icosphere import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.shapes.torus import MOST_TRIANGLES, Torus
+from sobolev_batch.surfaces.sources.fingerprints import installed_version
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
+    ExpectedSize,
     Fingerprint,
     Member,
-    Size,
     Source,
+    SurfaceMember,
     at_most,
-    installed_version,
 )
 
 # Measured peak of the subdivision, for each triangle that it makes.
-_MAKING_BYTES = 140
+_SUBDIVISION_BYTES = 140
+
+ClosedForm = Sphere | Ellipsoid | Torus
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -41,165 +44,77 @@ Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
 Levels = Annotated[tuple[Level, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
 
 
-class IcosphereSource(Source):
-    """Icosahedral triangulations T_N of the unit sphere.
+class ClosedFormSource(Source, ABC):
+    """A source of one surface in closed form."""
 
-    Attributes:
-        levels: the levels N to make.
-    """
+    label: ClassVar[str]
 
-    levels: Levels
+    @property
+    @abstractmethod
+    def shape(self) -> ClosedForm:
+        """The surface."""
+
+    @model_validator(mode="after")
+    def _check_shape(self) -> Self:
+        try:
+            _ = self.shape
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return self
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """One member per level, coarse to fine."""
-        return tuple(IcosphereMember(str(level), level) for level in sorted(set(self.levels)))
+        """Return the one surface, with its parameters as its fingerprint."""
+        return (SurfaceMember(self.label, -1, self.shape, {self.label: _parameters(self.shape)}),)
 
 
-@dataclass(frozen=True)
-class IcosphereMember(Member):
-    """The icosphere whose level is the member's."""
-
-    def load(self) -> Surface:
-        """Make the mesh."""
-        return icosphere(self.level)
-
-    def fingerprint(self) -> Fingerprint:
-        """The level, and the version of the library that subdivides."""
-        return {"icosphere": self.level, "trimesh": installed_version("trimesh")}
-
-    def expected_size(self) -> Size:
-        """Its number of triangles is known."""
-        triangles = 20 * 4**self.level
-        return Size(triangles, _MAKING_BYTES * triangles)
-
-
-class SphereSource(Source):
+class SphereSource(ClosedFormSource):
     """A sphere in closed form.
 
     Attributes:
-        radius: in units of length.
-        center: likewise.
+        radius: Radius, in units of length.
+        center: Centre, in units of length.
     """
+
+    label = "sphere"
 
     radius: Length = 1.0
     center: Triple = (0.0, 0.0, 0.0)
 
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """The one sphere."""
-        return (SphereMember("sphere", -1, Sphere(self.radius, self.center)),)
+    @property
+    def shape(self) -> Sphere:
+        """The sphere."""
+        return Sphere(self.radius, self.center)
 
 
-@dataclass(frozen=True)
-class SphereMember(Member):
-    """A sphere."""
-
-    sphere: Sphere
-
-    def load(self) -> Surface:
-        """The sphere itself."""
-        return self.sphere
-
-    def fingerprint(self) -> Fingerprint:
-        """Its radius and centre."""
-        return {"sphere": [self.sphere.radius, *self.sphere.center]}
-
-
-@dataclass(frozen=True)
-class SmoothMember(Member):
-    """A parametrised surface, which must survive pickling.
-
-    Attributes:
-        surface: the surface.
-        identity: JSON-able values that determine it: the name of its parametrisation, its parameters, and the
-            version of what makes it.
-    """
-
-    surface: Smooth
-    identity: Fingerprint
-
-    def load(self) -> Surface:
-        """The surface itself."""
-        return self.surface
-
-    def fingerprint(self) -> Fingerprint:
-        """What was named as its identity."""
-        return self.identity
-
-
-class EllipsoidSource(Source):
+class EllipsoidSource(ClosedFormSource):
     """An ellipsoid as a smooth surface.
 
     Attributes:
-        axes: the semi-axes along x, y and z, in units of length.
-        center: likewise.
+        axes: Semi-axes along x, y and z, in units of length.
+        center: Centre, in units of length.
     """
+
+    label = "ellipsoid"
 
     axes: Lengths
     center: Triple = (0.0, 0.0, 0.0)
 
     @property
     def shape(self) -> Ellipsoid:
-        """The surface."""
+        """The ellipsoid."""
         return Ellipsoid(self.axes, self.center)
 
-    @property
-    def identity(self) -> dict[str, list[float]]:
-        """What determines it."""
-        return {"ellipsoid": [*self.shape.axes, *self.shape.center]}
 
-    @model_validator(mode="after")
-    def _check_shape(self) -> Self:
-        _require(Ellipsoid, self.axes, self.center)
-        return self
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """The one ellipsoid."""
-        return (SmoothMember("ellipsoid", -1, self.shape, self.identity),)
-
-
-class EllipsoidLevelsSource(EllipsoidSource):
-    """Icospheres with their vertices moved onto an ellipsoid.
-
-    Attributes:
-        levels: of the icospheres.
-    """
-
-    levels: Levels
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """One member per level, coarse to fine."""
-        return tuple(EllipsoidMember(str(level), level, self.shape) for level in sorted(set(self.levels)))
-
-
-@dataclass(frozen=True)
-class EllipsoidMember(Member):
-    """The icosphere whose level is the member's, stretched."""
-
-    ellipsoid: Ellipsoid
-
-    def load(self) -> Surface:
-        """Make the mesh."""
-        return self.ellipsoid.mesh(self.level)
-
-    def fingerprint(self) -> Fingerprint:
-        """The ellipsoid, the level, and the version of the library that subdivides."""
-        shape = [*self.ellipsoid.axes, *self.ellipsoid.center]
-        return {"ellipsoid level": self.level, "ellipsoid": shape, "trimesh": installed_version("trimesh")}
-
-    def expected_size(self) -> Size:
-        """Its number of triangles is known."""
-        triangles = 20 * 4**self.level
-        return Size(triangles, _MAKING_BYTES * triangles)
-
-
-class TorusSource(Source):
+class TorusSource(ClosedFormSource):
     """A torus as a smooth surface, its axis along z.
 
     Attributes:
-        R: from the centre to the middle of the tube, in units of length.
-        r: of the tube; less than R.
-        center: in units of length.
+        R: Distance from the centre to the middle of the tube, in units of length.
+        r: Radius of the tube, less than R.
+        center: Centre, in units of length.
     """
+
+    label = "torus"
 
     R: Length
     r: Length
@@ -207,31 +122,45 @@ class TorusSource(Source):
 
     @property
     def shape(self) -> Torus:
-        """The surface."""
+        """The torus."""
         return Torus(self.R, self.r, self.center)
 
-    @property
-    def identity(self) -> dict[str, list[float]]:
-        """What determines it."""
-        return {"torus": [self.shape.R, self.shape.r, *self.shape.center]}
 
-    @model_validator(mode="after")
-    def _check_shape(self) -> Self:
-        _require(Torus, self.R, self.r, self.center)
-        return self
+class IcosphereSource(Source):
+    """Icosahedral triangulations T_N of the unit sphere.
+
+    Attributes:
+        levels: Levels N.
+    """
+
+    levels: Levels
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """The one torus."""
-        return (SmoothMember("torus", -1, self.shape, self.identity),)
+        """Return one member per level, coarse to fine."""
+        return tuple(IcosphereMember(str(level), level) for level in sorted(set(self.levels)))
+
+
+class EllipsoidLevelsSource(EllipsoidSource):
+    """Icospheres with their vertices moved onto an ellipsoid.
+
+    Attributes:
+        levels: Levels of the icospheres.
+    """
+
+    levels: Levels
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member per level, coarse to fine."""
+        return tuple(EllipsoidMember(str(level), level, self.shape) for level in sorted(set(self.levels)))
 
 
 class TorusGridSource(TorusSource):
-    """Grids of points on a torus, each cell of them cut into two triangles.
+    """Grids of points on a torus, each cell cut into two triangles.
 
     Attributes:
-        levels: N, each with twice as many cells each way as the one before.
-        around: cells around the axis at level 0.
-        across: cells around the tube at level 0.
+        levels: Levels N, each with twice as many cells each way as the one before.
+        around: Number of cells around the axis at level 0.
+        across: Number of cells around the tube at level 0.
     """
 
     levels: Levels
@@ -249,7 +178,7 @@ class TorusGridSource(TorusSource):
         return self
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """One member per level, coarse to fine."""
+        """Return one member per level, coarse to fine."""
         return tuple(
             TorusMember(str(level), level, self.shape, self.around << level, self.across << level)
             for level in sorted(set(self.levels))
@@ -257,31 +186,79 @@ class TorusGridSource(TorusSource):
 
 
 @dataclass(frozen=True)
-class TorusMember(Member):
+class TriangulationMember(Member, ABC):
+    """A triangulation of a closed-form surface, whose number of triangles is known before it is made."""
+
+    @property
+    @abstractmethod
+    def triangles(self) -> int:
+        """Number of triangles."""
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the number of triangles and the memory that making them takes."""
+        return ExpectedSize(self.triangles, _SUBDIVISION_BYTES * self.triangles)
+
+
+@dataclass(frozen=True)
+class IcosphereMember(TriangulationMember):
+    """The icosphere of the member's level."""
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles."""
+        return 20 << (2 * self.level)
+
+    def load(self) -> Surface:
+        """Make the mesh."""
+        return icosphere(self.level)
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the level, and the version of the library that subdivides."""
+        return {"icosphere": self.level, "trimesh": installed_version("trimesh")}
+
+
+@dataclass(frozen=True)
+class EllipsoidMember(IcosphereMember):
+    """The icosphere of the member's level, stretched onto an ellipsoid."""
+
+    ellipsoid: Ellipsoid
+
+    def load(self) -> Surface:
+        """Make the mesh."""
+        return self.ellipsoid.mesh(self.level)
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the ellipsoid, the level, and the version of the library that subdivides."""
+        return {
+            "ellipsoid level": self.level,
+            "ellipsoid": _parameters(self.ellipsoid),
+            "trimesh": installed_version("trimesh"),
+        }
+
+
+@dataclass(frozen=True)
+class TorusMember(TriangulationMember):
     """A grid on a torus."""
 
     torus: Torus
     around: int
     across: int
 
+    @property
+    def triangles(self) -> int:
+        """Number of triangles."""
+        return 2 * self.around * self.across
+
     def load(self) -> Surface:
         """Make the mesh."""
         return self.torus.mesh(self.around, self.across)
 
     def fingerprint(self) -> Fingerprint:
-        """The torus and the cells each way."""
-        shape = [self.torus.R, self.torus.r, *self.torus.center]
-        return {"torus grid": [self.around, self.across], "torus": shape}
-
-    def expected_size(self) -> Size:
-        """Its number of triangles is known."""
-        triangles = 2 * self.around * self.across
-        return Size(triangles, _MAKING_BYTES * triangles)
+        """Return the torus and the numbers of cells."""
+        return {"torus grid": [self.around, self.across], "torus": _parameters(self.torus)}
 
 
-def _require(shape: Callable[..., Smooth], *parameters: object) -> None:
-    """Refuse parameters that make no surface."""
-    try:
-        shape(*parameters)
-    except InputError as error:
-        raise ValueError(str(error)) from error
+def _parameters(shape: ClosedForm) -> list[float]:
+    """Return the parameters of a surface, in the order of its fields."""
+    values: list[float] = np.hstack(astuple(shape)).tolist()
+    return values

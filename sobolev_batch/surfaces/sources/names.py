@@ -1,6 +1,6 @@
 """Names that people give to families and files, and that become labels of surfaces.
 
-Labels stand in tables, logs and stores side by side: each must be seen as what it is, and be told from all others.
+Labels stand side by side in tables, logs and stores, so each must be legible and distinct.
 """
 
 from __future__ import annotations
@@ -10,44 +10,46 @@ import reprlib
 import unicodedata
 from collections.abc import Iterable
 
+# A file's stem has up to 255 bytes; a path that stands in for it may be longer.
+_LONGEST_LABEL = 1000
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60
-# Printable to Python, and yet nothing is seen of them: joiners, fillers, selectors of variants, the empty Braille cell.
+# Printable to Python, yet invisible: joiners, fillers, variation selectors, the empty Braille cell.
 _INVISIBLE = frozenset(
     "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
     + "".join(map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))))
 )
 
 
-def shown(value: object, longest: int = 80) -> str:
-    """A value as it is quoted in a message: on one line, no longer than it takes to recognise it."""
+def quoted(value: object, longest: int = 80) -> str:
+    """Return a value as messages quote it: on one line of at most ``longest`` characters."""
     if isinstance(value, int) and value.bit_length() > 64:
-        # Of long ones Python refuses to tell the digits.
+        # Python refuses to print the digits of long integers.
         return f"an integer of {value.bit_length()} bits"
     short = reprlib.Repr()
     short.maxstring = short.maxother = longest - 20
     short.maxlist = short.maxtuple = short.maxdict = 4
     short.maxlevel = 3
     try:
-        found = short.repr(value)
+        text = short.repr(value)
     except ValueError:
         return f"a {type(value).__name__} that holds an integer of too many digits"
-    return found if len(found) <= longest else found[: longest - 3] + "..."
+    return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
-def flaw(text: str, longest: int, forbidden: str = "") -> str | None:
-    """What keeps a text from being a name, in words; None where nothing does.
+def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
+    """Describe why a text cannot be a name; None where it can.
 
-    A name has a character at least and ``longest`` at most, all of them visible or single blanks within it,
-    and none of the forbidden ones.
+    A name has 1 to ``longest`` characters. They are visible, or single blanks between visible ones, and
+    none of them is forbidden.
     """
     if not text:
         return "it is empty"
     if len(text) > longest:
         return f"it has {len(text)} characters, {longest} are allowed"
-    unseen = next((c for c in text if not c.isprintable() or c in _INVISIBLE), None)
-    if unseen is not None:
-        return f"it holds the character {_code(unseen)}, which is not seen as what it is"
+    invisible = next((c for c in text if not c.isprintable() or c in _INVISIBLE), None)
+    if invisible is not None:
+        return f"it holds the invisible character {_code(invisible)}"
     barred = next((c for c in text if c in forbidden), None)
     if barred is not None:
         return f"it holds {barred!r}"
@@ -56,23 +58,28 @@ def flaw(text: str, longest: int, forbidden: str = "") -> str | None:
     return None
 
 
-def folded(name: str) -> str:
-    """The same for names that differ in nothing but case and the spelling of accents (Unicode's D145)."""
+def label_problem(name: str) -> str | None:
+    """Describe why a name of a member cannot be a label; None where it can."""
+    return name_problem(name, _LONGEST_LABEL, "\\")
+
+
+def caseless_key(name: str) -> str:
+    """Return a key that is equal for names that differ only in case and the encoding of accents (Unicode's D145)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
 
 
 def file_stem(number: int, label: str) -> str:
-    """A name for a file of a label, which itself may hold anything: its number tells it from all others."""
+    """Return a name for a file of a label, which may hold any characters; the number makes it unique."""
     plain = unicodedata.normalize("NFKD", label).encode("ascii", "ignore").decode("ascii")
     readable = re.sub(r"[^A-Za-z0-9]+", "-", plain).strip("-")[:_LONGEST_STEM].rstrip("-")
     return f"{number:04d}-{readable}" if readable else f"{number:04d}"
 
 
-def twins(names: Iterable[str]) -> list[list[str]]:
-    """Groups of names that are the same when folded."""
+def duplicate_names(names: Iterable[str]) -> list[list[str]]:
+    """Return the groups of names with one `caseless_key`."""
     groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(folded(name), []).append(name)
+        groups.setdefault(caseless_key(name), []).append(name)
     return [group for group in groups.values() if len(group) > 1]
 
 

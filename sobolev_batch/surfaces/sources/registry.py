@@ -1,9 +1,9 @@
-"""Where meshes come from: sources, their members, and the registry that finds sources by name.
+"""Sources of surfaces, their members, and the registry that finds sources by name.
 
-A source is a validated description (the parameters of a family in a study file). It lists its
-members without computing anything; a member is a small value that travels to a worker and is made
-into a surface there. Other packages add sources through the entry point group
-``sobolev_batch.sources``: each names a subclass of `Source`.
+A source is a validated description: the parameters of a family in a study file. It lists its members
+without computing anything. A member is a small value that travels to a worker, which makes the surface.
+Other packages add sources through the entry point group ``sobolev_batch.sources``; each entry point
+names a subclass of `Source`.
 """
 
 from __future__ import annotations
@@ -14,18 +14,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
-from sobolev_batch.errors import MeshError, StudyError
-from sobolev_batch.surfaces.formats.contents import bounded_length, open_regular
+from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.names import shown
+from sobolev_batch.surfaces.sources.names import quoted
 
-# Of levels, or of triangle counts of one mesh.
+# Levels, or triangle counts of one mesh, that one source takes.
 MOST_ENTRIES = 1000
 
 _GROUP = "sobolev_batch.sources"
@@ -34,47 +33,93 @@ Fingerprint = Mapping[str, Any]
 
 
 class Source(BaseModel, ABC):
-    """Parameters of a family of surfaces. Subclasses add fields; unknown keys are refused."""
+    """The parameters of a family of surfaces. Subclass it to add a source of your own.
+
+    A subclass adds pydantic fields, one for each key of the family's table in a study file, and
+    `members`. Values are frozen, their types are strict and unknown keys are refused. The entry point
+    group ``sobolev_batch.sources`` makes the subclass known; `check_source` tests it. docs/surfaces.md
+    has a whole package.
+
+    >>> from pathlib import Path
+    >>> import sobolev_batch as sb
+    >>> class StretchedBalls(sb.Source):
+    ...     sizes: list[float]
+    ...
+    ...     def members(self, folder: Path) -> tuple[sb.Member, ...]:
+    ...         return tuple(
+    ...             sb.SurfaceMember(f"{size:g}", rank, sb.Ellipsoid((size, 1.0, 1.0)), {"stretched ball": size})
+    ...             for rank, size in enumerate(sorted(self.sizes))
+    ...         )
+    >>> [member.name for member in StretchedBalls(sizes=[2.0, 1.5]).members(Path())]
+    ['1.5', '2']
+    >>> sb.check_source(StretchedBalls(sizes=[2.0, 1.5]))
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions that making its surfaces takes, besides those that this package requires."""
+        """Distributions that the surfaces need, besides those that sobolev-batch requires."""
         return ()
 
     @abstractmethod
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """The surfaces of the family, from coarse to fine where that has a meaning.
+        """List the surfaces of the family, from coarse to fine where that has a meaning.
 
         Args:
-            folder: where relative paths start; that of the study file.
+            folder: Folder of the study file, where relative paths start.
+
+        Returns:
+            The same members each time, listed without making a surface.
 
         Raises:
-            StudyError: the parameters lead to no surface.
+            StudyError: The parameters lead to no surface.
         """
 
 
 @dataclass(frozen=True)
-class Size:
-    """How large a surface is going to be, told without making it.
+class ExpectedSize:
+    """The predicted size of a surface.
 
     Attributes:
-        triangles: about how many; 0 for a closed form.
-        making_bytes: about the memory that making it takes at its peak.
+        triangles: Approximate number of triangles; 0 for a closed form.
+        projected_bytes: Approximate peak of the memory that `Member.load` takes.
+
+    >>> import sobolev_batch as sb
+    >>> sb.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
+    20480
     """
 
     triangles: int = 0
-    making_bytes: float = 0.0
+    projected_bytes: float = 0.0
 
 
 @dataclass(frozen=True)
 class Member(ABC):
-    """One surface of a source.
+    """One surface of a source: a small, picklable value that a worker makes into the surface.
+
+    A subclass is a frozen dataclass. It adds the fields from which it makes the surface.
 
     Attributes:
-        name: unique within its source; labels the surface in the store.
-        level: the refinement level, or the rank from coarse to fine; -1 where there is no such order.
+        name: Label of the surface in the store, unique within its source.
+        level: Refinement level, or rank from coarse to fine; -1 where the source has no such order.
+
+    >>> from dataclasses import dataclass
+    >>> import sobolev_batch as sb
+    >>> @dataclass(frozen=True)
+    ... class TorusMember(sb.Member):
+    ...     cells: int
+    ...
+    ...     def load(self) -> sb.Mesh:
+    ...         return sb.Torus().mesh(2 * self.cells, self.cells)
+    ...
+    ...     def fingerprint(self) -> dict[str, int]:
+    ...         return {"torus of cells": self.cells}
+    ...
+    ...     def expected_size(self) -> sb.ExpectedSize:
+    ...         return sb.ExpectedSize(4 * self.cells**2, 600.0 * self.cells**2)
+    >>> TorusMember("coarse", 0, cells=6).load()
+    Mesh(72 vertices, 144 triangles)
     """
 
     name: str
@@ -82,41 +127,68 @@ class Member(ABC):
 
     @abstractmethod
     def load(self) -> Surface:
-        """Make the surface, in its own unit of length.
+        """Make the surface, in its own unit of length. The result is the same each time.
 
         Raises:
-            MeshError: it cannot be read or made.
+            MeshError: The surface cannot be read or made.
         """
 
     @abstractmethod
     def fingerprint(self) -> Fingerprint:
-        """JSON-able values that determine the surface: the contents of files, not their names.
+        """Return JSON-able values that determine the surface: contents of files rather than their names.
 
-        Two equal fingerprints promise equal surfaces, so a stored field can be taken over.
+        A run takes a stored field over where the fingerprint is the same. So equal fingerprints promise
+        equal surfaces; include the versions of libraries and a number that you raise with each change of a
+        formula.
 
         Raises:
-            MeshError: a file that it depends on cannot be read.
+            MeshError: A file that the surface depends on cannot be read.
         """
 
     def fingerprint_digest(self) -> str:
-        """SHA-256 of the fingerprint.
+        """Return the SHA-256 of the fingerprint.
 
         Raises:
-            MeshError: as for `fingerprint`.
+            MeshError: As for `fingerprint`.
         """
         return hashlib.sha256(json.dumps(self.fingerprint(), sort_keys=True).encode()).hexdigest()
 
-    def expected_size(self) -> Size:
-        """What the surface and its making are going to take; what cannot be told counts as nothing.
+    def expected_size(self) -> ExpectedSize:
+        """Predict the size of the surface and the memory that `load` takes, without making it.
 
-        Meshes of millions of triangles are cut into parts, and too large ones are refused, on the
-        strength of this.
+        Meshes of millions of triangles are computed in batches, and meshes that fit into no worker are
+        refused, by this prediction. The default predicts a small surface.
         """
-        return Size()
+        return ExpectedSize()
+
+
+@dataclass(frozen=True)
+class SurfaceMember(Member):
+    """A member that carries its surface, for surfaces given by a few numbers or by functions of a module.
+
+    Attributes:
+        surface: The surface, which must survive pickling.
+        identity: Fingerprint: the name of the formula, its parameters, and the version of what makes it.
+
+    >>> import sobolev_batch as sb
+    >>> sb.SurfaceMember("ball", -1, sb.Sphere(2.0), {"ball": 2.0}).load()
+    Sphere(radius=2.0, center=(0.0, 0.0, 0.0))
+    """
+
+    surface: Surface
+    identity: Fingerprint
+
+    def load(self) -> Surface:
+        """Return the surface."""
+        return self.surface
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the identity."""
+        return self.identity
 
 
 def at_most(count: int) -> BeforeValidator:
-    """A bound on the length of a list, looked at before its entries are."""
+    """Return a validator that bounds the length of a list before its entries are validated."""
 
     def check(value: object) -> object:
         if isinstance(value, list | tuple) and len(value) > count:
@@ -126,88 +198,34 @@ def at_most(count: int) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        MeshError: the file cannot be read.
-    """
-    try:
-        with open_regular(path) as file:
-            bounded_length(file)
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
-    except (OSError, ValueError) as error:
-        raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-
-
-def installed_version(distribution: str) -> str:
-    """The installed version of a library whose output is part of a surface.
-
-    Raises:
-        MeshError: it is not installed.
-    """
-    try:
-        return version(distribution)
-    except PackageNotFoundError as error:
-        raise MeshError(
-            f"this source needs the library {distribution}, which is not installed; "
-            "the extra has it: pip install 'sobolev-batch[studies]'"
-        ) from error
-
-
-class NestedSource(Source):
-    """A source that works on the one surface of another.
-
-    Attributes:
-        mesh: the table of the other source.
-    """
-
-    mesh: SerializeAsAny[Source]
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """Those of the other source."""
-        return self.mesh.libraries
-
-    @field_validator("mesh", mode="before")
-    @classmethod
-    def _parse_mesh(cls, table: object) -> object:
-        if not isinstance(table, dict):
-            raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
-        return parse_source(table)
-
-
 def parse_source(table: Mapping[str, Any]) -> Source:
-    """Look a source up by the table's ``source`` key and validate the other keys as its parameters.
+    """Return the source that the key ``source`` of a table names, with the other keys as its parameters.
 
     Args:
-        table: the parameters of a family or reference, as read from TOML.
+        table: Parameters of a family or reference, as read from TOML.
 
     Raises:
-        StudyError: no such source.
-        pydantic.ValidationError: parameters that it does not take.
+        StudyError: No source has this name, or it cannot be loaded.
+        pydantic.ValidationError: The source does not take these parameters.
     """
     name = table.get("source")
     registry = _registry()
     if not isinstance(name, str) or name not in registry:
-        raise StudyError(f"no source is named {shown(name)}; known are {', '.join(sorted(registry))}")
+        raise StudyError(f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}")
     try:
         source_type = registry[name].load()
     except (ImportError, AttributeError) as error:
         raise StudyError(f"the source {name!r} cannot be loaded: {error}") from error
     if not (isinstance(source_type, type) and issubclass(source_type, Source)):
         raise StudyError(f"the entry point of the source {name!r} is not a subclass of Source: {registry[name].value}")
-    parameters = {key: value for key, value in table.items() if key != "source"}
-    return source_type.model_validate(parameters)
+    return source_type.model_validate({key: value for key, value in table.items() if key != "source"})
 
 
-def sole_member(source: Source, folder: Path) -> Member:
-    """The member of a source that must have exactly one.
+def single_member(source: Source, folder: Path) -> Member:
+    """Return the member of a source that must have exactly one.
 
     Raises:
-        StudyError: it has none or several.
+        StudyError: The source has none or several.
     """
     members = source.members(folder)
     if len(members) != 1:

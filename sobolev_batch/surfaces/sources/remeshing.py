@@ -1,63 +1,26 @@
-"""The source `remesh`: a mesh replaced by one of even triangles with given triangle counts."""
+"""The source `remesh`: a mesh replaced by even triangles, in given numbers."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.decimation import TriangleCounts, reduced_size, whole_mesh
-from sobolev_batch.surfaces.sources.registry import (
-    Fingerprint,
-    Member,
-    NestedSource,
-    Size,
-    installed_version,
-    sole_member,
-)
+from sobolev_batch.surfaces.sources.fingerprints import installed_version
+from sobolev_batch.surfaces.sources.nested import ReducedMember, ReducedSource
+from sobolev_batch.surfaces.sources.registry import Fingerprint
 
-# Clustering needs several input vertices for each output vertex to make even cells; pyacvd's own
-# advice is to subdivide until there are.
+# Even cells need several input vertices for each output vertex; pyacvd advises to subdivide until there are.
 _VERTICES_PER_CLUSTER = 10
 
 
-class RemeshSource(NestedSource):
-    """Even remeshings of one mesh by clustering its vertices into cells of like area.
-
-    S. Valette, J.-M. Chassery, "Approximated centroidal Voronoi diagrams for uniform polygonal mesh
-    coarsening" (2004), doi:10.1111/j.1467-8659.2004.00769.x; by the library pyacvd, which the extra
-    ``studies`` installs.
-
-    Attributes:
-        mesh: the mesh to replace, as a table that names a source with one member.
-        triangles: the approximate triangle counts; a closed mesh comes out within a few of them.
-    """
-
-    triangles: TriangleCounts
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """What clusters, and what the other source needs."""
-        return "pyacvd", *super().libraries
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """One member per triangle count, coarse to fine."""
-        original = sole_member(self.mesh, folder)
-        counts = sorted(set(self.triangles))
-        return tuple(RemeshedMember(str(count), rank, original, count) for rank, count in enumerate(counts))
-
-
 @dataclass(frozen=True)
-class RemeshedMember(Member):
+class RemeshedMember(ReducedMember):
     """A mesh remeshed to about a number of triangles."""
-
-    original: Member
-    triangles: int
 
     def load(self) -> Surface:
         """Load the original, cluster it, and triangulate the clusters."""
@@ -69,7 +32,7 @@ class RemeshedMember(Member):
                 f"remeshing needs a library that is missing ({error}); install the extra: "
                 "pip install 'sobolev-batch[studies]'"
             ) from error
-        mesh = whole_mesh(self.original, self.triangles)
+        mesh = self.load_original()
         # A closed surface of genus g has V = F/2 + 2 - 2g: two vertices more than half the triangles.
         clusters = self.triangles // 2 + 2
         with warnings.catch_warnings():
@@ -79,17 +42,29 @@ class RemeshedMember(Member):
             while len(clustering.mesh.points) < _VERTICES_PER_CLUSTER * clusters:
                 clustering.subdivide(2)
             clustering.cluster(clusters)
-            made = clustering.create_mesh()
-        return Mesh(np.asarray(made.points), np.asarray(made.regular_faces))
+            remeshed = clustering.create_mesh()
+        return Mesh(np.asarray(remeshed.points), np.asarray(remeshed.regular_faces))
 
     def fingerprint(self) -> Fingerprint:
-        """The original's fingerprint, the count, and the version of the library."""
+        """Return the original's fingerprint, the count, and the version of the library."""
         return {
             "remesh": dict(self.original.fingerprint()),
             "triangles": self.triangles,
             "pyacvd": installed_version("pyacvd"),
         }
 
-    def expected_size(self) -> Size:
-        """Clustering takes memory for the original."""
-        return reduced_size(self.original, self.triangles)
+
+class RemeshSource(ReducedSource):
+    """Even remeshings of one mesh, by clustering its vertices into cells of similar area.
+
+    A closed mesh comes out within a few triangles of the counts. S. Valette, J.-M. Chassery, "Approximated
+    centroidal Voronoi diagrams for uniform polygonal mesh coarsening" (2004),
+    doi:10.1111/j.1467-8659.2004.00769.x; by the library pyacvd, which the extra ``studies`` installs.
+    """
+
+    member_type = RemeshedMember
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """The clustering library, and the distributions that the other source needs."""
+        return "pyacvd", *super().libraries

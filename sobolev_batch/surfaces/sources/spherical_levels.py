@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.decimation import reduced_size
 from sobolev_batch.surfaces.sources.generated import Levels
-from sobolev_batch.surfaces.sources.registry import Fingerprint, Member, NestedSource, Size, Source, sole_member
+from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh, reduced_size
+from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, single_member
 
 
 class SphericalLevelsSource(NestedSource):
@@ -22,12 +22,12 @@ class SphericalLevelsSource(NestedSource):
 
     The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:
     the first 10*4^N + 2 form level N. Its map to the sphere has the same vertices in the same order,
-    and the convex hull of the first ones there gives the triangles of the level.
+    and the convex hull of the first ones gives the triangles of the level.
 
     Attributes:
-        mesh: the surface, as a table that names a source with one member.
-        sphere: its map to the sphere, likewise.
-        levels: the levels N to take.
+        mesh: Table of a source with one member, the surface.
+        sphere: Table of a source with one member, its map to the sphere.
+        levels: Levels N.
     """
 
     sphere: SerializeAsAny[Source]
@@ -39,8 +39,8 @@ class SphericalLevelsSource(NestedSource):
         return cls._parse_mesh(table)
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """One member per level, coarse to fine."""
-        surface, sphere = sole_member(self.mesh, folder), sole_member(self.sphere, folder)
+        """Return one member per level, coarse to fine."""
+        surface, sphere = single_member(self.mesh, folder), single_member(self.sphere, folder)
         return tuple(LevelMember(str(level), level, surface, sphere) for level in sorted(set(self.levels)))
 
 
@@ -52,10 +52,8 @@ class LevelMember(Member):
     sphere: Member
 
     def load(self) -> Surface:
-        """Take the level's vertices from the surface and its triangles from the sphere's hull."""
-        surface, sphere = self.surface.load(), self.sphere.load()
-        if not (isinstance(surface, Mesh) and isinstance(sphere, Mesh)):
-            raise MeshError("levels can be taken from two meshes only, not from smooth surfaces")
+        """Take the vertices of the level from the surface, and its triangles from the hull of the sphere."""
+        surface, sphere = load_mesh(self.surface), load_mesh(self.sphere)
         count = 10 * 4**self.level + 2
         if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
             raise MeshError(
@@ -71,13 +69,13 @@ class LevelMember(Member):
         return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
 
     def fingerprint(self) -> Fingerprint:
-        """The fingerprints of both files, and the level."""
+        """Return the fingerprints of both surfaces, and the level."""
         return {
             "spherical level": self.level,
             "surface": dict(self.surface.fingerprint()),
             "sphere": dict(self.sphere.fingerprint()),
         }
 
-    def expected_size(self) -> Size:
-        """Both surfaces are there at once, and the hull takes memory like a reduction of them."""
+    def expected_size(self) -> ExpectedSize:
+        """Return the size of the level; the hull takes memory like a reduction of the surface."""
         return reduced_size(self.surface, 20 * 4**self.level)

@@ -27,8 +27,7 @@ from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.adaptive.solve import Aim
-from sobolev_batch.surfaces.sources.generated import SmoothMember
-from sobolev_batch.surfaces.sources.registry import Member
+from sobolev_batch.surfaces.sources.registry import Member, SurfaceMember
 from tests.support.smooth_shapes import roof, roof_derivatives, turned_torus
 from tests.support.studies import variable
 
@@ -150,7 +149,7 @@ class Fixed:
     identity: Mapping[str, Any]
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        return (SmoothMember("own", -1, self.surface, self.identity),)
+        return (SurfaceMember("own", -1, self.surface, self.identity),)
 
 
 def own(surface: ParametrisedSurface, **changes: Any) -> Study:

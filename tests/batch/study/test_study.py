@@ -115,7 +115,7 @@ BROKEN = [
         "study.name: a name is 1 to 100 visible characters, blanks only between them, without / and \\; it is",
     ),
     ("study.name", "a/b", "without / and \\; it holds '/', found 'a/b'"),
-    ("study.name", "a\nb", "it holds the character U+000A, which is not seen as what it is"),
+    ("study.name", "a\nb", "it holds the invisible character U+000A"),
     ("study.name", " a", "it begins or ends with a blank"),
     ("study.name", "x" * 10_000, "it has 10000 characters, 100 are allowed"),
     ("study.name", 3, "study.name: input should be a valid string, found 3"),

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from sobolev_batch import Study, StudyError
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.sources.names import flaw, folded, shown
+from sobolev_batch.surfaces.sources.names import caseless_key, name_problem, quoted
 from tests.support.mesh_files import off
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 from tests.support.studies import changed, small_table
@@ -338,7 +338,7 @@ def test_files_in_different_folders_or_formats_are_told_apart(tmp_path: Path) ->
         ["two", "a.off"],
     ]
     assert {"f/b.off", "f/b.obj"} < set(labels)
-    assert len({folded(label) for label in labels}) == len(labels) == 4
+    assert len({caseless_key(label) for label in labels}) == len(labels) == 4
 
 
 @pytest.mark.parametrize(("one", "other"), [("A", "a"), ("caf\u00e9", "cafe\u0301"), ("STRASSE", "straße")])
@@ -347,7 +347,7 @@ def test_twins_in_one_folder_are_refused(tmp_path: Path, one: str, other: str) -
     if len(list(tmp_path.iterdir())) < 2:
         pytest.skip("this file system does not tell them apart")
     message = refused_files(tmp_path, "*.off")
-    assert "differ in nothing but case or the spelling of accents; rename one" in message
+    assert "differ only in case or in the encoding of accents; rename one" in message
     assert one in message
     assert other in message
 
@@ -525,13 +525,13 @@ def test_any_file_ends_in_a_study_or_a_study_error(tmp_path_factory: pytest.Temp
 @_fuzz
 @given(text=st.text(max_size=120))
 def test_names_without_a_flaw_are_seen_as_they_are(text: str) -> None:
-    reason = flaw(text, 100, "/")
+    reason = name_problem(text, 100, "/")
     if reason is None:
         assert text.isprintable()
         assert text == text.strip()
         assert 1 <= len(text) <= 100
         assert "/" not in text
-        assert folded(unicodedata.normalize("NFC", text)) == folded(
+        assert caseless_key(unicodedata.normalize("NFC", text)) == caseless_key(
             unicodedata.normalize("NFD", text.upper().lower())
         ) or (text.upper().lower() != text.lower())
     else:
@@ -541,4 +541,4 @@ def test_names_without_a_flaw_are_seen_as_they_are(text: str) -> None:
 @_fuzz
 @given(value=_values)
 def test_values_are_shown_on_one_line(value: Any) -> None:
-    assert len(orderly(shown(value))) <= 80
+    assert len(orderly(quoted(value))) <= 80

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import Mesh, icosphere, read_mesh
-from sobolev_batch.surfaces.shapes.mesh import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
 from tests.support.mesh_files import BIG, BOXES, LITTLE, Gltf, Read, gifti, obj, off, ply, stl_binary, stl_text
 from tests.support.shapes import (
     AWKWARD_VERTICES,

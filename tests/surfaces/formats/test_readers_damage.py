@@ -400,9 +400,9 @@ def test_zipped_content_under_a_plain_name_is_refused(tmp_path: Path) -> None:
 def test_files_beyond_the_bound_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
     path = tmp_path / f"scan{ending}"
     path.write_bytes(gzip.compress(PLY_BOX) if ending.endswith(".gz") else PLY_BOX)
-    monkeypatch.setattr("sobolev_batch.surfaces.formats.contents._LARGEST_BYTES", len(PLY_BOX))
+    monkeypatch.setattr("sobolev_batch.surfaces.formats.raw_files._LARGEST_BYTES", len(PLY_BOX))
     assert read_mesh(path).area == 28.0
-    monkeypatch.setattr("sobolev_batch.surfaces.formats.contents._LARGEST_BYTES", len(PLY_BOX) - 1)
+    monkeypatch.setattr("sobolev_batch.surfaces.formats.raw_files._LARGEST_BYTES", len(PLY_BOX) - 1)
     with pytest.raises(MeshError, match=re.escape(f"{path}: larger than {len(PLY_BOX) - 1} bytes")):
         read_mesh(path)
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import InputError, Mesh, MeshError
-from sobolev_batch.surfaces.shapes.mesh import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
 from tests.support.shapes import (
     BOX_AREA,
     TETRAHEDRON_AREA,
@@ -257,7 +257,7 @@ def test_corners_are_the_triangles_vertices() -> None:
 
 @pytest.mark.parametrize("length", [1, 5, 12, 13])
 def test_measures_taken_slice_by_slice_are_the_same(monkeypatch: pytest.MonkeyPatch, length: int) -> None:
-    monkeypatch.setattr("sobolev_batch.surfaces.shapes.mesh._SLICE", length)
+    monkeypatch.setattr("sobolev_batch.surfaces.shapes.mesh._BATCH", length)
     sliced = box()
     monkeypatch.undo()
     for name in ("areas", "edge_lengths", "centroid_radii"):

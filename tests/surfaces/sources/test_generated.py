@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import Ellipsoid, Torus
-from sobolev_batch.surfaces.sources.registry import Size
+from sobolev_batch.surfaces.sources.registry import ExpectedSize
 from tests.support.members import listed, loaded, members
 
 EGG: dict[str, Any] = {"source": "ellipsoid", "axes": [3, 2, 1], "center": [0.0, 0.5, 0.0]}
@@ -28,7 +28,7 @@ def test_smooth_surfaces_are_one_member_each() -> None:
     assert ring.load() == Torus(2.0, 0.5, (0.0, 0.5, 0.0))
     assert egg.fingerprint() == {"ellipsoid": [3.0, 2.0, 1.0, 0.0, 0.5, 0.0]}
     assert ring.fingerprint() == {"torus": [2.0, 0.5, 0.0, 0.5, 0.0]}
-    assert egg.expected_size() == ring.expected_size() == Size()
+    assert egg.expected_size() == ring.expected_size() == ExpectedSize()
 
 
 def test_levels_of_an_ellipsoid() -> None:

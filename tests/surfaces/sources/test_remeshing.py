@@ -54,7 +54,7 @@ def test_planning_a_remeshing_without_its_library_says_what_to_install(monkeypat
             raise PackageNotFoundError(distribution)
         return "1.0"
 
-    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.version", version)
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.fingerprints.version", version)
     (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
     with pytest.raises(MeshError, match=re.escape("pip install 'sobolev-batch[studies]'")):
         member.fingerprint()

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch.surfaces.shapes.proximity import MOST_POINTS, proximity
+from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity
 
 pytest.importorskip("vtkmodules", reason="VTK comes with the extra 'vtk'")
 

@@ -1,4 +1,4 @@
-"""The contents of files: read whole, unpacked where they are gzipped, and never more than is sensible."""
+"""Bytes of files: regular ones only, unpacked where they are gzipped, and never more than is sensible."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import IO, cast
 
 from sobolev_batch.errors import MeshError
 
-# No file is read beyond this; 8 GiB hold some 160 million binary STL triangles.
+# No larger file is read; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
-# Mesh files shrink to a tenth at best: what is packed may become so many times larger, or as large as does no harm.
+# Mesh files shrink to a tenth at best: packed ones may grow by such a factor, or to a harmless size.
 _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
-_STEP_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 20
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a file for reading that is one: a pipe could be waited for without end, and a device read without end.
+    """Open a regular file for reading. Pipes could keep a reader waiting for ever, devices could never end.
 
     Raises:
-        OSError: it cannot be opened, or is no regular file.
-        ValueError: no file can have this name.
+        OSError: The file cannot be opened, or is no regular file.
+        ValueError: No file can have this name.
     """
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
@@ -35,11 +35,11 @@ def open_regular(path: Path) -> BufferedReader:
     return path.open("rb")
 
 
-def bounded_length(file: IO[bytes]) -> int:
-    """The length of an open file.
+def checked_length(file: IO[bytes]) -> int:
+    """Return the length of an open file.
 
     Raises:
-        MeshError: it is too large to be read; the message does not name it.
+        MeshError: The file is too large to be read; the message does not name it.
     """
     length = os.fstat(file.fileno()).st_size
     if length > _LARGEST_BYTES:
@@ -48,19 +48,19 @@ def bounded_length(file: IO[bytes]) -> int:
 
 
 def is_gzipped(path: Path) -> bool:
-    """Whether a file's name says that it is compressed."""
+    """Return whether the name of a file says that it is compressed."""
     return path.name.lower().endswith(".gz")
 
 
-def read_contents(path: Path, *, gzipped: bool) -> bytes:
-    """The bytes of a regular file.
+def read_regular(path: Path, *, gzipped: bool) -> bytes:
+    """Return the bytes of a regular file.
 
     Raises:
-        MeshError: it cannot be read, is empty, or is too large; the message does not name it.
+        MeshError: The file cannot be read, is empty, or is too large; the message does not name it.
     """
     try:
         with open_regular(path) as file:
-            length = bounded_length(file)
+            length = checked_length(file)
             if gzipped:
                 most = unpacked_limit(length)
                 with gzip.GzipFile(fileobj=file) as unpacked:
@@ -77,28 +77,28 @@ def read_contents(path: Path, *, gzipped: bool) -> bytes:
     return data
 
 
-def read_bytes(path: Path) -> bytes:
-    """The bytes of a file, unpacked if its name ends in .gz.
+def read_unpacked(path: Path) -> bytes:
+    """Return the bytes of a file, unpacked if its name ends in .gz.
 
     Raises:
-        MeshError: it cannot be read, is empty, or is too large; the message starts with its path.
+        MeshError: The file cannot be read, is empty, or is too large; the message starts with its path.
     """
     try:
-        return read_contents(path, gzipped=is_gzipped(path))
+        return read_regular(path, gzipped=is_gzipped(path))
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 
 
 def unpacked_limit(packed_bytes: int) -> int:
-    """The most bytes that so many may stand for: a hundred times as many, or 16 MiB where that is more, up to 8 GiB."""
+    """Return the most bytes that packed ones may unpack to: a hundredfold, at least 16 MiB and at most 8 GiB."""
     return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
 
 
 def _read_bounded(file: IO[bytes], most: int) -> bytes:
-    """All of a file, or a little more than the bound; one large read would reserve the bound at once."""
-    parts = []
+    """Return all of a file, or a little more than the bound; one large read would reserve the bound at once."""
+    chunks = []
     total = 0
-    while total <= most and (part := file.read(_STEP_BYTES)):
-        parts.append(part)
-        total += len(part)
-    return b"".join(parts)
+    while total <= most and (chunk := file.read(_CHUNK_BYTES)):
+        chunks.append(chunk)
+        total += len(chunk)
+    return b"".join(chunks)
