@@ -7,13 +7,14 @@ import pytest
 
 from sobolev_batch import InputError, Mesh, icosphere
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from tests.support.shapes import CENTRED_BOX as BOX
 
 
 @pytest.mark.parametrize("method", ["auto", "gauss8", 1, 7, 50])
 @pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
 def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
-    batches = list(Quadrature(method).batches(BOX, 8.0, 1e-10, capacity))
+    batches = list(QuadraturePlan.of(BOX, 8.0, 1e-10, Quadrature(method)).batches(capacity))
     assert max(len(batch.weights) for batch in batches) <= capacity
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
@@ -26,13 +27,14 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
 
 
 def test_batches_are_nearly_equal() -> None:
-    sizes = [len(batch.weights) for batch in Quadrature("auto").batches(icosphere(5), 8.66, 1e-9, 200_000)]
+    plan = QuadraturePlan.of(icosphere(5), 8.66, 1e-9)
+    sizes = [len(batch.weights) for batch in plan.batches(200_000)]
     assert len(sizes) == 3
     assert max(sizes) < 1.4 * min(sizes)
 
 
 def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
-    batches = Quadrature(method).batches(mesh, 8.66, tolerance, 1 << 22)
+    batches = QuadraturePlan.of(mesh, 8.66, tolerance, Quadrature(method)).batches(1 << 22)
     return sum(len(batch.weights) for batch in batches) / len(mesh.triangles)
 
 
