@@ -14,9 +14,9 @@ from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
-from sobolev_batch.spectral.errors.probe import measure
+from sobolev_batch.spectral.errors.probe import Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import Sample, needs_probe, probe_block
+from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, check_orders
@@ -91,14 +91,12 @@ def fourier_transform(
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
 
-    >>> from sobolev_batch import Lattice, fourier_transform, icosphere
-    >>> mesh = icosphere(2)
-    >>> field = fourier_transform(mesh, Lattice(xi_max=2.0, M=16))
-    >>> field.sizes["xi_x"], field.sizes["xi_z"], field.dtype
-    (17, 9, dtype('complex128'))
-    >>> area = field.sel(xi_x=0, xi_y=0, xi_z=0).item().real
-    >>> abs(area - mesh.area) < 1e-8 * mesh.area
-    True
+    >>> from sobolev_batch import Lattice, Sphere, fourier_transform
+    >>> field = fourier_transform(Sphere(radius=1.0), Lattice(xi_max=2.0, M=16))
+    >>> field.shape, str(field.dtype)
+    ((17, 17, 9), 'complex128')
+    >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
+    12.5664
     """
     settings = TransformSettings(eps, dtype, Quadrature(quadrature))
     execution = Execution(backend_named(backend), threads or os.cpu_count() or 1)
@@ -147,10 +145,13 @@ def compute_field(
     plan = settings.plan(surface, lattice)
     transformed = transform_block(surface, lattice, block, settings, execution, plan)
     values = transformed.values
-    if sample is not None and needs_probe(surface, settings) and plan.lowest_degree <= USUAL_DEGREE:
+    if not needs_probe(surface, settings):
+        probe = Probe()
+    elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
         probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
     else:
-        probe = probe_block(surface, lattice, settings, orders, block, values)
+        draws = draws_for([surface], lattice, orders, plan.lowest_degree)
+        probe = probe_block(surface, lattice, settings, orders, block, values, draws)
     return Field(values, Quality.of_surface(surface, probe), settings, transformed.points, transformed.backend)
 
 
