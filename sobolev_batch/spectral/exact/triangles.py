@@ -236,4 +236,4 @@ def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
 
 def _exponential(phases: Reals) -> Complexes:
     cosines, sines = cosine_and_sine(phases)
-    return cosines + 1j * sines
+    return np.asarray(cosines + 1j * sines)

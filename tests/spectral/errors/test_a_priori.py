@@ -93,5 +93,5 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
 def test_settings_keep_precision_and_quadrature() -> None:
     given = TransformSettings(dtype="complex64")
     settled = settle(BOX, LATTICE, Goal((-2.0,), (1e-9,)), given)
-    assert replace(settled, eps=given.eps, tolerance=None) == given
+    assert replace(settled, eps=given.eps, tolerance=given.tolerance) == given
     assert settled.eps == 2e-7

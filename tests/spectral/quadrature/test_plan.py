@@ -97,6 +97,7 @@ def test_a_plan_holds_two_bytes_for_each_triangle(monkeypatch: pytest.MonkeyPatc
     assignment = RuleAssignment.of(mesh, 8.66, 1e-9, Quadrature())
     assert assignment.uses == whole.uses
     assert assignment.codes is not None
+    assert whole.codes is not None
     assert np.array_equal(assignment.codes, whole.codes)
     assert len(assignment.uses) > 2
     assert assignment.codes.nbytes == 2 * len(mesh.triangles)
