@@ -10,7 +10,8 @@ from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import XI_MAX, settings_of_the_paper
 from sobolev_batch.spectral.backends.backends import gpu_backend
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 
 # Level of the icosphere, intervals per axis, seconds to stay below.
 _CASES = ((7, 128, 0.060), (5, 416, 0.150))
@@ -32,7 +33,7 @@ def on_a_gpu(effort: Effort) -> Iterator[Row]:
             settings = settings_of_the_paper(mesh, lattice, dtype)
 
             def ours(given: sb.Mesh, lattice: sb.Lattice = lattice, settings: TransformSettings = settings) -> None:
-                made = transform_block(given, lattice, lattice.half, settings, backend=backend)
+                made = transform_block(given, lattice, lattice.half, settings, Execution(backend))
                 if made.backend != backend.library:
                     raise RuntimeError(f"not a time of the GPU: {made.backend}")
 

@@ -23,7 +23,8 @@ from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.spectral.shells import shell_weights
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 
 _WORKERS = 2
 _OVERHEAD = at_most(1.15)
@@ -167,7 +168,7 @@ def _measure_parts(paths: Sequence[Path], lattice: sb.Lattice, transform: Transf
 
     def transform_all() -> None:
         for mesh in meshes:
-            transform_block(mesh, lattice, lattice.half, transform, threads=1)
+            transform_block(mesh, lattice, lattice.half, transform)
 
     def describe_all() -> None:
         for mesh in meshes:

@@ -16,7 +16,8 @@ from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 
 ORDER = -10.0
 XI_MAX = 5.0
@@ -65,7 +66,7 @@ class Case:
         """The package's transform, on half the lattice."""
         settings = settle(mesh, self.lattice, self.goal, TransformSettings(dtype=self.dtype))
         same_eps = replace(settings, eps=_EPS[self.dtype])
-        return transform_block(mesh, self.lattice, self.lattice.half, same_eps, threads=self.threads).values
+        return transform_block(mesh, self.lattice, self.lattice.half, same_eps, Execution(threads=self.threads)).values
 
     def papers(self, mesh: sb.Mesh) -> Complexes:
         """The paper's transform, on all of it."""
@@ -110,7 +111,7 @@ def fresh(mesh: sb.Mesh) -> sb.Mesh:
 
 def our_transform(mesh: sb.Mesh, lattice: sb.Lattice, threads: int) -> Complexes:
     """The package's transform on half the lattice, with its default settings."""
-    return transform_block(mesh, lattice, lattice.half, TransformSettings(), threads=threads).values
+    return transform_block(mesh, lattice, lattice.half, TransformSettings(), Execution(threads=threads)).values
 
 
 def against_the_paper(effort: Effort) -> Iterator[Row]:

@@ -137,7 +137,7 @@ def _plan_lines(plan: Plan, place: Location, crew: Workers) -> Iterator[tuple[st
     else:
         yield (
             "transform",
-            f"eps {transform.accuracy:g}, {transform.dtype}, quadrature {transform.quadrature.method}",
+            f"eps {transform.eps:g}, {transform.dtype}, quadrature {transform.quadrature.method}",
         )
     yield "backend", study.backend
     if study.witness:

@@ -1,4 +1,4 @@
-"""The two precisions that fields are computed and stored in."""
+"""The two dtypes that fields are computed and stored in."""
 
 from __future__ import annotations
 
@@ -9,8 +9,3 @@ from numpy.typing import NDArray
 
 ComplexDtype = Literal["complex128", "complex64"]
 Complexes = NDArray[np.complexfloating[Any, Any]]
-
-
-def item_bytes(dtype: ComplexDtype) -> int:
-    """Bytes of one sample of a field."""
-    return 16 if dtype == "complex128" else 8

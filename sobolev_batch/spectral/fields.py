@@ -1,4 +1,4 @@
-"""Fourier fields of surfaces on the half lattice, each with what is known of its error."""
+"""Fourier fields of surfaces on the half lattice, each with an estimate of its error."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.backends.backends import CPU, Backend, backend_named
+from sobolev_batch.parameters import renamed_parameters
+from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.errors.a_priori import Goal, settle
-from sobolev_batch.spectral.errors.probe import measure
+from sobolev_batch.spectral.errors.probe import Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import Sample, needs_probe, probe_block
+from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.shells import check_orders
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.shells import Orders, check_orders
+from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
-# Where nobody says which orders a field is for.
+# The orders that a field is probed for if none are named.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
-# Of the rules that most triangles get: samples drawn for it serve coarser and equal ones.
+# The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
 _ATTEMPTS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A field that was computed for a goal.
+    """A computed field.
 
     Attributes:
-        values: complex, the half lattice.
-        quality: what is known of its error.
-        settings: that it was computed with.
-        points: of the quadrature.
-        backend: see `Transformed`.
+        values: Complex array on the half lattice.
+        quality: Area, extent and probe, from which errors follow.
+        settings: Settings that it was computed with.
+        points: Number of quadrature points.
+        backend: Library that computed it: see `Transformed`.
     """
 
     values: Complexes
@@ -49,6 +51,7 @@ class Field:
     backend: str
 
 
+@renamed_parameters(orders="order")
 def fourier_transform(
     surface: Surface,
     lattice: Lattice,
@@ -58,47 +61,53 @@ def fourier_transform(
     quadrature: str | int = "auto",
     backend: Literal["cpu", "gpu", "auto"] = "cpu",
     threads: int | None = None,
-    orders: Sequence[float] = PROBED_ORDERS,
+    order: Orders = PROBED_ORDERS,
 ) -> xr.DataArray:
-    """The Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
+    """Return the Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
 
     Args:
-        surface: a `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length.
-        lattice: the frequencies.
-        eps: accuracy relative to the surface's area; the error reached is a small multiple of it.
-            Default 1e-9, or 1e-6 in single precision.
+        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length.
+        lattice: Frequencies ξ, in cycles per unit length.
+        eps: Accuracy relative to the surface's area; the error is a small multiple of it. Default 1e-9, or 1e-6 in
+            single precision.
         dtype: "complex128" or "complex64".
-        quadrature: of meshes: "auto", a degree from 1 to 50, or "gauss8".
-        backend: "cpu"; "gpu"; or "auto", which is the GPU if there is one that can be used. What a GPU
-            fails to do is done on the processor, with a warning in the log.
-        threads: of the NUFFT on the processor; default one per core.
-        orders: the orders for which the field's own error is probed; it can be had for any other
-            order too, with more uncertainty.
+        quadrature: Rules for the triangles of a mesh: "auto", a degree from 1 to 50, or "gauss8".
+        backend: "cpu", "gpu", or "auto" for a GPU if one is usable. If a GPU fails, the processor takes over, with a
+            warning in the log.
+        threads: Threads of the NUFFT on the processor; one per core by default.
+        order: Sobolev orders for which the error of the field is probed. Errors at other orders follow too, with
+            more uncertainty.
 
     Returns:
-        The half xi_z >= 0 of the field, complex (M+1, M+1, M/2+1), with the coordinates xi_x, xi_y,
-        xi_z in cycles per unit length. The other half is the conjugate of this one. The attribute
-        `quality` holds what the errors of norms and distances need to know of the field, and `backend`
-        names the library that computed it.
+        Complex array (M+1, M+1, M/2+1), in squared units of length, on the half xi_z >= 0 with the coordinates xi_x,
+        xi_y, xi_z; the other half is its complex conjugate. The attributes hold the lattice, the convention, the
+        settings, the `backend` (the library that computed it), and as `quality` what the errors of norms and
+        distances follow from.
 
     Raises:
-        LatticeError: a surface reaches beyond the lattice's half period 1/(2h).
-        InputError: settings out of range; a parametrised surface that is not smooth.
-        BackendError: "gpu", and there is none that can be used.
+        LatticeError: The surface extends beyond the lattice's half period 1/(2h).
+        InputError: Settings are out of range, or a parametrised surface is not smooth.
+        BackendError: "gpu", and no GPU is usable.
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
+
+    >>> from sobolev_batch import Lattice, Sphere, fourier_transform
+    >>> field = fourier_transform(Sphere(radius=1.0), Lattice(xi_max=2.0, M=16))
+    >>> field.shape, str(field.dtype)
+    ((17, 17, 9), 'complex128')
+    >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
+    12.5664
     """
     settings = TransformSettings(eps, dtype, Quadrature(quadrature))
-    field = compute_field(
-        surface,
-        lattice,
-        settings,
-        check_orders(orders),
-        backend=backend_named(backend),
-        threads=threads or os.cpu_count() or 1,
-    )
+    execution = Execution(backend_named(backend), threads or os.cpu_count() or 1)
+    field = compute_field(surface, lattice, settings, check_orders(order), execution)
     attributes = {
-        "eps": settings.accuracy,
+        "long_name": "Fourier transform of the area measure",
+        "units": "squared units of length",
+        "convention": "integral of exp(-2 pi i xi.x) over the surface",
+        "xi_max": lattice.xi_max,
+        "M": lattice.M,
+        "eps": settings.eps,
         "quadrature": settings.quadrature.method,
         "quality": field.quality.to_json(),
         "backend": field.backend,
@@ -113,78 +122,66 @@ def compute_field(
     lattice: Lattice,
     settings: TransformSettings,
     orders: Sequence[float],
+    execution: Execution = ON_CPU,
     *,
     sample: Sample | None = None,
-    backend: Backend = CPU,
-    threads: int = 1,
-    memory: float | None = None,
 ) -> Field:
-    """The field of a surface with given settings, and its probe.
+    """Return the field of a surface by given settings, with its probe.
 
     Args:
-        surface: whose field.
-        lattice: where.
-        settings: how.
-        orders: that it is probed for.
-        sample: of the surface, drawn for these orders and `USUAL_DEGREE`, where there is one.
-        backend: where to compute the transform; the probe's exact side stays on the processor.
-        threads: to compute with.
-        memory: see `transform_block`.
+        surface: Surface in units of length.
+        lattice: Lattice of the field.
+        settings: Accuracy and dtype.
+        orders: Sobolev orders that the field is probed for.
+        execution: Backend, threads and memory of the transform; the exact values of the probe are always computed on
+            the processor.
+        sample: Sample of the surface, drawn for these orders and `USUAL_DEGREE`, if there is one.
 
     Raises:
-        LatticeError: a mesh reaches beyond the lattice's half period.
-        InputError: the memory is too little.
+        LatticeError: The surface extends beyond the lattice's half period.
+        InputError: The allowed memory is too little.
     """
     block = lattice.half
-    made = transform_block(surface, lattice, block, settings, backend=backend, threads=threads, memory=memory)
-    probed = needs_probe(surface, settings)
-    if probed and sample is not None and settings.lowest_degree(surface, lattice) <= USUAL_DEGREE:
-        probe = measure(sample.draws, made.values[sample.draws.places(block)], sample.exact)
+    plan = settings.plan(surface, lattice)
+    transformed = transform_block(surface, lattice, block, settings, execution, plan)
+    values = transformed.values
+    if not needs_probe(surface, settings):
+        probe = Probe()
+    elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
+        probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
     else:
-        probe = probe_block(surface, lattice, settings, orders, block, made.values)
-    return Field(made.values, Quality.of_surface(surface, probe), settings, made.points, made.backend)
+        draws = draws_for([surface], lattice, orders, plan.lowest_degree)
+        probe = probe_block(surface, lattice, settings, orders, block, values, draws)
+    return Field(values, Quality.of_surface(surface, probe), settings, transformed.points, transformed.backend)
 
 
 def field_for(
     surface: Surface,
     lattice: Lattice,
     goal: Goal,
-    transform: TransformSettings,
+    settings: TransformSettings,
+    execution: Execution = ON_CPU,
     *,
     sample: Sample | None = None,
-    backend: Backend = CPU,
-    threads: int = 1,
-    memory: float | None = None,
 ) -> Field:
-    """The field of a surface with an error that keeps a goal, as far as its probe can tell.
+    """Return the field of a surface with an error within a goal, as far as its probe can tell.
 
     Args:
-        surface: whose field.
-        lattice: where.
-        goal: what its error may be.
-        transform: whose precision and quadrature are kept.
-        sample: see `compute_field`.
-        backend: likewise.
-        threads: to compute with.
-        memory: see `transform_block`.
+        surface: Surface in units of length.
+        lattice: Lattice of the field.
+        goal: Largest error of the field.
+        settings: Settings whose dtype and quadrature are kept.
+        execution: See `compute_field`.
+        sample: See `compute_field`.
 
     Returns:
         The first of a few attempts that keeps the goal, or the last.
     """
     if isinstance(surface, Sphere):
-        return compute_field(surface, lattice, transform, goal.orders, sample=sample)
+        return compute_field(surface, lattice, settings, goal.orders, sample=sample)
     for _ in range(_ATTEMPTS):
-        settings = settle(surface, lattice, goal, transform)
-        field = compute_field(
-            surface,
-            lattice,
-            settings,
-            goal.orders,
-            sample=sample,
-            backend=backend,
-            threads=threads,
-            memory=memory,
-        )
+        settled = settle(surface, lattice, goal, settings)
+        field = compute_field(surface, lattice, settled, goal.orders, execution, sample=sample)
         excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
         if excess <= 1:
             break

@@ -1,4 +1,4 @@
-"""The frequency lattice of a study, its half with xi_z >= 0, and rectangular blocks of it."""
+"""The lattice of frequencies, its half with xi_z >= 0, and rectangular blocks of it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import LatticeError
 
-# Beyond this the half lattice of doubles alone takes 34 GB and more; no FFT of it is sensible.
+# Beyond this a field takes more than 34 GB even in single precision.
 LARGEST_M = 2048
-# Beyond this and its inverse, cells and periods leave double precision.
+# Beyond this and its inverse, volumes of cells and periods leave double precision.
 _LOWEST_XI_MAX = 1e-50
 AXES = ("xi_x", "xi_y", "xi_z")
 
@@ -26,8 +26,8 @@ class Block:
     """A rectangular block of the half lattice, in units of the spacing.
 
     Attributes:
-        start: the lowest index k of each axis; may be negative in x and y.
-        shape: the number of samples of each axis.
+        start: Lowest index k along each axis; may be negative in x and y.
+        shape: Number of samples along each axis.
     """
 
     start: tuple[int, int, int]
@@ -39,35 +39,34 @@ class Block:
         return math.prod(self.shape)
 
     def indices(self, axis: int) -> NDArray[np.int64]:
-        """The indices k of an axis, int64 (shape[axis],)."""
+        """Return the indices k along an axis, int64 (shape[axis],)."""
         return np.arange(self.start[axis], self.start[axis] + self.shape[axis], dtype=np.int64)
 
     def split(self, largest_size: int) -> tuple[Block, ...]:
-        """The block in equal ones of at most ``largest_size`` samples.
+        """Return equal blocks of at most ``largest_size`` samples that make up this one.
 
-        They differ in shape only at the high ends, as the chunks of a regular grid do. The slow
-        axes are cut first, which keeps each block one contiguous run as long as possible.
+        They differ in shape only at the high ends, as the chunks of a regular grid do. The slow axes are split
+        first, so that a block is contiguous in memory as far as possible.
         """
         shape = list(self.shape)
         for axis in range(3):
-            most = max(1, largest_size // math.prod(shape[axis + 1 :]))
-            parts = math.ceil(shape[axis] / most)
-            shape[axis] = math.ceil(shape[axis] / parts)
+            longest = max(1, largest_size // math.prod(shape[axis + 1 :]))
+            shape[axis] = math.ceil(shape[axis] / math.ceil(shape[axis] / longest))
             if math.prod(shape) <= largest_size:
                 break
-        return tuple(self._parts((shape[0], shape[1], shape[2])))
+        return tuple(self._blocks((shape[0], shape[1], shape[2])))
 
-    def _parts(self, chunk: tuple[int, int, int]) -> Iterator[Block]:
-        starts = [range(0, total, step) for total, step in zip(self.shape, chunk, strict=True)]
+    def _blocks(self, shape: tuple[int, int, int]) -> Iterator[Block]:
+        starts = [range(0, total, step) for total, step in zip(self.shape, shape, strict=True)]
         for offsets in product(*starts):
             i, j, k = (
                 (first + offset, min(step, total - offset))
-                for first, offset, step, total in zip(self.start, offsets, chunk, self.shape, strict=True)
+                for first, offset, step, total in zip(self.start, offsets, shape, self.shape, strict=True)
             )
             yield Block((i[0], j[0], k[0]), (i[1], j[1], k[1]))
 
     def place_in(self, whole: Block) -> tuple[slice, slice, slice]:
-        """Where this block lies in an array of one that holds it."""
+        """Return the slices of this block in an array of a larger one."""
         x, y, z = (
             slice(start - first, start - first + count)
             for first, start, count in zip(whole.start, self.start, self.shape, strict=True)
@@ -79,15 +78,21 @@ class Block:
 class Lattice:
     """The frequencies xi = h k with h = 2 xi_max / M and k = -M/2..M/2 on each axis.
 
-    A surface measure is real, so its transform at -xi is the conjugate of that at xi, and only the
-    half with xi_z >= 0 is ever computed and stored: shape (M+1, M+1, M/2+1).
+    A surface measure is real, so its transform at -xi is the conjugate of that at xi. Only the Hermitian half with
+    xi_z >= 0 is computed and stored: shape (M+1, M+1, M/2+1).
 
-    Args:
-        xi_max: half the side of the frequency cube, in cycles per unit length.
-        M: number of intervals per axis, even.
+    Attributes:
+        xi_max: Half the side of the frequency cube, in cycles per unit length.
+        M: Number of intervals along each axis, even.
 
     Raises:
-        LatticeError: xi_max not positive and finite; M not an even integer from 2 to 2048.
+        LatticeError: xi_max is not positive and finite, or M is not an even integer from 2 to 2048.
+
+    >>> lattice = Lattice(xi_max=5.0, M=64)
+    >>> lattice.shape, lattice.spacing
+    ((65, 65, 33), 0.15625)
+    >>> lattice.half_period  # surfaces must lie within |coordinate| < 3.2 units of length
+    3.2
     """
 
     xi_max: float
@@ -106,56 +111,56 @@ class Lattice:
 
     @property
     def spacing(self) -> float:
-        """Distance h of neighbouring frequencies, in cycles per unit length."""
+        """Distance h between neighbouring frequencies, in cycles per unit length."""
         return 2 * self.xi_max / self.M
 
     @property
     def half_period(self) -> float:
-        """1/(2h): surfaces must lie in the open cube of coordinates below this, in units of length."""
+        """Bound 1/(2h) on the |coordinates| of surfaces, in units of length."""
         return 1 / (2 * self.spacing)
 
     @property
     def highest_frequency(self) -> float:
-        """The length |xi| of the cube's corners, in cycles per unit length."""
+        """Length |xi| of the cube's corners, in cycles per unit length."""
         return math.sqrt(3) * self.xi_max
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Samples along xi_x, xi_y, xi_z of the half lattice."""
+        """Number of samples along xi_x, xi_y, xi_z of the half lattice."""
         return self.M + 1, self.M + 1, self.M // 2 + 1
 
     @property
     def half(self) -> Block:
-        """The half lattice xi_z >= 0 as one block."""
+        """Half lattice xi_z >= 0 as one block."""
         return Block((-self.M // 2, -self.M // 2, 0), self.shape)
 
     @cached_property
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Frequencies along xi_x, xi_y, xi_z of the half lattice, in cycles per unit length."""
+        """Frequencies along xi_x, xi_y, xi_z of the half lattice, float64, in cycles per unit length."""
         return self.frequencies(self.half)
 
     def frequencies(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Frequencies along the three axes of a block, in cycles per unit length."""
+        """Return the frequencies along the three axes of a block, in cycles per unit length."""
         x, y, z = (self.spacing * block.indices(axis).astype(np.float64) for axis in range(3))
         return x, y, z
 
     def axis_weights(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Weights of the trapezoidal rule along the three axes of a block, h included.
+        """Return the weights of the trapezoidal rule along the three axes of a block, with the factor h.
 
-        Their products integrate over the whole cube from a block of its half: the end samples of
-        each axis count half; samples with xi_z > 0 count twice, for themselves and their conjugates.
+        Their products integrate over the whole cube: samples at the ends of an axis count half, and samples with
+        xi_z > 0 count twice, for themselves and their conjugates.
         """
         x, y, z = (np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3))
         return x, y, z * np.where(block.indices(2) > 0, 2.0, 1.0)
 
     def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
-        """The products of the `axis_weights` at each sample of a block, (block.shape)."""
+        """Return the product of the `axis_weights` at each sample of a block, float64 (block.shape)."""
         x, y, z = self.axis_weights(block)
         weights: NDArray[np.float64] = x[:, None, None] * y[:, None] * z
         return weights
 
     def shells(self, block: Block) -> NDArray[np.int32]:
-        """The squared length |k|^2 of each index triple of a block, int32 (block.shape)."""
+        """Return the squared length |k|^2 of each index triple of a block, int32 (block.shape)."""
         x, y, z = (block.indices(axis).astype(np.int32) ** 2 for axis in range(3))
         lengths: NDArray[np.int32] = x[:, None, None] + y[:, None] + z
         return lengths
@@ -166,28 +171,27 @@ class Lattice:
         return 3 * (self.M // 2) ** 2 + 1
 
     def split(self, largest_size: int) -> tuple[Block, ...]:
-        """The half lattice in equal blocks, see `Block.split`."""
+        """Return equal blocks that make up the half lattice: see `Block.split`."""
         return self.half.split(largest_size)
 
     def place(self, block: Block) -> tuple[slice, slice, slice]:
-        """Where a block lies in an array of the half lattice."""
+        """Return the slices of a block in an array of the half lattice."""
         return block.place_in(self.half)
 
     @classmethod
     def of(cls, field: xr.DataArray) -> Lattice:
-        """The lattice on whose half a field is sampled.
+        """Return the lattice of a field.
 
         Raises:
-            LatticeError: an array without the three axes, or whose axes are not those of the half
-                of a lattice.
+            LatticeError: The array lacks the three axes, or they are not those of the half of a lattice.
         """
         if not set(AXES) <= set(field.coords):
             raise LatticeError(f"a Fourier field needs the coordinates {', '.join(AXES)}, found {list(field.coords)}")
-        found = [np.asarray(field[name].values, dtype=np.float64) for name in AXES]
-        if found[0].ndim != 1 or len(found[0]) < 3:
-            raise LatticeError(f"xi_x must be an axis of at least three samples, found shape {found[0].shape}")
-        lattice = cls(float(found[0][-1]), len(found[0]) - 1)
-        for name, axis, expected in zip(AXES, found, lattice.axes, strict=True):
+        axes = [np.asarray(field[name].values, dtype=np.float64) for name in AXES]
+        if axes[0].ndim != 1 or len(axes[0]) < 3:
+            raise LatticeError(f"xi_x must be an axis of at least three samples, found shape {axes[0].shape}")
+        lattice = cls(float(axes[0][-1]), len(axes[0]) - 1)
+        for name, axis, expected in zip(AXES, axes, lattice.axes, strict=True):
             if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=1e-12, atol=1e-12 * lattice.xi_max):
                 raise LatticeError(
                     f"{name} does not run over the half (xi_z >= 0) of a lattice of xi_max {lattice.xi_max:g} and "

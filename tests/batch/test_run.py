@@ -61,7 +61,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     # The same errors from the stored field as from one that was just computed.
     field = variable(tree, "fourier", "fourier").sel(mesh="ico/3")
     fresh = distance(
-        fourier_transform(icosphere(3), SMALL_LATTICE, threads=1, orders=study.orders), sphere, study.orders
+        fourier_transform(icosphere(3), SMALL_LATTICE, threads=1, order=study.orders), sphere, study.orders
     )
     stored = distance(field, variable(tree, "fourier", "fourier").sel(mesh="reference"), study.orders)
     for name in ("truncation", "aliasing"):

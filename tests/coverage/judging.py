@@ -63,7 +63,7 @@ def evaluate(case: Case) -> tuple[float, float] | None:
     setting = case.setting
     if isinstance(setting, Given):
         a, b = (
-            fourier_transform(surface, setting.lattice, setting.eps, quadrature=setting.quadrature, orders=[case.order])
+            fourier_transform(surface, setting.lattice, setting.eps, quadrature=setting.quadrature, order=[case.order])
             for surface in case.pair
         )
         found = distance(a, b, case.order)

@@ -153,7 +153,7 @@ def on_fine_lattice(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Tr
     Not independent of the way that errors are found, but of how well that works where they are large.
     """
     lattice = _FINE_ROUGH if max(orders) > _SMOOTH else _FINE_SMOOTH
-    first, second = (fourier_transform(surface, lattice, 1e-13, orders=orders) for surface in (a, b))
+    first, second = (fourier_transform(surface, lattice, 1e-13, order=orders) for surface in (a, b))
     fine = distance(first, second, orders)
     pairs = zip(fine["distance"].values, fine["error"].values, strict=True)
     return tuple(Truth(float(value), float(error)) for value, error in pairs)

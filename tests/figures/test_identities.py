@@ -10,8 +10,10 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.nufft import transform_points
 
 WORKFLOW = Path(__file__).parents[2] / "workflows/cortex.toml"
@@ -31,14 +33,15 @@ def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:
     assert isinstance(coarse, sb.Mesh)
     similarity = sb.Similarity.to_unit_ball(whole)
     rule = Quadrature(2)
-    first, second = (list(rule.batches(similarity.apply(surface), 1.0, 1e-9, 1 << 20)) for surface in (coarse, whole))
+    plans = (QuadraturePlan.of(similarity.apply(surface), 1.0, 1e-9, rule) for surface in (coarse, whole))
+    first, second = (list(plan.batches(1 << 20)) for plan in plans)
     return first, second
 
 
 @pytest.fixture(scope="module")
 def fields(points: tuple[list[WeightedPoints], list[WeightedPoints]]) -> tuple[xr.DataArray, xr.DataArray]:
     def field(batches: list[WeightedPoints]) -> xr.DataArray:
-        values, _ = transform_points(batches, LATTICE, LATTICE.half, eps=1e-14)
+        values, _ = transform_points(batches, LATTICE, LATTICE.half, NufftSpec(LATTICE.shape, 1e-14))
         return xr.DataArray(np.asarray(values), dims=AXES, coords=dict(zip(AXES, LATTICE.axes, strict=True)))
 
     return field(points[0]), field(points[1])

@@ -20,7 +20,7 @@ from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation
 from sobolev_batch.spectral.shells import shell_weights
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity

@@ -24,7 +24,8 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import draws_for
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.transform import TransformSettings, require_inside, transform_block
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
@@ -110,8 +111,8 @@ def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
     started = time.perf_counter()
     try:
         piece = job.store.scratch.read(job.row, cut.token, number)
-        backend = backend_of(job.backend)
-        made = transform_block(piece, job.lattice, block, cut.settings, backend=backend, memory=job.memory)
+        execution = Execution(backend_of(job.backend), allowed_bytes=job.memory)
+        made = transform_block(piece, job.lattice, block, cut.settings, execution)
         exact = exact_transform(piece, cut.draws.within(block).frequencies)
     except StoreError:
         raise

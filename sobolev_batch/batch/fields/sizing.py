@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.errors import ClusterError
-from sobolev_batch.spectral.dtypes import item_bytes
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 # Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
@@ -95,7 +97,7 @@ def lay_out(
         ClusterError: no worker has the memory that it takes.
     """
     block = blocks[0]
-    block_bytes = float(block.size * item_bytes(transform.dtype))
+    block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
 
     def least(triangles: float) -> float:
         return LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles
@@ -120,7 +122,7 @@ def lay_out(
         )
     room = max(least(part), crew.share_bytes - fixed(part))
     # Not all of the room is taken, but a mesh may turn out larger than its file suggested.
-    wanted = memory_bytes(block, transform, triangles=part) - block_bytes
+    wanted = projected_bytes(block, transform, triangles=part) - block_bytes
     task = fixed(part) + min(room, max(wanted, least(part)))
     parts = 1 if whole else max(1, math.ceil(size.triangles / part))
     # A task computes as many blocks as leaves two for every thread: each makes the mesh anew.

@@ -23,10 +23,11 @@ from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.a_priori import settle
 from sobolev_batch.spectral.errors.probe import join
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import probe_block
+from sobolev_batch.spectral.errors.samples import draws_for, probe_block
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -140,21 +141,23 @@ def settings_of(job: Job, surface: Surface) -> TransformSettings:
 
 def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
     """Compute and store some blocks; what there is to tell of the surface itself is left out."""
-    backend = backend_of(job.backend)
+    execution = Execution(backend_of(job.backend), allowed_bytes=job.memory)
     if tuple(blocks) == (job.lattice.half,):
         if job.aim is not None and not isinstance(surface, Sphere):
             goal = job.aim.goal(surface)
-            field = field_for(surface, job.lattice, goal, job.transform, backend=backend, memory=job.memory)
+            field = field_for(surface, job.lattice, goal, job.transform, execution)
         else:
-            field = compute_field(surface, job.lattice, job.transform, job.orders, backend=backend, memory=job.memory)
+            field = compute_field(surface, job.lattice, job.transform, job.orders, execution)
         checksum = job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
         return Part(Facts(points=field.points), 0.0, "", field.quality, (checksum,), (field.backend,))
     settings = settings_of(job, surface)
+    plan = settings.plan(surface, job.lattice)
+    draws = draws_for([surface], job.lattice, job.orders, plan.lowest_degree)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
-        made = transform_block(surface, job.lattice, block, settings, backend=backend, memory=job.memory)
+        made = transform_block(surface, job.lattice, block, settings, execution, plan)
         checksums.append(job.store.write_field(job.row, job.lattice.place(block), made.values))
-        probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values))
+        probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values, draws))
         backends.append(made.backend)
         points = made.points
     quality = Quality.of_surface(surface, join(probes))

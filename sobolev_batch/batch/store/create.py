@@ -230,7 +230,7 @@ def _attributes(plan: Plan) -> dict[str, Any]:
         "study": {
             "name": study.name,
             **_lattice_entry(plan),
-            "eps": None if study.accuracy else study.transform.accuracy,
+            "eps": None if study.accuracy else study.transform.eps,
             "choice": plan.choice.to_table() if study.accuracy else None,
             "orders": list(study.orders),
             "reference": plan.reference,

@@ -16,7 +16,8 @@ from sobolev_batch.spectral.adaptive.solve import Aim
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, TransformSettings, require_inside
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import shell_sums
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -93,7 +93,7 @@ def pursue(
         goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(inexact)
         dtype = _precision(surfaces, lattice, goal)
         fields = tuple(
-            field_for(surface, lattice, goal, TransformSettings(dtype=dtype), sample=sample, threads=threads)
+            field_for(surface, lattice, goal, TransformSettings(dtype=dtype), Execution(threads=threads), sample=sample)
             for surface, sample in zip(surfaces, samples, strict=True)
         )
         found = _assessed(fields, lattice, orders, areas, widths)
@@ -199,7 +199,7 @@ def pilot_of(
         samples = _samples((surface, reference), lattice, orders)
         goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
         fields = [
-            field_for(each, lattice, goal, TransformSettings(), sample=sample, threads=threads)
+            field_for(each, lattice, goal, TransformSettings(), Execution(threads=threads), sample=sample)
             for each, sample in zip((surface, reference), samples, strict=True)
         ]
         found = _assessed(fields, lattice, orders, np.array(area), widths)

@@ -22,7 +22,8 @@ from sobolev_batch.spectral.errors.budget import (
     truncated,
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
-from sobolev_batch.spectral.transform.transform import FINEST_EPS, TransformSettings, memory_bytes
+from sobolev_batch.spectral.transform.settings import FINEST_EPS, TransformSettings
+from sobolev_batch.spectral.transform.transform import projected_bytes
 
 Reals = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ class Accuracy:
     def _bytes(intervals: int) -> float:
         half = Lattice(1.0, intervals).half
         # What is asked for may lead to any eps, and the finest takes the finest grid.
-        return memory_bytes(half, TransformSettings(FINEST_EPS["complex128"])) + 2 * 16 * half.size
+        return projected_bytes(half, TransformSettings(FINEST_EPS["complex128"])) + 2 * 16 * half.size
 
 
 def first_lattice(widths: Reals, reach: float, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:

@@ -1,4 +1,4 @@
-"""Backends: the NUFFT on a processor or a GPU, the arrays of either, and what they cost.
+"""Backends: the NUFFT on the processor or on a GPU, the arrays of each, and the costs of both.
 
-In: points and strengths. Out: modes of a plan, in arrays of the same backend.
+In: the specification of a NUFFT, points, strengths. Out: Fourier modes, in arrays of the same backend.
 """

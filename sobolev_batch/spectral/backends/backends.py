@@ -1,4 +1,4 @@
-"""Where transforms are computed: on the processor by FINUFFT, or on a GPU by cuFINUFFT."""
+"""The backends that compute transforms: FINUFFT on the processor, cuFINUFFT on a GPU."""
 
 from __future__ import annotations
 
@@ -17,67 +17,32 @@ import numpy as np
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.arrays import Array
-from sobolev_batch.spectral.backends.costs import Costs, Shape
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.costs import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
 
 _log = logging.getLogger(__name__)
 
-CPU_COSTS = Costs(
-    finest={
-        "complex128": {2.0: 0.0, 1.75: 1e-12, 1.5: 1e-11, 1.25: 1e-7},
-        "complex64": {2.0: 0.0, 1.75: 3e-6, 1.5: 2e-5, 1.25: 1e-3},
-    },
-    making=150.0,
-    point=100.0,
-    spread_cell=0.28,
-    grid_cell=27.0,
-    point_bytes=140,
-    triangle_bytes=100,
-    fixed_bytes=8_000_000,
-    work_grids=0,
-    scattered=True,
-    most_cells=10**11,  # FINUFFT's own bound
-)
-
-# Times are rough: nothing but the choice of a grid follows from them, and both grids keep eps.
-GPU_COSTS = Costs(
-    # cuFINUFFT evaluates its kernel by polynomials for these two only. Its older kernel was measured
-    # with FINUFFT, which has it too: at 1.25 it keeps eps down to 1e-9, and 1e-5 in single precision.
-    finest={"complex128": {2.0: 0.0, 1.25: 1e-8}, "complex64": {2.0: 0.0, 1.25: 1e-4}},
-    making=1.0,
-    point=1.0,
-    spread_cell=0.02,
-    grid_cell=0.1,
-    point_bytes=250,
-    triangle_bytes=60,
-    fixed_bytes=50_000_000,
-    work_grids=2,  # cuFFT's work area, and at worst as much for bins of a single cell
-    scattered=False,
-    most_cells=2**31 - 1,  # cuFINUFFT counts cells in 32 bits and does not check
-)
-
-# A plan is not for two threads, and two transforms at once would each find half of the memory.
+# Two threads cannot share a plan, and each of two transforms would find half of the memory.
 _DEVICE = threading.RLock()
 
 
 class NufftPlan(Protocol):
-    """A plan in three dimensions, as finufft and cufinufft make it: of type 1 where nothing else is said."""
+    """A plan in three dimensions, as finufft and cufinufft make it."""
 
     def setpts(self, x: Array, y: Array, z: Array) -> None:
-        """Set the angles of the points; references are kept, not copies."""
+        """Set the angles of the points; the plan keeps references, not copies."""
 
     def execute(self, data: Array) -> Array:
-        """Transform the strengths of the points; of type 2, the coefficients of the modes."""
+        """Transform the strengths of the points (type 1) or the coefficients of the modes (type 2)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Backend(ABC):
-    """Where transforms are computed.
+    """A processor or GPU with its NUFFT library.
 
     Attributes:
         name: "cpu" or "gpu".
-        library: that computes the nonuniform FFT.
-        costs: of that library.
+        library: Name of the NUFFT library.
+        costs: Costs of that library.
     """
 
     name: Literal["cpu", "gpu"]
@@ -86,15 +51,19 @@ class Backend(ABC):
 
     @abstractmethod
     def upload(self, array: Array) -> Array:
-        """An array of the host, where this backend computes."""
+        """Return an array of the host as an array of this backend."""
 
     @abstractmethod
     def download(self, array: Array) -> Array:
-        """An array of this backend, on the host; waits until it is computed."""
+        """Return an array of this backend as an array of the host, once it is computed."""
 
     @abstractmethod
-    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
-        """A type-1 plan with the sign -1, whose modes of an axis of n samples start at -(n // 2)."""
+    def plan(self, spec: NufftSpec) -> NufftPlan:
+        """Return a type-1 plan with the sign -1; the modes of an axis of n samples start at -(n // 2).
+
+        Args:
+            spec: Specification with its oversampling set.
+        """
 
 
 class _Cpu(Backend):
@@ -104,8 +73,8 @@ class _Cpu(Backend):
     def download(self, array: Array) -> Array:
         return array
 
-    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
-        return _finufft_plan(1, -1, shape, eps=eps, dtype=dtype, oversampling=oversampling, threads=threads)
+    def plan(self, spec: NufftSpec) -> NufftPlan:
+        return _finufft_plan(1, -1, spec)
 
     def __reduce__(self) -> str:
         return "CPU"
@@ -113,64 +82,63 @@ class _Cpu(Backend):
 
 @dataclass(frozen=True, eq=False)
 class Gpu(Backend):
-    """The first of the devices that CUDA shows; `gpu_backend` makes it.
+    """The first device that CUDA shows; `gpu_backend` returns it.
 
     Attributes:
-        libraries: that it calls.
+        libraries: Libraries that it calls.
     """
 
     libraries: cuda.Cuda
 
     @property
     def description(self) -> str:
-        """The device's name and memory."""
-        runtime = self.libraries.cupy.cuda.runtime
-        properties = runtime.getDeviceProperties(0)
+        """Name and memory of the device."""
+        properties = self.libraries.cupy.cuda.runtime.getDeviceProperties(0)
         return f"{properties['name'].decode()}, {properties['totalGlobalMem'] / 1e9:.3g} GB"
 
     @property
     def free_bytes(self) -> int:
-        """Device memory that a transform may take, that of arrays no longer in use included."""
+        """Device memory that a transform may take, including what CuPy keeps of freed arrays."""
         cupy = self.libraries.cupy
         return int(cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes())
 
     @contextmanager
     def work(self) -> Iterator[None]:
-        """While device work goes on: one thread at a time, on the first device and its default stream."""
+        """Reserve the device for one thread, and select it with its default stream."""
         cupy = self.libraries.cupy
         with _DEVICE, cupy.cuda.Device(0), cupy.cuda.Stream.null:
             yield
 
-    def make_room(self, needed: float) -> None:
-        """Where fewer bytes are free, give back what CuPy keeps of freed memory: cuFINUFFT allocates beside it."""
+    def release_memory(self, projected_bytes: float) -> None:
+        """Give back what CuPy keeps of freed arrays if less is free: cuFINUFFT allocates outside of CuPy's pool."""
         cupy = self.libraries.cupy
-        if cupy.cuda.runtime.memGetInfo()[0] < needed:
+        if cupy.cuda.runtime.memGetInfo()[0] < projected_bytes:
             cupy.get_default_memory_pool().free_all_blocks()
 
     def upload(self, array: Array) -> Array:
-        """A copy in device memory."""
+        """Return a copy in device memory."""
         return self.libraries.cupy.asarray(array)
 
     def download(self, array: Array) -> Array:
-        """A copy on the host, once everything before it is computed."""
+        """Return a copy on the host, once everything before it is computed."""
         return self.libraries.cupy.asnumpy(array)
 
-    def plan(self, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
-        """A plan of cuFINUFFT with every option that it has a choice in.
+    def plan(self, spec: NufftSpec) -> NufftPlan:
+        """Return a plan of cuFINUFFT with all of its options set.
 
         Raises:
-            RuntimeError: cuFINUFFT could not make it; it does not say why.
+            RuntimeError: cuFINUFFT failed to make it; it does not say why.
         """
-        # Defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac its own choice.
-        made: NufftPlan = self.libraries.plan(
+        # The defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac automatic.
+        plan: NufftPlan = self.libraries.plan(
             1,
-            shape,
+            spec.shape,
             n_trans=1,
-            eps=eps,
+            eps=spec.eps,
             isign=-1,
-            dtype=dtype,
+            dtype=spec.dtype,
             modeord=0,
-            upsampfac=oversampling,
+            upsampfac=spec.oversampling,
             gpu_method=0,  # shared memory where the kernel's width leaves room for it, else global memory
             gpu_sort=1,
             gpu_kerevalmeth=1,
@@ -181,7 +149,7 @@ class Gpu(Backend):
             gpu_stream=0,
             debug=0,
         )
-        return made
+        return plan
 
     def __reduce__(self) -> tuple[object, ...]:
         return gpu_backend, ()
@@ -190,38 +158,36 @@ class Gpu(Backend):
 CPU: Backend = _Cpu("cpu", "finufft", CPU_COSTS)
 
 
-def evaluation_plan(shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int) -> NufftPlan:
-    """A type-2 plan on the processor with the sign +1, whose modes of an axis of n samples start at -(n // 2)."""
-    return _finufft_plan(2, 1, shape, eps=eps, dtype=dtype, oversampling=oversampling, threads=threads)
+def evaluation_plan(spec: NufftSpec) -> NufftPlan:
+    """Return a type-2 plan on the processor with the sign +1; the modes of an axis of n start at -(n // 2)."""
+    return _finufft_plan(2, 1, spec)
 
 
-def _finufft_plan(
-    kind: int, sign: int, shape: Shape, *, eps: float, dtype: ComplexDtype, oversampling: float, threads: int
-) -> NufftPlan:
-    # Its warnings speak of thread counts and of tolerances, which are checked before they get here.
-    made: NufftPlan = finufft.Plan(
-        kind,
-        shape,
-        eps=eps,
+def _finufft_plan(nufft_type: int, sign: int, spec: NufftSpec) -> NufftPlan:
+    # FINUFFT warns of thread counts and of tolerances, which are checked before.
+    plan: NufftPlan = finufft.Plan(
+        nufft_type,
+        spec.shape,
+        eps=spec.eps,
         isign=sign,
-        dtype=dtype,
+        dtype=spec.dtype,
         modeord=0,
-        nthreads=threads,
-        upsampfac=oversampling,
+        nthreads=spec.threads,
+        upsampfac=spec.oversampling,
         showwarn=0,
     )
-    return made
+    return plan
 
 
 @cache
 def gpu_backend() -> Gpu:
-    """The GPU, after it has passed a trial.
+    """Return the GPU, once it has passed a trial.
 
-    Nothing of CUDA is loaded before this is called. With several GPUs, one process each with its own
-    CUDA_VISIBLE_DEVICES is the way to use them all.
+    Nothing of CUDA is loaded before this is called. To use several GPUs, start one process for each, with its own
+    CUDA_VISIBLE_DEVICES.
 
     Raises:
-        BackendError: there is none that can be used; the message says why, and what to do.
+        BackendError: No usable GPU; the message says why, and what to do.
     """
     backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
     try_out(backend)
@@ -229,11 +195,11 @@ def gpu_backend() -> Gpu:
 
 
 def backend_named(name: str) -> Backend:
-    """The backend that is meant by "cpu", "gpu" or "auto": a GPU if there is one that can be used.
+    """Return the backend for "cpu", "gpu" or "auto" (a usable GPU, else the processor).
 
     Raises:
-        BackendError: "gpu", and there is none.
-        InputError: another name.
+        BackendError: "gpu", and no GPU is usable.
+        InputError: Another name.
     """
     if name == "gpu":
         return gpu_backend()
@@ -251,16 +217,20 @@ def try_out(backend: Gpu) -> None:
     """Transform one point at the origin, which compiles a kernel and calls every library.
 
     Raises:
-        BackendError: it fails, or the values are wrong.
+        BackendError: The transform fails, or its values are wrong.
     """
     try:
         with backend.work():
-            plan = backend.plan((4, 6, 8), eps=1e-9, dtype="complex128", oversampling=2.0, threads=1)
+            plan = backend.plan(NufftSpec((4, 6, 8), 1e-9, oversampling=2.0))
             origin = backend.upload(np.zeros(1))
             plan.setpts(origin, origin, origin)
             values = backend.download(plan.execute(np.exp(1j * origin)))
     except Exception as error:  # CUDA's errors have no common base
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise BackendError(f"the GPU fails a trial transform: {reason}; is its driver up to date?") from error
+        raise BackendError(f"the GPU fails a trial transform: {one_line(error)}; is its driver up to date?") from error
     if not np.allclose(values, 1.0, rtol=0.0, atol=1e-8):
         raise BackendError(f"the GPU computes wrong values: {values.flat[0]} instead of 1")
+
+
+def one_line(error: Exception) -> str:
+    """Return the message of an error in one line, or its type if it has none."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""The GPU libraries, loaded on demand: CuPy, cuFINUFFT, and the CUDA libraries that both need."""
+"""GPU libraries, loaded on demand: CuPy, cuFINUFFT, and the CUDA libraries that both need."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from sobolev_batch.errors import BackendError
 
 INSTALL = "pip install 'sobolev-batch[gpu]'"
 
-# What cuFINUFFT is linked against, and what CuPy compiles with. cuFINUFFT's wheel neither declares them
+# cuFINUFFT is linked against the first two, and CuPy compiles with the third. cuFINUFFT's wheel neither declares them
 # nor finds them where pip puts them: they must be in the process before it is imported.
 _LIBRARIES = {"cudart": "the CUDA runtime", "cufft": "cuFFT", "nvrtc": "the CUDA compiler NVRTC"}
-# Of cudaError_t.
+# Values of cudaError_t.
 _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
 
 
 @dataclass(frozen=True, eq=False)
 class Cuda:
-    """The libraries, once loaded.
+    """The loaded libraries.
 
     Attributes:
-        cupy: the module.
-        cufinufft: the module.
-        runtime: the CUDA runtime of cuFINUFFT; CuPy has one of its own.
+        cupy: Module.
+        cufinufft: Module.
+        runtime: CUDA runtime of cuFINUFFT; CuPy has one of its own.
     """
 
     cupy: Any
@@ -34,36 +34,36 @@ class Cuda:
     runtime: Any
 
     def last_error(self) -> int:
-        """The error that cuFINUFFT's runtime remembers, which is forgotten by asking."""
+        """Return the last error of cuFINUFFT's runtime, and reset it."""
         return int(self.runtime.cudaGetLastError())
 
     def is_out_of_memory(self, error: BaseException) -> bool:
-        """Whether device memory was too little; cuFINUFFT itself does not say what went wrong."""
+        """Return True if device memory was too little, which cuFINUFFT itself does not report."""
         if isinstance(error, self.cupy.cuda.memory.OutOfMemoryError):
             return True
         return _OUT_OF_MEMORY in (getattr(error, "status", None), self.last_error())
 
     def plan(self, *args: Any, **options: Any) -> Any:
-        """A plan of cuFINUFFT."""
-        # It takes an error that an earlier plan left behind for its own.
+        """Return a plan of cuFINUFFT."""
+        # A plan takes an error that an earlier one left behind for its own.
         self.last_error()
         return _plan_class(self.cufinufft)(*args, **options)
 
 
 def load() -> Cuda:
-    """Load everything and look for a device.
+    """Load all libraries and look for a device.
 
     Raises:
-        BackendError: something is missing; the message says what, and what to do.
+        BackendError: A library, the driver or the device is missing; the message says what to do.
     """
     pathfinder = _module("cuda.pathfinder", "cuda-pathfinder")
     runtime: Any = None
-    for name, what in _LIBRARIES.items():
+    for name, title in _LIBRARIES.items():
         try:
-            found = pathfinder.load_nvidia_dynamic_lib(name)
+            library = pathfinder.load_nvidia_dynamic_lib(name)
         except RuntimeError as error:  # pathfinder's errors derive from it
-            raise BackendError(f"no GPU: {what} ({name}) is not installed or cannot be loaded: {INSTALL}") from error
-        runtime = runtime or ctypes.CDLL(found.abs_path)
+            raise BackendError(f"no GPU: {title} ({name}) is not installed or cannot be loaded: {INSTALL}") from error
+        runtime = runtime or ctypes.CDLL(library.abs_path)
     cupy = _module("cupy", "CuPy")
     cufinufft = _module("cufinufft", "cuFINUFFT")
     _require_device(cupy)
@@ -99,7 +99,7 @@ def _require_device(cupy: Any) -> None:
 
 def _plan_class(cufinufft: Any) -> Any:
     class Plan(cufinufft.Plan):  # type: ignore[misc]
-        """A plan that is not destroyed where it could not be made: that would print a traceback."""
+        """A plan whose destructor does nothing if the constructor failed; cuFINUFFT's would print a traceback."""
 
         def __del__(self) -> None:
             handle = getattr(self, "_plan", None)

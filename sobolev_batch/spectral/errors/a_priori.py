@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import choose_rules
-from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, reaches, typical_errors
-from sobolev_batch.spectral.transform.transform import COARSEST_EPS, FINEST_EPS, TransformSettings
+from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, rule_ranges, typical_errors
+from sobolev_batch.spectral.transform.settings import COARSEST_EPS, FINEST_EPS, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -134,9 +134,9 @@ class Census:
         energy on |ξ| = r is area² near zero and area / (2π r²) on average far out; the odd parts add
         up like random numbers.
         """
-        rules, reach = reaches(tolerance)
+        rules, ranges = rule_ranges(tolerance)
         # The rule that the smallest of a class gets, on the largest of it: never less than the truth.
-        splits, choice = choose_rules(2 * np.pi * lattice.highest_frequency * self.smallest, reach)
+        splits, choice = choose_rules(2 * np.pi * lattice.highest_frequency * self.smallest, ranges)
         radii = (np.arange(_RADII) + 0.5) / _RADII * _BALL * lattice.xi_max
         phases = 2 * np.pi * radii[:, None] * (self.largest / 2.0**splits)
         even, odd = np.empty_like(phases), np.empty_like(phases)

@@ -13,8 +13,8 @@ from sobolev_batch.spectral.errors.probe import Draws, Probe, draw, draw_count, 
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.quadrature.smooth import exact_values, resolve
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.quadrature.smooth import exact_values, resolution_of
+from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -66,6 +66,7 @@ def probe_block(
     orders: Sequence[float],
     block: Block,
     values: Complexes,
+    draws: Draws | None = None,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
@@ -74,12 +75,14 @@ def probe_block(
     """
     if not needs_probe(surface, settings):
         return Probe()
-    draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice)).within(block)
+    if draws is None:
+        draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice))
+    draws = draws.within(block)
     sample = Sample.of(surface, draws)
     probe = measure(draws, values[draws.places(block)], sample.exact)
     # Once for the whole field.
     if isinstance(surface, Smooth) and block.start == lattice.half.start:
-        change = resolve(surface, lattice.highest_frequency, settings.rule_tolerance).change
+        change = resolution_of(surface, lattice.highest_frequency, settings.tolerance).change
         return join([probe, even_probe(lattice, change * surface.area)])
     return probe
 

@@ -1,4 +1,4 @@
-"""Exact transforms: closed forms of triangles and spheres, which quadrature is checked against.
+"""Exact transforms: closed forms of triangles and spheres, to check computed fields against.
 
-In: a surface and a few frequencies. Out: its Fourier transform to rounding.
+In: a surface and a few frequencies, or two spheres. Out: Fourier transforms and norms, exact to rounding.
 """

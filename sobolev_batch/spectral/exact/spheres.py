@@ -1,4 +1,4 @@
-"""Closed forms for spheres: transforms, norms and inner products of their area measures."""
+"""Closed forms of spheres: transforms, norms and inner products of their area measures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 
 def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """The transform ∫ exp(-2πi ξ·x) dσ(x) of a sphere's area measure.
+    """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of a sphere's area measure.
 
     Args:
-        sphere: radius R and centre c, in units of length.
-        frequencies: (..., 3) float64, in cycles per unit length.
+        sphere: Sphere of radius R and centre c, in units of length.
+        frequencies: ξ, float64 (..., 3), in cycles per unit length.
 
     Returns:
         complex128 (...): 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) = sin(πt)/(πt).
@@ -33,7 +33,7 @@ def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArra
 
 
 def sphere_block(sphere: Sphere, lattice: Lattice, block: Block) -> NDArray[np.complex128]:
-    """The transform of a sphere on a block of the lattice, complex128 (block.shape)."""
+    """Return the transform of a sphere on a block of the lattice, complex128 (block.shape)."""
     x, y, z = lattice.frequencies(block)
     lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)
     values = (sphere.area * np.sinc(2 * sphere.radius * lengths)).astype(np.complex128)
@@ -45,31 +45,31 @@ def sphere_block(sphere: Sphere, lattice: Lattice, block: Block) -> NDArray[np.c
 
 
 def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
-    """The inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
+    """Return the inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
 
-    With C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ, a Matérn function, it is 4πR₁R₂ times the mean over
-    |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), d the distance of the centres: closed for
-    concentric spheres, a smooth one-dimensional integral otherwise. Relative error about 1e-13.
+    It is 4πR₁R₂ times the mean over |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), where d is the distance of
+    the centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, a
+    one-dimensional integral otherwise. The relative error is about 1e-13.
 
     Raises:
-        OrderError: an order that is not below -1/2, or so low that the Bessel functions overflow.
+        OrderError: The order is not below -1/2, or so low that the Bessel functions overflow.
     """
     nu = -order - 0.5
     if not nu > 0:
         raise OrderError(f"the norm of a surface needs an order below -1/2, found {order:g}")
-    apart = math.dist(first.center, second.center)
+    separation = math.dist(first.center, second.center)
     radii = first.radius, second.radius
     near, far = radii[0] - radii[1], radii[0] + radii[1]
 
     def integrand(t: float) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _matern_difference(nu, abs(near + apart * t), abs(far + apart * t))
+            return _matern_difference(nu, abs(near + separation * t), abs(far + separation * t))
 
-    if apart == 0:
+    if separation == 0:
         mean = integrand(0.0)
     else:
-        # The Matérn function has a kink at zero: integrate up to it from both sides.
-        kinks = sorted(t for t in (-near / apart, -far / apart) if -1 < t < 1)
+        # Integrate up to the kink of the Matérn function at zero from both sides.
+        kinks = sorted(t for t in (-near / separation, -far / separation) if -1 < t < 1)
         edges = [-1.0, *kinks, 1.0]
         mean = 0.5 * sum(_integral(integrand, low, high) for low, high in pairwise(edges))
     value = 8 * math.pi * radii[0] * radii[1] * mean
@@ -79,15 +79,15 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
 
 
 def sphere_norm(sphere: Sphere, order: float) -> float:
-    """The Sobolev norm of a sphere's area measure, of an order s < -1/2."""
+    """Return the Sobolev norm of a sphere's area measure, of an order s < -1/2."""
     return math.sqrt(sphere_inner_product(sphere, sphere, order))
 
 
 def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
-    """The Sobolev distance of two spheres' area measures, of an order s < -1/2.
+    """Return the Sobolev distance of two spheres' area measures, of an order s < -1/2.
 
-    The squared distance is a difference of inner products: its absolute error is about 1e-13 of the
-    squared norms.
+    The squared distance is a difference of inner products, with an absolute error of about 1e-13 of the squared
+    norms.
     """
     squared = (
         sphere_inner_product(first, first, order)
@@ -98,7 +98,7 @@ def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
 
 
 def _matern_difference(nu: float, shorter: float, longer: float) -> float:
-    """C(2π shorter) - C(2π longer), without cancellation where both arguments are small.
+    """Return C(2π shorter) - C(2π longer), without cancellation if both arguments are small.
 
     C(b) = √π (b/2)^ν K_ν(b) / Γ(ν+1/2), and d/db [b^ν K_ν(b)] = -b^ν K_{ν-1}(b).
     """
@@ -111,12 +111,12 @@ def _matern_difference(nu: float, shorter: float, longer: float) -> float:
 
 def _integral(function: Callable[[float], float], low: float, high: float) -> float:
     with warnings.catch_warnings():
-        # It asks for the last digits, and says so where rounding keeps one of them back.
+        # The tolerance asks for the last digits; quad warns if rounding prevents one of them.
         warnings.simplefilter("ignore", IntegrationWarning)
         return float(quad(function, low, high, epsabs=0, epsrel=1e-13, limit=200)[0])
 
 
 def _matern(nu: float, b: float) -> float:
-    """b^ν K_ν(b), with its limit 2^(ν-1) Γ(ν) at zero."""
+    """Return b^ν K_ν(b), or its limit 2^(ν-1) Γ(ν) at zero."""
     value = np.power(b, nu) * kv(nu, b) if b > 0 else math.inf
     return float(value) if math.isfinite(value) else float(np.exp2(nu - 1) * gamma(nu))

@@ -43,7 +43,7 @@ def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr
             f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
             "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
         )
-    return fourier_transform(a, lattice, orders=orders)
+    return fourier_transform(a, lattice, order=orders)
 
 
 def pair_of(

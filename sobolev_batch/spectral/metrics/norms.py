@@ -167,8 +167,8 @@ def _pursued(
         xi_max=found.lattice.xi_max,
         M=found.lattice.M,
         dtype=settings[0].dtype,
-        eps=[setting.accuracy for setting in settings],
-        tolerance=[setting.rule_tolerance for setting in settings],
+        eps=[setting.eps for setting in settings],
+        tolerance=[setting.tolerance for setting in settings],
         points=[field.points for field in found.fields],
     )
 

@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.dtypes import ComplexDtype, item_bytes
+from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
 from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
-from sobolev_batch.spectral.transform.memory import Division, Load, divide
+from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.transform import DEFAULT_BATCH, TransformSettings, require_points_inside
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import require_points_inside
 
 # Of a given memory, what blocks of fields may take; the rest is for the NUFFT.
 _SHARE_OF_BLOCKS = 0.25
@@ -108,7 +110,7 @@ class Evaluation:
         """Samples that a block should have at most."""
         if self.memory is None:
             return BLOCK_SAMPLES
-        each = _SAMPLE_BYTES + len(self.weights) * item_bytes(self.settings.dtype)
+        each = _SAMPLE_BYTES + len(self.weights) * np.dtype(self.settings.dtype).itemsize
         return max(1, min(BLOCK_SAMPLES, int(_SHARE_OF_BLOCKS * self.memory / each)))
 
     def of_block(self, block: Block, difference: NDArray[np.complexfloating]) -> NDArray[np.float64]:
@@ -119,29 +121,13 @@ class Evaluation:
         coefficients = np.empty((len(self.weights), *block.shape), dtype=dtype)
         for row, weight in zip(coefficients, self.weights, strict=True):
             np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-        division = Division(DEFAULT_BATCH)
+        threads = self.threads or os.cpu_count() or 1
+        batching = Batching(NufftSpec(block.shape, self.settings.eps, dtype, threads=threads))
         if self.memory is not None:
             count = self.coordinates.shape[1]
-            left = (1 - _SHARE_OF_BLOCKS) * self.memory
-            division = divide(
-                block.shape,
-                self.settings.accuracy,
-                dtype,
-                Load(count, count, fill=1.0),
-                CPU.costs,
-                memory=left,
-                batch=DEFAULT_BATCH,
-            )
-        return evaluate_at(
-            self.coordinates,
-            coefficients,
-            self.lattice,
-            block,
-            eps=self.settings.accuracy,
-            dtype=dtype,
-            threads=self.threads or os.cpu_count() or 1,
-            division=division,
-        )
+            allowed_bytes = (1 - _SHARE_OF_BLOCKS) * self.memory
+            batching = fastest_batching(batching, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
+        return evaluate_at(self.coordinates, coefficients, self.lattice, block, batching)
 
 
 def _coordinates(points: ArrayLike) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Quadrature rules on triangles, and how far each of them reaches at a given accuracy."""
+"""Quadrature rules on triangles, and the range of triangle sizes in which each keeps a tolerance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sobolev_batch.spectral.exact.triangles import second_difference
 Reals = NDArray[np.float64]
 
 HIGHEST_DEGREE = 50
-# Below this the rules' own rounding hides what is left of their error.
+# Below this, rounding hides the error of a rule.
 FINEST_TOLERANCE = 1e-15
 
 
@@ -23,10 +23,10 @@ class TriangleRule:
     """A quadrature rule on the triangle.
 
     Attributes:
-        degree: polynomials up to this total degree are integrated exactly.
-        barycentric: (n, 3) barycentric coordinates of the nodes, rows sum to 1.
-        weights: (n,) positive weights, their sum is 1: multiply by the area.
-        sharing: triangles of a closed mesh that have each node in common: 6 for corners, 2 for edges.
+        degree: Total degree up to which polynomials are integrated exactly.
+        barycentric: Barycentric coordinates of the nodes (n, 3); rows sum to 1.
+        weights: Positive weights (n,), to be multiplied by the area; they sum to 1.
+        sharing: Number of triangles of a closed mesh that share a node: 6 for corners, 2 for edges.
     """
 
     degree: int
@@ -41,19 +41,19 @@ class TriangleRule:
 
     @property
     def cost(self) -> float:
-        """Points a triangle of a large closed mesh, where shared nodes are merged."""
+        """Points for each triangle of a large closed mesh, once shared nodes are merged."""
         return self.size / self.sharing
 
 
 @cache
 def corner_rule() -> TriangleRule:
-    """The rule of degree 1 whose nodes are the corners: half a point a triangle."""
+    """Return the rule of degree 1 whose nodes are the corners: half a point for each triangle."""
     return TriangleRule(1, np.eye(3), np.full(3, 1 / 3), sharing=6)
 
 
 @cache
 def midpoint_rule() -> TriangleRule:
-    """The rule of degree 2 whose nodes are the edge midpoints: one and a half points a triangle.
+    """Return the rule of degree 2 whose nodes are the edge midpoints: one and a half points for each triangle.
 
     Source: P. C. Hammer, A. H. Stroud, "Numerical integration over simplexes" (1956).
     """
@@ -62,9 +62,9 @@ def midpoint_rule() -> TriangleRule:
 
 @cache
 def symmetric_rule(degree: int) -> TriangleRule:
-    """The fully symmetric rule of a degree from 1 to 50 with positive weights and interior nodes.
+    """Return the fully symmetric rule of a degree from 1 to 50, with positive weights and interior nodes.
 
-    H. Xiao, Z. Gimbutas, "A numerical algorithm for the construction of efficient quadrature rules
+    Source: H. Xiao, Z. Gimbutas, "A numerical algorithm for the construction of efficient quadrature rules
     in two and higher dimensions" (2010), doi:10.1016/j.camwa.2009.10.027; tables from modepy.
     """
     rule = modepy.XiaoGimbutasSimplexQuadrature(degree, 2)
@@ -75,9 +75,9 @@ def symmetric_rule(degree: int) -> TriangleRule:
 
 @cache
 def gauss_rule(points: int = 8) -> TriangleRule:
-    """The product of two Gauss-Legendre rules, collapsed onto the triangle: points² nodes.
+    """Return the product of two Gauss-Legendre rules, collapsed onto the triangle: points² nodes.
 
-    With 8 points it is the rule of K. Koga's paper: 64 nodes whatever the triangle's size.
+    With 8 points it is the rule of K. Koga's paper: 64 nodes for every triangle.
     """
     nodes, weights = np.polynomial.legendre.leggauss(points)
     u, v = np.meshgrid((1 + nodes) / 2, (1 + nodes) / 2, indexing="ij")
@@ -87,56 +87,56 @@ def gauss_rule(points: int = 8) -> TriangleRule:
 
 
 @lru_cache(maxsize=64)
-def reaches(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
-    """The rules worth using at a tolerance, by cost, and how large a triangle each may get.
+def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
+    """Return the rules that are worth using at a tolerance, and the range of each.
 
     Args:
-        tolerance: largest error on one triangle, relative to its area, at every frequency.
+        tolerance: Largest error on one triangle, relative to its area, at every frequency.
 
     Returns:
-        rules of increasing cost, and for each the largest 2π|ξ|ρ (radians; ρ the distance from a
-        triangle's centroid to its farthest corner) up to which it keeps the tolerance for every
-        shape of triangle and direction of ξ. Rules that a cheaper one outreaches are left out.
+        Rules of increasing cost, and for each the largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's
+        centroid to its farthest corner) up to which it keeps the tolerance for every shape of triangle and
+        direction of ξ. Rules with a smaller range than a cheaper one are left out.
     """
     tolerance = max(tolerance, FINEST_TOLERANCE)
     sizes, errors = _error_table()
     rules: list[TriangleRule] = []
-    kept: list[float] = []
+    ranges: list[float] = []
     for rule, row in zip(_candidates(), errors, strict=True):
         beyond = np.flatnonzero(row > tolerance)
-        reach = sizes[beyond[0] - 1] if beyond.size and beyond[0] > 0 else (0.0 if beyond.size else sizes[-1])
-        while rules and rules[-1].cost >= rule.cost and kept[-1] <= reach:
+        last = beyond[0] - 1 if beyond.size else len(sizes) - 1
+        limit = float(sizes[last]) if last >= 0 else 0.0
+        while rules and rules[-1].cost >= rule.cost and ranges[-1] <= limit:
             rules.pop()
-            kept.pop()
-        if not kept or reach > kept[-1]:
+            ranges.pop()
+        if not ranges or limit > ranges[-1]:
             rules.append(rule)
-            kept.append(float(reach))
-    return tuple(rules), np.array(kept)
+            ranges.append(limit)
+    return tuple(rules), np.array(ranges)
 
 
 @lru_cache(maxsize=128)
 def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
-    """Root mean square of a rule's error on one triangle over all directions of ξ.
+    """Return the root mean square of a rule's error on one triangle over all directions of ξ.
 
     Returns:
-        sizes 2π|ξ|ρ (radians), and at each the error relative to the area, split into its even part
-        (real, seen from the centroid), which neighbouring triangles add up, and its odd part, which
-        changes sign between neighbours that point opposite ways and mostly cancels. Taken over the
-        equilateral triangle and the flat one, whichever is worse.
+        Sizes 2π|ξ|ρ (radians), and at each the even and the odd part of the error, relative to the area. The even
+        part (real, seen from the centroid) adds up over neighbouring triangles. The odd part changes sign between
+        neighbours that point opposite ways, and mostly cancels. Each is the larger one of the equilateral and the
+        flat triangle.
     """
     sizes = np.geomspace(1e-3, 200.0, 64)
-    cosines, chances = np.polynomial.legendre.leggauss(4)
+    cosines, weights = np.polynomial.legendre.leggauss(4)
     sines = np.sqrt(1 - ((1 + cosines) / 2) ** 2)
-    turns = (np.arange(4) + 0.5) * np.pi / 24
-    equilateral = np.cos(turns + 2 * np.pi / 3 * np.arange(3)[:, None])
+    angles = (np.arange(4) + 0.5) * np.pi / 24
+    equilateral = np.cos(angles + 2 * np.pi / 3 * np.arange(3)[:, None])
     flat = np.outer([1.0, -0.5, -0.5], np.cos((np.arange(4) + 0.5) * np.pi / 8))
     even, odd = [], []
     for shape in (equilateral, flat):
         phases = (sizes[:, None, None] * sines[:, None]) * shape[:, None, None, :]
         difference = _rule_errors(rule, phases.reshape(3, -1)).reshape(len(sizes), len(sines), -1)
-        mean = chances / 2 @ np.mean(difference.real**2, axis=2).T, chances / 2 @ np.mean(difference.imag**2, axis=2).T
-        even.append(np.sqrt(mean[0]))
-        odd.append(np.sqrt(mean[1]))
+        even.append(np.sqrt(weights / 2 @ np.mean(difference.real**2, axis=2).T))
+        odd.append(np.sqrt(weights / 2 @ np.mean(difference.imag**2, axis=2).T))
     return sizes, np.maximum(*even), np.maximum(*odd)
 
 
@@ -148,11 +148,11 @@ def _candidates() -> tuple[TriangleRule, ...]:
 
 @lru_cache(maxsize=1)
 def _error_table() -> tuple[Reals, Reals]:
-    """Sizes 2π|ξ|ρ (S,) and the largest relative error of each candidate on triangles of that size (52, S).
+    """Return sizes 2π|ξ|ρ (S,) and the largest relative error of each candidate on triangles of that size (52, S).
 
-    On a plane wave a rule sees nothing of the triangle but the phases at its three corners. Measured
-    from the centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon, of which
-    symmetry leaves one twelfth to sample.
+    On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
+    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon, of which symmetry leaves one twelfth to
+    sample.
     """
     sizes = np.geomspace(1e-4, 200.0, 160)
     fractions = np.linspace(0.5, 1.0, 5)
@@ -164,6 +164,6 @@ def _error_table() -> tuple[Reals, Reals]:
 
 
 def _rule_errors(rule: TriangleRule, phases: Reals) -> NDArray[np.complex128]:
-    """Error of a rule on exp(i phase), given at the three corners (3, n), relative to the area (n,)."""
+    """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
     exact = 2 * second_difference(phases[1] - phases[0], phases[2] - phases[0])
     return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - exact)

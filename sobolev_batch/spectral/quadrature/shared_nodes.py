@@ -1,4 +1,4 @@
-"""Nodes that neighbouring triangles have in common, merged into one point each."""
+"""Nodes that neighbouring triangles share, merged into one point each."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from sobolev_batch.spectral.backends.arrays import Array, sums_of_runs
 
-# An edge and its triangle are sorted as one integer: twice the bits of a vertex and those of a triangle.
+# An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
 _BITS = 63
 
 
 class Faces(Protocol):
-    """What of a mesh its points are made from, as arrays of any backend."""
+    """The arrays of a mesh that points are made from, on any backend."""
 
     @property
     def vertices(self) -> Array:
@@ -29,22 +29,22 @@ class Faces(Protocol):
 
 
 def merged_corners(mesh: Faces, members: Array) -> tuple[Array, Array]:
-    """The corners of some triangles, each with a third of the areas that meet there.
+    """Return the corners of some triangles, each with a third of the areas that meet there.
 
     Returns:
-        coordinates (3, n), in units of length; weights (n,), in squared units of length.
+        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
     """
     thirds = np.repeat(mesh.areas[members] / 3, 3)
     weights = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
-    there = np.flatnonzero(weights)
-    return np.ascontiguousarray(mesh.vertices[there].T, like=weights), weights[there]
+    corners = np.flatnonzero(weights)
+    return np.ascontiguousarray(mesh.vertices[corners].T, like=weights), weights[corners]
 
 
 def merged_midpoints(mesh: Faces, members: Array) -> tuple[Array, Array]:
-    """The edge midpoints of some triangles, each with a third of the areas that meet there.
+    """Return the edge midpoints of some triangles, each with a third of the areas that meet there.
 
     Returns:
-        coordinates (3, n), in units of length; weights (n,), in squared units of length.
+        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
     """
     triangles, vertices = mesh.triangles[members], mesh.vertices
     triangle_bits = len(triangles).bit_length()
@@ -64,10 +64,10 @@ def merged_midpoints(mesh: Faces, members: Array) -> tuple[Array, Array]:
     ordered.sort()
     thirds = (mesh.areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
     ordered >>= triangle_bits
-    differs = np.empty(len(ordered), dtype=bool, like=ordered)
-    differs[:1] = True
-    np.not_equal(ordered[1:], ordered[:-1], out=differs[1:])
-    starts = np.flatnonzero(differs)
+    is_first = np.empty(len(ordered), dtype=bool, like=ordered)
+    is_first[:1] = True
+    np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
+    starts = np.flatnonzero(is_first)
     weights = sums_of_runs(thirds, starts)
     ends = ordered[starts]
     coordinates = np.empty((3, len(starts)), like=thirds)

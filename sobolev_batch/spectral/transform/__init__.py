@@ -1,4 +1,4 @@
-"""Transform: weighted points become a block of the Fourier field, within a given memory.
+"""Transform: from a surface to a block of its Fourier field, within the memory that is allowed.
 
-In: a surface, a block of the lattice, settings. Out: complex values on the block.
+In: a surface, a lattice, a block, settings. Out: complex values, the number of points, the backend.
 """

@@ -1,67 +1,135 @@
-"""How a transform is divided so that it fits into memory: batches of points, parts of the block, oversampling."""
+"""Memory of a transform: batches of points and sub-blocks of a block, so that it takes what is allowed."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 
 from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.costs import Costs, Shape, fastest_oversampling, spreading_nanoseconds
-from sobolev_batch.spectral.dtypes import ComplexDtype, item_bytes
+from sobolev_batch.spectral.backends.costs import Costs, NufftSpec, Shape
 from sobolev_batch.spectral.lattice import Block
 
-# A batch holds a few pieces of triangles, and a piece at least eight times the largest rule.
-SMALLEST_BATCH = 1 << 12
-# Widest kernel of FINUFFT and cuFINUFFT: a grid has at least twice as many cells along each axis.
+# Points of one NUFFT: two million take 0.3 GB with their strengths and sorting, and make the FFT a small part of
+# the time.
+DEFAULT_BATCH = 1 << 21
+# The smallest batch holds eight nodes sets of the largest triangle rule.
+_SMALLEST_BATCH = 1 << 12
+# The widest kernel of FINUFFT and cuFINUFFT: a grid has at least twice as many cells along each axis.
 _WIDEST_KERNEL = 16
-# The share of the lattice's period that a surface's bounding box fills, where it is not known. At an
-# aliasing error worth having it is far less.
+# The bounding box of a surface fills this fraction of the lattice's period, if nothing else is known. At a useful
+# aliasing error it is far less.
 _USUAL_FILL = 0.3
 
 
 @dataclass(frozen=True)
-class Load:
-    """What is to be transformed.
+class Workload:
+    """The points to transform.
 
     Attributes:
-        points: expected number.
-        most_points: bound on it before shared ones are merged.
-        triangles: number.
-        fill: the share of the lattice's period that the bounding box takes, by volume.
+        points: Expected number of points.
+        largest_points: Bound on the number of points, before shared ones are merged.
+        triangles: Number of triangles.
+        fill: Fraction of the lattice's period that the bounding box fills, by volume.
     """
 
-    points: float
-    most_points: float = math.inf
+    points: float = math.inf
+    largest_points: float = math.inf
     triangles: int = 0
     fill: float = _USUAL_FILL
 
 
 @dataclass(frozen=True)
-class Division:
-    """How a transform is divided.
+class Batching:
+    """A sequence of equal NUFFTs that computes a transform.
 
     Attributes:
-        batch: points of one NUFFT.
-        shape: samples along each axis of the parts that a block is computed in; None for the whole.
-        oversampling: of the fine grid; None for the fastest.
+        spec: Each NUFFT; its shape is the block's, or that of sub-blocks.
+        batch: Largest number of points of each.
     """
 
-    batch: int
-    shape: Shape | None = None
-    oversampling: float | None = None
+    spec: NufftSpec
+    batch: int = DEFAULT_BATCH
+
+    def grid_cells(self, workload: Workload, costs: Costs) -> int:
+        """Return the number of cells of the largest fine grid that may be used."""
+        # More points favour more oversampling, never less.
+        spec = costs.with_oversampling(self.spec, min(self.batch, workload.largest_points))
+        return math.prod(_grid_length(modes, spec.oversampling or 2.0) for modes in spec.shape)
+
+    def projected_bytes(self, workload: Workload, costs: Costs) -> int:
+        """Return an upper estimate of the memory, without the result and the mesh."""
+        grids = 1 + costs.work_grids + (workload.fill if costs.copies_grid else 0)
+        samples = self.grid_cells(workload, costs) * grids + self.spec.size
+        points = min(self.batch, workload.largest_points) * costs.point_bytes
+        triangles = workload.triangles * costs.triangle_bytes
+        return math.ceil(samples * self.spec.item_bytes + points) + triangles + costs.fixed_bytes
+
+    def projected_nanoseconds(self, shape: Shape, workload: Workload, costs: Costs) -> float:
+        """Return the predicted time for a block of some shape."""
+        sigma = self.spec.oversampling or max(costs.finest_eps[self.spec.dtype])
+        blocks = math.prod(math.ceil(whole / step) for whole, step in zip(shape, self.spec.shape, strict=True))
+        batches = math.ceil(max(workload.points, 1) / self.batch)
+        each_point = costs.point_nanoseconds + blocks * costs.spreading_nanoseconds(sigma, self.spec.eps)
+        cells = self.grid_cells(workload, costs)
+        return workload.points * each_point + batches * blocks * cells * costs.fft_cell_nanoseconds
 
 
-def parts(block: Block, shape: Shape | None) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
-    """The parts of a block, each with its place in an array of the block.
+def fastest_batching(whole: Batching, workload: Workload, costs: Costs, allowed_bytes: float) -> Batching:
+    """Return the batching that is predicted to be the fastest within the allowed memory.
 
-    All have the same shape, so that one plan serves them: those at the high ends may reach beyond the block.
+    If the whole block fits, nothing is subdivided or prescribed: the values are then those of unlimited memory.
+
+    Args:
+        whole: Batching with the shape of the block and the largest allowed batch.
+        workload: Points to transform.
+        costs: Costs of the library.
+        allowed_bytes: Memory that the transform may take, without the result and the mesh.
+
+    Raises:
+        InputError: No batching fits; the message names the smallest memory that works.
     """
-    shape = shape or block.shape
+
+    def fits(batching: Batching) -> bool:
+        if batching.grid_cells(workload, costs) > costs.largest_grid:
+            return False
+        return batching.projected_bytes(workload, costs) <= allowed_bytes
+
+    if fits(whole):
+        return whole
+    shape = whole.spec.shape
+    candidates: list[Batching] = []
+    least_bytes = math.inf
+    batches = [whole.batch]
+    while batches[-1] // 2 >= _SMALLEST_BATCH:
+        batches.append(batches[-1] // 2)
+    for batch, sigma in product(batches, costs.oversamplings(whole.spec)):
+        spec = replace(whole.spec, oversampling=sigma)
+        smaller = [Batching(replace(spec, shape=sub_shape), batch) for sub_shape in _sub_shapes(shape, sigma)]
+        # Ever smaller sub-blocks take ever less memory: the first that fits is the largest.
+        first = bisect_left(smaller, True, key=fits)
+        if first < len(smaller):
+            candidates.append(smaller[first])
+        else:
+            least_bytes = min(least_bytes, smaller[-1].projected_bytes(workload, costs))
+    if not candidates:
+        raise InputError(
+            f"{allowed_bytes / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, shape))} "
+            f"samples: give at least {math.ceil(least_bytes / 1e5) / 10:.4g} MB besides the result and the mesh"
+        )
+    return min(candidates, key=lambda batching: batching.projected_nanoseconds(shape, workload, costs))
+
+
+def sub_blocks(block: Block, shape: Shape) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
+    """Yield the sub-blocks of a block, each with its slices of an array of the block.
+
+    All have the same shape, so that one plan serves them: those at the high ends may extend beyond the block.
+    """
     for offsets in product(*(range(0, count, step) for count, step in zip(block.shape, shape, strict=True))):
         i, j, k = (first + offset for first, offset in zip(block.start, offsets, strict=True))
         x, y, z = (
@@ -71,115 +139,23 @@ def parts(block: Block, shape: Shape | None) -> Iterator[tuple[Block, tuple[slic
         yield Block((i, j, k), shape), (x, y, z)
 
 
-def transform_bytes(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> int:
-    """Upper estimate of what transforming to a block of some shape takes, besides its result and the mesh.
-
-    Args:
-        shape: of the block.
-        eps: accuracy.
-        dtype: of the field.
-        load: what is transformed.
-        division: how.
-        costs: of the library.
-    """
-    part = division.shape or shape
-    grids = 1 + costs.work_grids + (load.fill if costs.scattered else 0)
-    samples = _cells(shape, eps, dtype, load, division, costs) * grids + math.prod(part)
-    points = min(division.batch, load.most_points) * costs.point_bytes
-    triangles = load.triangles * costs.triangle_bytes
-    return math.ceil(samples * item_bytes(dtype) + points) + triangles + costs.fixed_bytes
-
-
-def divide(
-    shape: Shape, eps: float, dtype: ComplexDtype, load: Load, costs: Costs, *, memory: float, batch: int
-) -> Division:
-    """The division that fits into memory and is predicted to be the fastest.
-
-    Where the whole fits, nothing is divided and nothing prescribed: results are then those that unlimited
-    memory leads to.
-
-    Args:
-        shape: of the block.
-        eps: accuracy.
-        dtype: of the field.
-        load: what is to be transformed.
-        costs: of the library.
-        memory: what may be taken besides the result and the mesh, in bytes.
-        batch: the largest number of points of one NUFFT.
-
-    Raises:
-        InputError: no division fits; the message names the smallest memory that works.
-    """
-
-    def taken(division: Division) -> int:
-        return transform_bytes(shape, eps, dtype, load, division, costs)
-
-    def fits(division: Division) -> bool:
-        cells = _cells(shape, eps, dtype, load, division, costs)
-        return taken(division) <= memory and cells <= costs.most_cells
-
-    undivided = Division(batch)
-    if fits(undivided):
-        return undivided
-    batches = [batch]
-    while batches[-1] // 2 >= SMALLEST_BATCH:
-        batches.append(batches[-1] // 2)
-    found: list[tuple[float, Division]] = []
-    least = math.inf
-    for points in batches:
-        for sigma in costs.oversamplings(eps, dtype):
-            for part in _shapes(shape, sigma):
-                division = Division(points, part, sigma)
-                if fits(division):
-                    found.append((_nanoseconds(shape, eps, dtype, load, division, costs), division))
-                    break
-            else:
-                least = min(least, taken(division))
-    if not found:
-        raise InputError(
-            f"{memory / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, shape))} samples: "
-            f"give at least {math.ceil(least / 1e5) / 10:.4g} MB besides the result and the mesh"
-        )
-    return min(found, key=lambda candidate: candidate[0])[1]
-
-
-def _shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
-    """Shapes of parts, from the whole block down to where smaller ones save nothing."""
+def _sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
+    """Yield shapes of sub-blocks, from the whole block down to where smaller ones save nothing."""
     counts = [1, 1, 1]
-    now = list(shape)
+    lengths = list(shape)
     while True:
-        yield now[0], now[1], now[2]
-        axis = max(range(3), key=now.__getitem__)
-        if now[axis] * sigma <= 2 * _WIDEST_KERNEL:
+        yield lengths[0], lengths[1], lengths[2]
+        axis = max(range(3), key=lengths.__getitem__)
+        if lengths[axis] * sigma <= 2 * _WIDEST_KERNEL:
             return
-        before = now[axis]
-        while now[axis] == before:
+        before = lengths[axis]
+        while lengths[axis] == before:
             counts[axis] += 1
-            now[axis] = math.ceil(shape[axis] / counts[axis])
+            lengths[axis] = math.ceil(shape[axis] / counts[axis])
 
 
 @lru_cache(maxsize=1 << 14)
-def _axis(samples: int, sigma: float) -> int:
-    """Cells of the fine grid along an axis: even, with no prime factor above 5, as FINUFFT takes them."""
-    least = max(math.ceil(sigma * samples), 2 * _WIDEST_KERNEL)
+def _grid_length(modes: int, sigma: float) -> int:
+    """Return the cells of the fine grid along an axis: even, with no prime factor above 5, as FINUFFT takes them."""
+    least = max(math.ceil(sigma * modes), 2 * _WIDEST_KERNEL)
     return 2 * int(next_fast_len(-(-least // 2), real=True))
-
-
-def _cells(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> int:
-    """Cells of the largest fine grid that a division can lead to."""
-    sigma = division.oversampling
-    if sigma is None:
-        # More points ask for more oversampling, never for less.
-        points = min(division.batch, load.most_points)
-        sigma = fastest_oversampling(points, math.prod(shape), eps, dtype, costs)
-    return math.prod(_axis(samples, sigma) for samples in division.shape or shape)
-
-
-def _nanoseconds(shape: Shape, eps: float, dtype: ComplexDtype, load: Load, division: Division, costs: Costs) -> float:
-    """Predicted time of a division with a shape and an oversampling, in nanoseconds."""
-    part, sigma = division.shape or shape, division.oversampling or max(costs.finest[dtype])
-    count = math.prod(math.ceil(whole / step) for whole, step in zip(shape, part, strict=True))
-    rounds = math.ceil(max(load.points, 1) / division.batch)
-    each = costs.making + count * spreading_nanoseconds(sigma, eps, costs)
-    cells = _cells(shape, eps, dtype, load, division, costs)
-    return load.points * each + rounds * count * cells * costs.grid_cell

@@ -1,112 +1,52 @@
-"""The Fourier transform of a surface on a block of the lattice: closed form, or quadrature and NUFFT."""
+"""The Fourier transform of a surface on a block of the lattice: a closed form, or quadrature and NUFFT."""
 
 from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field, replace
-from typing import get_args
+from dataclasses import dataclass, replace
+from functools import singledispatch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
-from sobolev_batch.spectral.backends.costs import Costs
-from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes, item_bytes
+from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu, one_line
+from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.transform.memory import Division, Load, divide, transform_bytes
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan, unknown_surface
+from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
+from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
-# Raise it whenever the numbers that a given surface and settings lead to change: stored fields of
-# another version are then computed again instead of being compared with new ones.
+# Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
+# computed again instead of being compared with new ones.
 NUMERICS_VERSION = 3
 
-# Points of one NUFFT call: 2 million take 0.3 GB with their strengths and their sorting, and make
-# the FFT of a call a small part of it.
-DEFAULT_BATCH = 1 << 21
-
-# What FINUFFT can reach; below it warns in 2.5 and refuses from 2.6.
-FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
-COARSEST_EPS = 0.1
-# The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of
-# degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that found most of it.
-_SMOOTH_DEGREE = 16
-# Samples of a closed form at a time.
-_SLAB = 1 << 18
-# Of a GPU's free memory, what a transform plans with; and how often it is tried, each time with half as much.
-_DEVICE_SHARE, _ATTEMPTS = 0.9, 4
+# Samples of a closed form at a time: temporaries of the whole block would take several times its size.
+_SAMPLES = 1 << 18
+# The fraction of a GPU's free memory that a transform plans with, and the number of attempts, each with half of it.
+_DEVICE_FRACTION, _ATTEMPTS = 0.9, 4
 _OUT_OF_MEMORY = "out of memory"
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class TransformSettings:
-    """How fields are computed.
-
-    Args:
-        eps: accuracy of a field relative to the surface's area. None stands for 1e-9 in complex128
-            and 1e-6 in complex64.
-        dtype: "complex128" or "complex64".
-        quadrature: see `Quadrature`.
-        tolerance: largest error of the triangle rules on any one triangle, relative to its area, and of
-            the nodes of a parametrised surface, relative to the whole area; None stands for eps.
-
-    Raises:
-        InputError: a precision that does not exist, or an eps beyond what it can hold.
-    """
-
-    eps: float | None = None
-    dtype: ComplexDtype = "complex128"
-    quadrature: Quadrature = field(default_factory=Quadrature)
-    tolerance: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.dtype not in get_args(ComplexDtype):
-            raise InputError(f"dtype must be 'complex128' or 'complex64', found {self.dtype!r}")
-        if self.eps is None:
-            object.__setattr__(self, "eps", 1e-9 if self.dtype == "complex128" else 1e-6)
-        finest = FINEST_EPS[self.dtype]
-        if not finest <= self.accuracy <= COARSEST_EPS:
-            raise InputError(
-                f"eps must lie between {finest:g} and {COARSEST_EPS:g} in {self.dtype}, found {self.eps!r}"
-            )
-
-    @property
-    def accuracy(self) -> float:
-        """The eps in force."""
-        return float(self.eps) if self.eps is not None else float("nan")
-
-    @property
-    def rule_tolerance(self) -> float:
-        """The tolerance in force."""
-        return self.accuracy if self.tolerance is None else self.tolerance
-
-    def lowest_degree(self, surface: Surface, lattice: Lattice) -> int:
-        """The lowest degree among the rules that triangles get, whose error shows first; 0 for a closed form."""
-        if isinstance(surface, Sphere):
-            return 0
-        if isinstance(surface, Smooth):
-            return _SMOOTH_DEGREE
-        return self.quadrature.lowest_degree(surface, lattice.highest_frequency, self.rule_tolerance)
-
-
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A block of a field, and from what it was made.
+    """A block of a field.
 
     Attributes:
-        values: complex (block.shape).
-        points: of the quadrature; 0 for a closed form.
-        backend: the library that computed it; also which one failed before, and why. "closed form"
-            where none was needed.
+        values: Complex array (block.shape).
+        points: Number of quadrature points; 0 for a closed form.
+        backend: Library that computed it, and the reason if another one failed before; "closed form" if none
+            was needed.
     """
 
     values: Complexes
@@ -119,167 +59,168 @@ def transform_block(
     lattice: Lattice,
     block: Block,
     settings: TransformSettings,
-    *,
-    backend: Backend = CPU,
-    threads: int = 1,
-    batch: int = DEFAULT_BATCH,
-    memory: float | None = None,
+    execution: Execution = ON_CPU,
+    plan: QuadraturePlan | None = None,
 ) -> Transformed:
-    """The transform of a surface on one block of the lattice.
+    """Return the transform of a surface on one block of the lattice.
 
     Args:
-        surface: what to transform.
-        lattice: where.
-        block: which part of it.
-        settings: how.
-        backend: where to compute. What a GPU fails to do is done on the processor.
-        threads: of FINUFFT.
-        batch: the largest number of points of one NUFFT.
-        memory: what this may take besides the mesh and the result, in bytes. What does not fit is
-            computed in smaller batches, in parts of the block and with less oversampling, whichever is
-            predicted to be the fastest; that changes the values by a small multiple of eps. Without
-            it, a transform takes what `memory_bytes` says, however many points there are. On a GPU what
-            is free there is the bound, and this one holds for the processor that may have to step in.
+        surface: Surface in units of length.
+        lattice: Lattice of the frequencies.
+        block: Block of the lattice.
+        settings: Accuracy and dtype.
+        execution: Backend, threads and memory.
+        plan: Quadrature plan of the surface by the same settings, if there is one. Pass it to transform several
+            blocks with one choice of rules.
 
     Raises:
-        LatticeError: a surface reaches beyond the lattice's half period.
-        InputError: the memory is too little for any way of computing it, or the quadrature of a
-            parametrised surface does not settle.
+        LatticeError: The surface extends beyond the lattice's half period.
+        InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
+            the surface is of an unknown kind.
     """
-    if isinstance(surface, Sphere):
-        return Transformed(_closed_form(surface, lattice, block, settings.dtype), 0, "closed form")
-    require_inside(surface, lattice)
-    division = Division(batch)
-    if memory is not None:
-        division, _ = _division(surface, lattice, block, settings, CPU.costs, memory=memory, batch=batch)
-    failure = ""
-    if isinstance(backend, Gpu):
-        made = _on_gpu(surface, lattice, block, settings, batch, backend)
-        if isinstance(made, Transformed):
-            return made
-        _log.warning("%s: %s; the processor computes it instead", backend.library, made)
-        failure = f" after {backend.library}: {made}"
-    values, points = _computed(surface, lattice, block, settings, division, CPU, threads)
-    return Transformed(values, points, CPU.library + failure)
+    return _transform(surface, _Target(lattice, block, settings, execution, plan))
 
 
-def _on_gpu(
-    surface: Mesh | Smooth, lattice: Lattice, block: Block, settings: TransformSettings, batch: int, backend: Gpu
-) -> Transformed | str:
-    """The transform of a surface by a GPU, or why it failed.
-
-    Where memory is too little after all, it is tried again in smaller batches and parts.
-    """
-    try:
-        with backend.work():
-            room = _DEVICE_SHARE * backend.free_bytes - block.size * item_bytes(settings.dtype)
-            for _ in range(_ATTEMPTS):
-                division, taken = _division(surface, lattice, block, settings, backend.costs, memory=room, batch=batch)
-                backend.make_room(taken)
-                try:
-                    values, points = _computed(surface, lattice, block, settings, division, backend, 1)
-                    return Transformed(values, points, backend.library)
-                except Exception as error:
-                    # cuFINUFFT says of a failure only where it happened; cuFFT's want of memory is not even known.
-                    suspect = type(error) is RuntimeError and taken > room / 2
-                    if not (backend.libraries.is_out_of_memory(error) or suspect):
-                        raise
-                room = min(room, taken) / 2
-                _log.warning("%s: %s; trying again with %.3g MB", backend.library, _OUT_OF_MEMORY, room / 1e6)
-                backend.make_room(math.inf)
-    except InputError:  # no division is small enough
-        return _OUT_OF_MEMORY
-    except Exception as error:
-        return (" ".join(str(error).split()) or type(error).__name__)[:200]
-    return _OUT_OF_MEMORY
-
-
-def _computed(
-    surface: Mesh | Smooth,
-    lattice: Lattice,
+def projected_bytes(
     block: Block,
     settings: TransformSettings,
-    division: Division,
-    backend: Backend,
-    threads: int,
-) -> tuple[Complexes, int]:
-    """The transform of a surface on one backend, divided in one way, and the number of points."""
-    batches = settings.quadrature.batches(
-        surface, lattice.highest_frequency, settings.rule_tolerance, division.batch, backend
-    )
-    values, points = transform_points(
-        batches,
-        lattice,
-        block,
-        eps=settings.accuracy,
-        dtype=settings.dtype,
-        threads=threads,
-        backend=backend,
-        shape=division.shape,
-        oversampling=division.oversampling,
-    )
-    return backend.download(values), points
-
-
-def memory_bytes(
-    block: Block,
-    settings: TransformSettings,
-    batch: int = DEFAULT_BATCH,
+    execution: Execution = ON_CPU,
     *,
-    memory: float | None = None,
     triangles: int = 0,
 ) -> int:
-    """Peak memory of `transform_block`, its result included and the mesh itself not, as an upper estimate.
-
-    The oversampled grid and its copy where the surface is, the block and its sum, a batch's coordinates,
-    angles, strengths, phases and sorting.
+    """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
 
     Args:
-        block: see `transform_block`.
-        settings: likewise.
-        batch: likewise.
-        memory: likewise.
-        triangles: of the mesh; each takes some bytes while its rule is chosen.
+        block: Block of the lattice.
+        settings: Accuracy and dtype.
+        execution: Allowed memory and batch.
+        triangles: Number of triangles of the mesh, each of which takes some bytes while its rule is chosen.
     """
-    load = Load(math.inf, triangles=triangles)
-    needed: float = transform_bytes(block.shape, settings.accuracy, settings.dtype, load, Division(batch), CPU.costs)
-    if memory is not None:
-        needed = min(needed, memory)
-    return block.size * item_bytes(settings.dtype) + math.ceil(needed)
+    whole = Batching(NufftSpec(block.shape, settings.eps, settings.dtype), execution.batch)
+    needed: float = whole.projected_bytes(Workload(triangles=triangles), CPU.costs)
+    if execution.allowed_bytes is not None:
+        needed = min(needed, execution.allowed_bytes)
+    return block.size * whole.spec.item_bytes + math.ceil(needed)
 
 
-def _division(
-    surface: Mesh | Smooth,
-    lattice: Lattice,
-    block: Block,
-    settings: TransformSettings,
-    costs: Costs,
-    *,
-    memory: float,
-    batch: int,
-) -> tuple[Division, int]:
-    """How the transform of a surface is divided to fit into memory, and what it then takes, in bytes.
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """The arguments of `transform_block`, without the surface."""
 
-    Raises:
-        InputError: the memory is too little.
-    """
-    shape, eps, dtype = block.shape, settings.accuracy, settings.dtype
+    lattice: Lattice
+    block: Block
+    settings: TransformSettings
+    execution: Execution
+    plan: QuadraturePlan | None
+
+
+@singledispatch
+def _transform(surface: object, target: _Target) -> Transformed:
+    raise unknown_surface(surface)
+
+
+@_transform.register
+def _(surface: Sphere, target: _Target) -> Transformed:
+    values = _closed_form(surface, target.lattice, target.block, target.settings.dtype)
+    return Transformed(values, 0, "closed form")
+
+
+@_transform.register(Mesh)
+@_transform.register(Smooth)
+def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
+    lattice, execution = target.lattice, target.execution
+    require_inside(surface, lattice)
+    plan = target.plan or target.settings.plan(surface, lattice)
     low, high = surface.bounds
     fill = float(np.prod((high - low) / (2 * lattice.half_period)))
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
-    load = Load(math.inf, triangles=triangles, fill=fill)
-    if transform_bytes(shape, eps, dtype, load, Division(batch), costs) > memory:
-        # Only now do the points need counting.
-        points, most = settings.quadrature.sizes(surface, lattice.highest_frequency, settings.rule_tolerance)
-        load = replace(load, points=points, most_points=most)
-    division = divide(shape, eps, dtype, load, costs, memory=memory, batch=batch)
-    return division, transform_bytes(shape, eps, dtype, load, division, costs)
+    task = _QuadratureTransform(plan, lattice, target.block, target.settings, execution, fill)
+    # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
+    batching = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
+    failure = ""
+    if isinstance(execution.backend, Gpu):
+        transformed = task.on_gpu(execution.backend)
+        if isinstance(transformed, Transformed):
+            return transformed
+        library = execution.backend.library
+        _log.warning("%s: %s; the processor computes it instead", library, transformed)
+        failure = f" after {library}: {transformed}"
+    return task.compute(CPU, batching, failure)
+
+
+@dataclass(frozen=True, eq=False)
+class _QuadratureTransform:
+    """The transform of a surface's points onto a block.
+
+    Attributes:
+        fill: Fraction of the lattice's period that the surface's bounding box fills, by volume.
+    """
+
+    plan: QuadraturePlan
+    lattice: Lattice
+    block: Block
+    settings: TransformSettings
+    execution: Execution
+    fill: float
+
+    @property
+    def whole(self) -> Batching:
+        """Batching without sub-blocks."""
+        settings, execution = self.settings, self.execution
+        spec = NufftSpec(self.block.shape, settings.eps, settings.dtype, threads=execution.threads)
+        return Batching(spec, execution.batch)
+
+    def fitting(self, backend: Backend, allowed_bytes: float) -> tuple[Batching, int]:
+        """Return the fastest batching within the allowed memory, and the memory that it takes.
+
+        Raises:
+            InputError: The memory is too little.
+        """
+        workload = Workload(triangles=self.plan.triangles, fill=self.fill)
+        if self.whole.projected_bytes(workload, backend.costs) > allowed_bytes:
+            # Only now do the points need counting.
+            size = self.plan.size
+            workload = replace(workload, points=size.expected, largest_points=size.largest)
+        batching = fastest_batching(self.whole, workload, backend.costs, allowed_bytes)
+        return batching, batching.projected_bytes(workload, backend.costs)
+
+    def compute(self, backend: Backend, batching: Batching, failure: str = "") -> Transformed:
+        """Return the transform, computed by one backend."""
+        batches = self.plan.batches(batching.batch, backend)
+        values, points = transform_points(batches, self.lattice, self.block, batching.spec, backend)
+        return Transformed(backend.download(values), points, backend.library + failure)
+
+    def on_gpu(self, gpu: Gpu) -> Transformed | str:
+        """Return the transform, computed by a GPU, or the reason why it failed."""
+        try:
+            with gpu.work():
+                return self._attempts_on(gpu)
+        except InputError:  # no batching is small enough
+            return _OUT_OF_MEMORY
+        except Exception as error:
+            return one_line(error)[:200]
+
+    def _attempts_on(self, gpu: Gpu) -> Transformed | str:
+        """Compute on a GPU; if memory is too little after all, try again with half as much."""
+        allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - self.block.size * self.whole.spec.item_bytes
+        for _ in range(_ATTEMPTS):
+            batching, projected = self.fitting(gpu, allowed_bytes)
+            gpu.release_memory(projected)
+            try:
+                return self.compute(gpu, batching)
+            except Exception as error:
+                # cuFINUFFT says of a failure only where it happened, and nothing if cuFFT ran out of memory.
+                unexplained = type(error) is RuntimeError and projected > allowed_bytes / 2
+                if not (gpu.libraries.is_out_of_memory(error) or unexplained):
+                    raise
+            allowed_bytes = min(allowed_bytes, projected) / 2
+            _log.warning("%s: %s; trying again with %.3g MB", gpu.library, _OUT_OF_MEMORY, allowed_bytes / 1e6)
+            gpu.release_memory(math.inf)
+        return _OUT_OF_MEMORY
 
 
 def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, dtype: ComplexDtype) -> Complexes:
-    """The transform of a sphere, slab by slab: whole temporaries would take several times the block."""
     values: Complexes = np.empty(block.shape, dtype=dtype)
-    step = max(1, _SLAB // math.prod(block.shape[1:]))
+    step = max(1, _SAMPLES // math.prod(block.shape[1:]))
     for first in range(0, block.shape[0], step):
         count = min(step, block.shape[0] - first)
         slab = Block((block.start[0] + first, *block.start[1:]), (count, *block.shape[1:]))
@@ -288,29 +229,29 @@ def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, dtype: ComplexD
 
 
 def require_inside(surface: Surface, lattice: Lattice) -> None:
-    """Refuse a surface that does not fit into the lattice's period, where its points would fold.
+    """Check that a surface lies within the lattice's period: points beyond it would be folded back.
 
     Raises:
-        LatticeError: some |coordinate| is not below 1/(2h).
+        LatticeError: Some |coordinate| is not below 1/(2h).
     """
     kind = "mesh" if isinstance(surface, Mesh) else "surface"
     _require_reach(max(float(np.abs(bound).max()) for bound in surface.bounds), lattice, f"the {kind} reaches", "it")
 
 
 def require_points_inside(coordinates: NDArray[np.float64], lattice: Lattice) -> None:
-    """Refuse points (3, n) that do not lie within the lattice's period.
+    """Check that points (3, n) lie within the lattice's period.
 
     Raises:
-        LatticeError: some |coordinate| is not below 1/(2h).
+        LatticeError: Some |coordinate| is not below 1/(2h).
     """
     _require_reach(float(np.abs(coordinates).max(initial=0.0)), lattice, "the points reach", "them")
 
 
-def _require_reach(reach: float, lattice: Lattice, subject: str, what: str) -> None:
+def _require_reach(reach: float, lattice: Lattice, subject: str, pronoun: str) -> None:
     if not reach < lattice.half_period:
-        needed = 2 * math.floor(2 * lattice.xi_max * reach) + 2
+        intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2
         raise LatticeError(
             f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take M >= {needed}, a smaller xi_max, or scale {what} down"
+            f"take M >= {intervals}, a smaller xi_max, or scale {pronoun} down"
         )

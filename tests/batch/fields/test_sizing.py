@@ -7,10 +7,11 @@ import pytest
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.sizing import lay_out
-from sobolev_batch.spectral.backends.backends import CPU_COSTS
+from sobolev_batch.spectral.backends.costs import CPU_COSTS, NufftSpec
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.memory import Load, divide
-from sobolev_batch.spectral.transform.transform import TransformSettings, memory_bytes
+from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
@@ -32,7 +33,7 @@ def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
     assert (layout.parts, layout.groups) == (1, (ONE_CHUNK,))
     # It claims what it is going to use, and may use what there is.
     assert layout.transform_bytes == pytest.approx(8e9, rel=0.01)
-    assert memory_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < layout.largest_bytes < 0.4e9
+    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < layout.largest_bytes < 0.4e9
 
 
 @pytest.mark.parametrize("workers", [crew(4), crew(4, 4), crew(64, 64, 64, threads=8)])
@@ -49,7 +50,7 @@ def test_where_memory_is_short_parts_are_smaller() -> None:
 
 def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() -> None:
     tight = lay_out(LARGE, TRANSFORM, ExpectedSize(1000, 0), crew(1.5), rows=10)
-    assert tight.transform_bytes < memory_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
+    assert tight.transform_bytes < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
     assert tight.largest_bytes == pytest.approx(1.5e9)
     # Four at once would leave nothing to each: such tasks run beside fewer others.
     crowded = lay_out(LARGE, TRANSFORM, ExpectedSize(1000, 0), crew(2.25, threads=4), rows=10)
@@ -63,8 +64,8 @@ def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() 
 def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
     layout = lay_out(blocks, TRANSFORM, ExpectedSize(triangles, 0), crew(4, threads=threads), rows=1)
     part = triangles / layout.parts
-    load = Load(part * 3, part * 12, int(part))
-    divide(blocks[0].shape, 1e-9, "complex128", load, CPU_COSTS, memory=layout.transform_bytes, batch=1 << 21)
+    workload = Workload(part * 3, part * 12, int(part))
+    fastest_batching(Batching(NufftSpec(blocks[0].shape, 1e-9)), workload, CPU_COSTS, layout.transform_bytes)
     assert layout.largest_bytes <= 4e9
 
 

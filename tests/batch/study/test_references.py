@@ -90,7 +90,7 @@ def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path
     # The reference's bounding sphere becomes the unit sphere at the origin.
     unit = Torus(2.0 / 2.8, 0.8 / 2.8)
     assert study.lattice is not None
-    expected = fourier_transform(unit, study.lattice, threads=1, orders=study.orders)
+    expected = fourier_transform(unit, study.lattice, threads=1, order=study.orders)
     assert np.abs(stored.values - expected.values).max() < 1e-8 * unit.area
     area = open_store(store_path)["meshes"].to_dataset()["area"].sel(mesh="reference").item()
     assert area == pytest.approx(unit.area, rel=1e-12)

@@ -16,15 +16,16 @@ import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.backends import backends, cuda
-from sobolev_batch.spectral.backends.arrays import combine, sums_of_runs
 from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral.backends.costs import GPU_COSTS
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import Goal
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.transform import Transformed, TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import Transformed, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 from tests.support.repository import PACKAGE, imported
 
@@ -46,7 +47,7 @@ def uneven() -> Mesh:
 
 
 def on(backend: backends.Backend, mesh: Mesh, settings: TransformSettings = DOUBLE, **options: Any) -> Transformed:
-    return transform_block(mesh, LATTICE, LATTICE.half, settings, backend=backend, **options)
+    return transform_block(mesh, LATTICE, LATTICE.half, settings, Execution(backend, **options))
 
 
 def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, tolerance: float = 1e-12) -> None:
@@ -57,9 +58,9 @@ def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, toleranc
 
 
 def rules_in_use(mesh: Mesh, settings: TransformSettings) -> set[str]:
-    groups = settings.quadrature._groups(mesh, LATTICE.highest_frequency, settings.rule_tolerance)
+    assignment = RuleAssignment.of(mesh, LATTICE.highest_frequency, settings.tolerance, settings.quadrature)
     kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
-    return {"split" if group.splits else kinds.get(group.rule, "interior") for group in groups}
+    return {"split" if use.splits else kinds.get(use.rule, "interior") for use in assignment.uses}
 
 
 MESHES: list[Callable[[], Mesh]] = [*(lambda level=level: icosphere(level) for level in range(5)), uneven]
@@ -96,7 +97,7 @@ def test_single_precision_agrees_to_its_own_accuracy() -> None:
 def test_batches_and_blocks_agree(block: Block) -> None:
     mesh = icosphere(3)
     found, expected = (
-        transform_block(mesh, LATTICE, block, DOUBLE, backend=backend, batch=20_000)
+        transform_block(mesh, LATTICE, block, DOUBLE, Execution(backend, batch=20_000))
         for backend in (Device().backend(), CPU)
     )
     assert found.backend == "cufinufft"
@@ -108,7 +109,7 @@ def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog:
     mesh, settings, lattice = icosphere(5), TransformSettings(eps), Lattice(5.0, 64)
     expected = transform_block(mesh, lattice, lattice.half, settings)
     device = Device(capacity=7.5e7)
-    found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
+    found = transform_block(mesh, lattice, lattice.half, settings, Execution(device.backend()))
     assert found.backend == "cufinufft"
     assert device.options[0]["n_modes"] != lattice.shape
     assert not caplog.records
@@ -123,7 +124,7 @@ def test_what_is_foreseen_of_a_device_is_what_it_takes() -> None:
     allowed = device.most_used / 0.9
     assert on(Device(capacity=allowed + 1e8).backend(), mesh, settings, batch=200_000).backend == "cufinufft"
     # Points: what a batch holds at most, over the points of a batch.
-    assert device.most_used < 200_000 * backends.GPU_COSTS.point_bytes + 60 * len(mesh.triangles) + 20e6
+    assert device.most_used < 200_000 * GPU_COSTS.point_bytes + 60 * len(mesh.triangles) + 20e6
 
 
 def test_every_option_of_a_plan_is_given() -> None:
@@ -142,7 +143,7 @@ def test_out_of_memory_is_tried_again_in_smaller_parts(
 ) -> None:
     mesh, lattice, device = icosphere(5), Lattice(5.0, 64), Device(failures=[(where, "memory")] * times)
     settings = TransformSettings(1e-9)
-    found = transform_block(mesh, lattice, lattice.half, settings, backend=device.backend())
+    found = transform_block(mesh, lattice, lattice.half, settings, Execution(device.backend()))
     assert found.backend == "cufinufft"
     assert_agree(found, transform_block(mesh, lattice, lattice.half, settings), mesh, 5e-9)
     assert [record.levelname for record in caplog.records] == ["WARNING"] * times
@@ -189,7 +190,7 @@ def test_any_other_failure_falls_back_at_once(where: str, caplog: pytest.LogCapt
 def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
     mesh, lattice = icosphere(4), Lattice(5.0, 64)
     device = Device(capacity=2.5e8, failures=[("plan", "error")])
-    found = transform_block(mesh, lattice, lattice.half, DOUBLE, backend=device.backend())
+    found = transform_block(mesh, lattice, lattice.half, DOUBLE, Execution(device.backend()))
     assert found.backend == "cufinufft"
     assert len(device.options) == 2
     assert_agree(found, transform_block(mesh, lattice, lattice.half, DOUBLE), mesh)
@@ -197,11 +198,11 @@ def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left()
 
 def test_memory_bounds_the_processor_that_steps_in() -> None:
     mesh, device = icosphere(3), Device(failures=[("execute", "error")])
-    found = on(device.backend(), mesh, TransformSettings(1e-9), memory=1.2e7)
+    found = on(device.backend(), mesh, TransformSettings(1e-9), allowed_bytes=1.2e7)
     assert found.backend.startswith("finufft after")
-    assert np.array_equal(found.values, on(CPU, mesh, TransformSettings(1e-9), memory=1.2e7).values)
+    assert np.array_equal(found.values, on(CPU, mesh, TransformSettings(1e-9), allowed_bytes=1.2e7).values)
     with pytest.raises(InputError, match="give at least"):
-        on(Device().backend(), mesh, memory=1e6)
+        on(Device().backend(), mesh, allowed_bytes=1e6)
 
 
 def test_two_threads_take_turns() -> None:
@@ -215,10 +216,10 @@ def test_two_threads_take_turns() -> None:
 def test_fields_carry_their_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Device().backend()
     mesh = icosphere(2)
-    assert compute_field(mesh, LATTICE, TransformSettings(), [-2.0], backend=backend).backend == "cufinufft"
+    assert compute_field(mesh, LATTICE, TransformSettings(), [-2.0], Execution(backend)).backend == "cufinufft"
     goal = Goal((-2.0,), (1e-3,))
-    assert field_for(mesh, LATTICE, goal, TransformSettings(), backend=backend).backend == "cufinufft"
-    assert field_for(Sphere(), LATTICE, goal, TransformSettings(), backend=backend).backend == "closed form"
+    assert field_for(mesh, LATTICE, goal, TransformSettings(), Execution(backend)).backend == "cufinufft"
+    assert field_for(Sphere(), LATTICE, goal, TransformSettings(), Execution(backend)).backend == "closed form"
     monkeypatch.setattr(backends, "gpu_backend", lambda: backend)
     attributes = {name: fourier_transform(mesh, LATTICE, backend=name).attrs["backend"] for name in ("gpu", "auto")}
     assert attributes == {"gpu": "cufinufft", "auto": "cufinufft"}
@@ -329,19 +330,6 @@ def test_says_in_one_line_what_is_missing(
         cuda.load()
 
 
-def test_the_exceptions_agree_with_numpy() -> None:
-    rng = np.random.default_rng(7)
-    device = Device()
-    rows, values = rng.normal(size=(3, 50)), rng.normal(size=50)
-    starts = np.array([0, 3, 4, 20, 49])
-    for coefficients in (rng.normal(size=3), rng.normal(size=(5, 3))):
-        found = combine(coefficients, device._asarray(rows))
-        assert isinstance(found, Array)
-        assert np.abs(found.host - coefficients @ rows).max() < 1e-14
-    sums = sums_of_runs(device._asarray(values), device._asarray(starts))
-    assert np.abs(sums.host - np.add.reduceat(values, starts)).max() < 1e-14
-
-
 # The real libraries, without a device.
 
 
@@ -429,11 +417,12 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     code = """
 from sobolev_batch.spectral.backends import cuda
-from sobolev_batch.spectral.backends.backends import GPU_COSTS, Gpu
+from sobolev_batch.spectral.backends.backends import Gpu
+from sobolev_batch.spectral.backends.costs import GPU_COSTS, NufftSpec
 cuda._require_device = lambda cupy: None
 backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
 try:
-    backend.plan((8, 8, 8), eps=1e-9, precision="complex128", oversampling=1.5, threads=1)
+    backend.plan(NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
 except RuntimeError as error:
     print(error, backend.libraries.is_out_of_memory(error))
 """

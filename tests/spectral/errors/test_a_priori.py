@@ -11,7 +11,8 @@ import trimesh
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.errors.a_priori import Census, Goal, loosest_tolerance, permits_single, settle
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
 
 LATTICE = Lattice(3.0, 32)
@@ -92,5 +93,5 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
 def test_settings_keep_precision_and_quadrature() -> None:
     given = TransformSettings(dtype="complex64")
     settled = settle(BOX, LATTICE, Goal((-2.0,), (1e-9,)), given)
-    assert replace(settled, eps=given.eps, tolerance=None) == given
-    assert settled.accuracy == 2e-7
+    assert replace(settled, eps=given.eps, tolerance=given.tolerance) == given
+    assert settled.eps == 2e-7

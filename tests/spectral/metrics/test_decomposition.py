@@ -14,6 +14,7 @@ from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, ic
 from sobolev_batch.spectral.exact.spheres import sphere_inner_product
 from sobolev_batch.spectral.metrics import inputs as operands
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -101,7 +102,7 @@ def share_in_the_limit(mesh: Mesh, radius: float, order: float) -> float:
     """
     lack = 1 - mesh.area / Sphere(radius).area
     inside, weights = 0.0, 0.0
-    for batch in Quadrature(8).batches(mesh, 1.0, 1e-9, 1 << 20):
+    for batch in QuadraturePlan.of(mesh, 1.0, 1e-9, Quadrature(8)).batches(1 << 20):
         inside += batch.weights @ (radius - np.linalg.norm(batch.coordinates, axis=0))
         weights += batch.weights.sum()
     displacement = inside / weights

@@ -20,6 +20,7 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.shells import shell_sums, shell_weights
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -54,7 +55,7 @@ def test_distance_against_the_matern_kernel_in_real_space() -> None:
     shrunk = type(BOX)(0.8 * BOX.vertices, BOX.triangles)
     points, weights = [], []
     for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in Quadrature(22).batches(mesh, 1.0, 1e-9, 1 << 20):
+        for batch in QuadraturePlan.of(mesh, 1.0, 1e-9, Quadrature(22)).batches(1 << 20):
             points.append(batch.coordinates.T)
             weights.append(sign * batch.weights)
     x, w = np.concatenate(points), np.concatenate(weights)

@@ -22,9 +22,11 @@ from sobolev_batch import (
     icosphere,
     witness,
 )
+from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
-from sobolev_batch.spectral.transform.memory import Division
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
+from sobolev_batch.spectral.transform.memory import Batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -88,8 +90,11 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     block = Block((-3, 1, 2), (5, 4, 4))
     coefficients = np.random.default_rng(4).standard_normal((2, *block.shape)) + 1j
     one, many = (
-        evaluate_at(points.T, coefficients, LATTICE, block, eps=1e-13, division=division)
-        for division in (Division(1 << 20), Division(7, (2, 3, 3), 2.0))
+        evaluate_at(points.T, coefficients, LATTICE, block, batching)
+        for batching in (
+            Batching(NufftSpec(block.shape, 1e-13)),
+            Batching(NufftSpec((2, 3, 3), 1e-13, oversampling=2.0), 7),
+        )
     )
     assert many == pytest.approx(one, rel=0, abs=1e-11 * np.abs(one).max())
 
@@ -99,8 +104,8 @@ def test_evaluation_is_the_adjoint_of_the_transform() -> None:
     block = Block((-6, -2, 1), (7, 6, 4))
     points, weights = rng.uniform(-1, 1, (3, 40)), rng.standard_normal(40)
     coefficients = rng.standard_normal((1, *block.shape)) + 1j * rng.standard_normal((1, *block.shape))
-    transformed, _ = transform_points([WeightedPoints(points, weights)], LATTICE, block, eps=1e-13)
-    (values,) = evaluate_at(points, coefficients, LATTICE, block, eps=1e-13, division=Division(1 << 20))
+    transformed, _ = transform_points([WeightedPoints(points, weights)], LATTICE, block, NufftSpec(block.shape, 1e-13))
+    (values,) = evaluate_at(points, coefficients, LATTICE, block, Batching(NufftSpec(block.shape, 1e-13)))
     assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
 
 
@@ -110,7 +115,7 @@ def test_its_integral_against_the_difference_is_the_squared_distance(other: Mesh
     a, b = (fourier_transform(surface, lattice, 1e-14) for surface in (mesh, other))
     total = np.zeros(len(ORDERS))
     for surface, sign in ((mesh, 1.0), (other, -1.0)):
-        for batch in Quadrature().batches(surface, lattice.highest_frequency, 1e-14, 1 << 20):
+        for batch in QuadraturePlan.of(surface, lattice.highest_frequency, 1e-14).batches(1 << 20):
             values = witness(a, b, ORDERS, batch.coordinates.T, eps=1e-14).values
             total += sign * values @ batch.weights
     assert total == pytest.approx(distance(a, b, ORDERS)["distance"].values ** 2, rel=1e-10)
@@ -123,7 +128,7 @@ def test_is_the_difference_smoothed_by_the_matern_kernel() -> None:
     points = np.random.default_rng(7).uniform(-1, 1, (9, 3))
     expected = np.zeros(len(points))
     for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in Quadrature(22).batches(mesh, 1.0, 1e-9, 1 << 20):
+        for batch in QuadraturePlan.of(mesh, 1.0, 1e-9, Quadrature(22)).batches(1 << 20):
             r = np.linalg.norm(points[:, None] - batch.coordinates.T, axis=2)
             kernel = 2 * np.pi**power / gamma(power) * r ** (power - 1.5) * kv(1.5 - power, 2 * np.pi * r)
             expected += sign * kernel @ batch.weights

@@ -1,4 +1,4 @@
-"""Triangle rules: exactness, positivity, and how far each one reaches."""
+"""Triangle rules: exactness, positivity, and the range of each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ import pytest
 
 from sobolev_batch import Mesh
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.quadrature.rules import HIGHEST_DEGREE, TriangleRule, gauss_rule, reaches, symmetric_rule
+from sobolev_batch.spectral.quadrature.rules import (
+    HIGHEST_DEGREE,
+    TriangleRule,
+    gauss_rule,
+    rule_ranges,
+    symmetric_rule,
+)
 
 
 def monomial_error(rule: TriangleRule, degree: int) -> float:
@@ -42,12 +48,12 @@ def test_the_papers_rule_has_64_points_of_degree_14() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9, 1e-12])
-def test_no_triangle_within_reach_exceeds_the_tolerance(tolerance: float) -> None:
+def test_no_triangle_within_range_exceeds_the_tolerance(tolerance: float) -> None:
     rng = np.random.default_rng(11)
-    rules, reach = reaches(tolerance)
-    assert (np.diff(reach) > 0).all()
+    rules, ranges = rule_ranges(tolerance)
+    assert (np.diff(ranges) > 0).all()
     assert (np.diff([rule.cost for rule in rules]) > 0).all()
-    for rule, limit in zip(rules, reach, strict=True):
+    for rule, limit in zip(rules, ranges, strict=True):
         if limit == 0:
             continue
         for _ in range(8):
@@ -62,9 +68,9 @@ def test_no_triangle_within_reach_exceeds_the_tolerance(tolerance: float) -> Non
 
 
 def test_rules_are_not_wastefully_far_within_the_tolerance() -> None:
-    # A quarter beyond its reach, the worst direction must break the tolerance: the table is sharp.
-    rules, reach = reaches(1e-9)
-    for rule, limit in zip(rules[2:12], reach[2:12], strict=True):
+    # A quarter beyond its range, the worst direction must break the tolerance: the table is sharp.
+    rules, ranges = rule_ranges(1e-9)
+    for rule, limit in zip(rules[2:12], ranges[2:12], strict=True):
         worst = 0.0
         for fraction in np.linspace(0.5, 1, 21):
             phases = 1.25 * limit * np.array([1.0, -fraction, fraction - 1.0])

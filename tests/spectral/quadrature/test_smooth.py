@@ -28,10 +28,11 @@ from sobolev_batch import (
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.spheres import sphere_transform
-from sobolev_batch.spectral.quadrature import meshes as quadrature
+from sobolev_batch.spectral.quadrature import plan as quadrature_plan
 from sobolev_batch.spectral.quadrature import smooth as resolution
-from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolve
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolution_of
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.support.fake_device import Device
@@ -158,7 +159,7 @@ def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
     whole = transform_block(surface, LATTICE, LATTICE.half, settings)
     assert whole.points > 1000
     for block in LATTICE.split(4000):
-        part = transform_block(surface, LATTICE, block, settings, batch=1 << 12, memory=1e9)
+        part = transform_block(surface, LATTICE, block, settings, Execution(allowed_bytes=1e9, batch=1 << 12))
         assert part.values == pytest.approx(whole.values[LATTICE.place(block)], abs=1e-12 * surface.area)
 
 
@@ -176,8 +177,8 @@ def test_single_precision() -> None:
 @pytest.mark.parametrize("surface", [*SMOOTH, angular_ball(False)], ids=lambda surface: type(surface).__name__)
 @pytest.mark.parametrize("highest", [0.5, 7.0, 20.0])
 def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float) -> None:
-    found = resolve(surface, highest, 1e-9)
-    assert found.settled
+    found = resolution_of(surface, highest, 1e-9)
+    assert found.converged
     assert found.change <= 1e-9
     points = highest * np.random.default_rng(9).normal(size=(20, 3))
     points *= highest / np.linalg.norm(points, axis=1, keepdims=True)
@@ -195,7 +196,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
         return radii * np.sin(u) * np.cos(v), radii * np.sin(u) * np.sin(v), np.cos(u)
 
     surface = ParametrisedSurface(rippled, HALF_TURN, TURN)
-    assert resolve(surface, 0.01, 1e-9).counts[1] > 2 * 62
+    assert resolution_of(surface, 0.01, 1e-9).counts[1] > 2 * 62
     assert surface.area > 1.2 * 4 * math.pi
 
 
@@ -208,12 +209,12 @@ def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) ->
     ):
         fourier_transform(surface, LATTICE)
     # Where less is asked for, it converges, if slowly.
-    assert resolve(surface, 2.0, 1e-4).change <= 1e-4
+    assert resolution_of(surface, 2.0, 1e-4).change <= 1e-4
 
 
 def test_a_surface_large_beside_the_wavelength_is_refused_at_once() -> None:
     with pytest.raises(InputError, match="it would take more to begin with"):
-        resolve(Torus(1.0, 0.4), 1e4, 1e-9)
+        resolution_of(Torus(1.0, 0.4), 1e4, 1e-9)
 
 
 def test_a_surface_beyond_the_period_is_refused() -> None:
@@ -246,7 +247,7 @@ def test_the_error_of_the_nufft_is_reported(surface: Smooth, eps: float) -> None
 def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SMOOTH[1]
     exact = fourier_transform(surface, LATTICE, 1e-14, threads=1)
-    monkeypatch.setattr(quadrature, "resolve", lambda *_: Resolution((91, 25), 0.0, True))
+    monkeypatch.setattr(quadrature_plan, "resolution_of", lambda *_: Resolution((91, 25), 0.0, True))
     field = fourier_transform(surface, LATTICE, 1e-12, threads=1)
     orders = [-2.0, -5.0]
     truth = distance(field, exact, orders)["distance"].values
@@ -269,7 +270,7 @@ def test_what_doubling_the_nodes_changes_is_reported() -> None:
     reported = norm(field, orders)["discretisation"].values
     assert (truth <= reported).all()
     assert (truth > 1e-6).all()
-    change = resolve(surface, LATTICE.highest_frequency, 1e-4).change
+    change = resolution_of(surface, LATTICE.highest_frequency, 1e-4).change
     assert (reported > change * surface.area).all()
 
 
@@ -329,7 +330,7 @@ def test_a_gpu_gets_the_same_nodes() -> None:
     device = Device()
     for surface in SMOOTH:
         found, expected = (
-            transform_block(surface, LATTICE, LATTICE.half, TransformSettings(1e-13), backend=backend, batch=1 << 13)
+            transform_block(surface, LATTICE, LATTICE.half, TransformSettings(1e-13), Execution(backend, batch=1 << 13))
             for backend in (device.backend(), CPU)
         )
         assert (found.backend, expected.backend) == ("cufinufft", "finufft")
@@ -340,7 +341,7 @@ def test_a_gpu_gets_the_same_nodes() -> None:
 def test_little_memory_makes_parts_and_not_other_numbers() -> None:
     surface, lattice = SMOOTH[1], Lattice(4.0, 64)
     whole, parts = (
-        transform_block(surface, lattice, lattice.half, TransformSettings(1e-9), memory=memory)
+        transform_block(surface, lattice, lattice.half, TransformSettings(1e-9), Execution(allowed_bytes=memory))
         for memory in (None, 1.5e7)
     )
     assert whole.points == parts.points
@@ -365,7 +366,7 @@ def test_reported_errors_hold_true_ones(seed: int) -> None:
 
 
 def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
-    fewer, more = (resolve(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9).counts[0] for thickness in (0.04, 0.01))
+    fewer, more = (resolution_of(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9).counts[0] for thickness in (0.04, 0.01))
     assert 2 * fewer < more < 8 * fewer
     with pytest.raises(InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"):
-        resolve(Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)
+        resolution_of(Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)

@@ -1,0 +1,106 @@
+"""Quadrature plans: batches of weighted points, their number, and what is chosen once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sobolev_batch import InputError, Lattice, Mesh, Sphere, Torus, fourier_transform, icosphere
+from sobolev_batch.spectral.fields import compute_field
+from sobolev_batch.spectral.quadrature import meshes
+from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
+from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.surface import Surface
+from tests.support.shapes import CENTRED_BOX as BOX
+
+
+@pytest.mark.parametrize("method", ["auto", "gauss8", 1, 7, 50])
+@pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
+def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
+    batches = list(QuadraturePlan.of(BOX, 8.0, 1e-10, Quadrature(method)).batches(capacity))
+    assert max(len(batch.weights) for batch in batches) <= capacity
+    coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
+    weights = np.concatenate([batch.weights for batch in batches])
+    assert (weights > 0).all()
+    assert weights.sum() == pytest.approx(BOX.area, rel=1e-13)
+    if method != 1:
+        # ∫ x² over a box of sides a, b, c: two faces at ±a/2, and four that run through.
+        a, b, c = 1.0, 1.2, 1.4
+        assert weights @ coordinates[0] ** 2 == pytest.approx(b * c * a**2 / 2 + a**3 / 6 * (b + c), rel=1e-13)
+
+
+def test_batches_are_nearly_equal() -> None:
+    plan = QuadraturePlan.of(icosphere(5), 8.66, 1e-9)
+    sizes = [len(batch.weights) for batch in plan.batches(200_000)]
+    assert len(sizes) == 3
+    assert max(sizes) < 1.4 * min(sizes)
+
+
+def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
+    batches = QuadraturePlan.of(mesh, 8.66, tolerance, Quadrature(method)).batches(1 << 22)
+    return sum(len(batch.weights) for batch in batches) / len(mesh.triangles)
+
+
+def test_small_triangles_get_few_points() -> None:
+    fine = icosphere(6)
+    assert points_per_triangle("auto", fine, 1e-9) <= 15
+    assert points_per_triangle("auto", fine, 1e-4) <= 6
+    assert points_per_triangle("auto", fine, 1e-2) == 1.5
+    assert points_per_triangle("auto", fine, 0.2) == pytest.approx(0.5, abs=1e-4)
+    assert points_per_triangle("gauss8", fine, 1e-9) == 64
+
+
+@pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
+@pytest.mark.parametrize("method", ["auto", 7])
+def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
+    plan = QuadraturePlan.of(surface, 8.66, 1e-2, Quadrature(method))
+    count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
+    assert plan.size.expected == pytest.approx(count, rel=0.05)
+    assert count <= plan.size.largest
+
+
+def test_a_closed_form_has_no_points() -> None:
+    plan = QuadraturePlan.of(Sphere(), 8.66, 1e-9)
+    assert (plan.size, plan.lowest_degree, list(plan.batches(1 << 20))) == ((0.0, 0), 0, [])
+
+
+def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> None:
+    with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised .*, found str"):
+        QuadraturePlan.of("torus.ply", 8.66, 1e-9)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"must be a Mesh, .*, found str"):
+        fourier_transform("torus.ply", Lattice(1.0, 4))  # type: ignore[arg-type]
+
+
+def test_the_rules_of_a_field_are_chosen_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, lattice = icosphere(4), Lattice(5.0, 32)
+    calls: list[int] = []
+    choose = RuleAssignment.of
+
+    def counted(*arguments: Any) -> RuleAssignment:
+        calls.append(1)
+        return choose(*arguments)
+
+    monkeypatch.setattr(RuleAssignment, "of", counted)
+    # Little memory: the points are counted, then made, and the probe asks for the lowest degree.
+    compute_field(mesh, lattice, TransformSettings(), [-2.0], Execution(allowed_bytes=1.2e7))
+    assert len(calls) == 1
+
+
+def test_a_plan_holds_two_bytes_for_each_triangle(monkeypatch: pytest.MonkeyPatch) -> None:
+    sphere = icosphere(5)
+    mesh = Mesh(sphere.vertices * np.where(sphere.vertices[:, 2:] > 0.2, 1.0, 0.02), sphere.triangles)
+    whole = RuleAssignment.of(mesh, 8.66, 1e-9, Quadrature())
+    monkeypatch.setattr(meshes, "_TRIANGLES", 1000)
+    assignment = RuleAssignment.of(mesh, 8.66, 1e-9, Quadrature())
+    assert assignment.uses == whole.uses
+    assert assignment.codes is not None
+    assert whole.codes is not None
+    assert np.array_equal(assignment.codes, whole.codes)
+    assert len(assignment.uses) > 2
+    assert assignment.codes.nbytes == 2 * len(mesh.triangles)
+    members = [batch.members for batch in assignment.batches()]
+    assert np.array_equal(np.sort(np.concatenate(members)), np.arange(len(mesh.triangles)))
+    assert [len(chosen) for chosen in members] == [use.count for use in assignment.uses]
