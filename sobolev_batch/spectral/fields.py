@@ -18,7 +18,7 @@ from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.shells import check_orders
+from sobolev_batch.spectral.shells import SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -185,7 +185,7 @@ def field_for(
             threads=threads,
             memory=memory,
         )
-        excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
+        excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, goal.orders)) / goal.norms))
         if excess <= 1:
             break
         goal = goal.tightened(2 * excess)

@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.errors.budget import Sums, truncated
+from sobolev_batch.spectral.errors.budget import Sums, Support, truncated
 from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -74,7 +75,7 @@ def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> Non
     assert first.probe.shells == again.probe.shells
     other = Quality.from_json(fourier_transform(icosphere(1), lattice).attrs["quality"])
     assert other.probe.shells != first.probe.shells
-    assert (first.probe.norms(lattice, [-1.3, -7.7]) > 0).all()
+    assert (first.probe.norms(SobolevWeights(lattice, (-1.3, -7.7))) > 0).all()
 
 
 def test_fields_of_unknown_origin_have_numbers_without_errors() -> None:
@@ -95,6 +96,7 @@ def test_truncation_only_adds() -> None:
 def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
     lattice = Lattice(4.0, 16)
     sums = Sums(np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
-    bound = truncated(sums, lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
-    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    weights, support = SobolevWeights(lattice, (-2.0, -0.6)), Support(np.ones(1), np.full(13, 2.0))
+    bound = truncated(sums, weights, support)
+    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), weights, support)
     assert bound == pytest.approx(flat, rel=0.3)

@@ -20,7 +20,7 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.shells import shell_sums, shell_weights
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -123,4 +123,6 @@ def test_shell_sums_of_blocks_add_up() -> None:
     parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
     whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
     assert np.allclose(parts, whole, rtol=1e-13, atol=0)
-    assert shell_weights(LATTICE, [-2.0]) @ whole == pytest.approx(norm(field, -2)["norm"].item() ** 2, rel=1e-14)
+    assert SobolevWeights(LATTICE, (-2.0,)).per_shell @ whole == pytest.approx(
+        norm(field, -2)["norm"].item() ** 2, rel=1e-14
+    )
