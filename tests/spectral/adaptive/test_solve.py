@@ -26,19 +26,19 @@ from tests.support.shapes import CENTRED_BOX as BOX
 def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: float) -> None:
     a, b = Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.7, (-0.2, 0.1, 0.0))
     exact = distance(a, b, order)["distance"].item()
-    found = distance(a, b, order, rtol=rtol)
-    assert found["within"].item()
-    assert abs(found["distance"].item() - exact) <= found["error"].item() <= rtol * found["distance"].item()
+    dataset = distance(a, b, order, rtol=rtol)
+    assert dataset["within"].item()
+    assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= rtol * dataset["distance"].item()
 
 
 def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
-    found = distance(icosphere(6), Sphere(), -10.0, rtol=1e-5)
-    relative = found["distance"].item() / norm(Sphere(), -10.0)["norm"].item()
+    dataset = distance(icosphere(6), Sphere(), -10.0, rtol=1e-5)
+    relative = dataset["distance"].item() / norm(Sphere(), -10.0)["norm"].item()
     assert relative == pytest.approx(7.383836e-05, rel=1e-5)
     # Far fewer samples and points than the paper's 129³ and 64 a triangle.
-    assert found.attrs["M"] <= 48
-    assert found.attrs["points"][0] <= 6 * 81_920
-    assert found.attrs["rtol"] == 1e-5
+    assert dataset.attrs["M"] <= 48
+    assert dataset.attrs["points"][0] <= 6 * 81_920
+    assert dataset.attrs["rtol"] == 1e-5
 
 
 def test_several_orders_share_what_the_most_demanding_needs() -> None:
@@ -54,8 +54,8 @@ def test_several_orders_share_what_the_most_demanding_needs() -> None:
 
 def test_norms_too() -> None:
     exact = norm(Sphere(0.5), -4.0)["norm"].item()
-    found = norm(Sphere(0.5), -4.0, rtol=1e-5)
-    assert abs(found["norm"].item() - exact) <= found["error"].item() <= 1e-5 * exact
+    dataset = norm(Sphere(0.5), -4.0, rtol=1e-5)
+    assert abs(dataset["norm"].item() - exact) <= dataset["error"].item() <= 1e-5 * exact
     assert norm(icosphere(2), -4.0, rtol=1e-4)["within"].item()
 
 
@@ -78,8 +78,8 @@ def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
 
 
 def test_equal_surfaces_have_a_distance_below_rounding() -> None:
-    found = distance(BOX, Mesh(BOX.vertices, BOX.triangles), -3.0, rtol=1e-3)
-    assert found["distance"].item() <= found["error"].item()
+    dataset = distance(BOX, Mesh(BOX.vertices, BOX.triangles), -3.0, rtol=1e-3)
+    assert dataset["distance"].item() <= dataset["error"].item()
 
 
 def test_refuses_what_has_no_meaning() -> None:
@@ -122,9 +122,9 @@ def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
 
 def test_a_larger_pilot_looks_before_an_accuracy_is_refused() -> None:
     # The first pilot, up to some 8 cycles, sees the distance of near meshes still growing.
-    found = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
-    assert found["within"].item()
-    assert found.attrs["M"] > 64
+    dataset = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
+    assert dataset["within"].item()
+    assert dataset.attrs["M"] > 64
 
 
 def test_what_lies_below_rounding_is_refused() -> None:
@@ -137,8 +137,8 @@ def test_what_lies_below_rounding_is_refused() -> None:
 @pytest.mark.parametrize("order", [-40.0, -100.0])
 def test_very_negative_orders(order: float) -> None:
     exact = distance(Sphere(), Sphere(0.9), order)["distance"].item()
-    found = distance(Sphere(), Sphere(0.9), order, rtol=1e-4)
-    assert abs(found["distance"].item() - exact) <= found["error"].item() <= 1e-4 * exact
+    dataset = distance(Sphere(), Sphere(0.9), order, rtol=1e-4)
+    assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= 1e-4 * exact
     with pytest.raises(OrderError, match="orders go down to -100"):
         distance(Sphere(), Sphere(0.9), [order, -1e6], rtol=1e-4)
 

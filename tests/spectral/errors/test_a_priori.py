@@ -44,11 +44,11 @@ def test_settled_fields_keep_their_goal_and_are_not_wasteful(name: str, order: f
     for relative in (1e-2, 1e-4, 1e-6, 1e-8):
         target = ErrorTarget((order,), (relative * scale,))
         settings = choose_settings(mesh, LATTICE, target, TransformSettings())
-        made = transform_block(mesh, LATTICE, LATTICE.half, settings)
-        error = norm(exact.copy(data=made.values - exact.values), order)["norm"].item()
+        transformed = transform_block(mesh, LATTICE, LATTICE.half, settings)
+        error = norm(exact.copy(data=transformed.values - exact.values), order)["norm"].item()
         # The forecast is no bound: the probe says what came of it, and whoever needs it tightens.
         assert error < 4 * target.norms[0]
-        points.append(made.points)
+        points.append(transformed.points)
     assert points == sorted(points)
     careful = transform_block(mesh, LATTICE, LATTICE.half, TransformSettings(1e-8)).points
     assert points[-1] <= careful
@@ -70,8 +70,8 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
     exact = fourier_transform(mesh, lattice, 1e-13)
     for tolerance in (0.2, 1e-2, 1e-3):
         settings = TransformSettings(1e-13, tolerance=tolerance)
-        made = transform_block(mesh, lattice, lattice.half, settings)
-        true = norm(exact.copy(data=made.values - exact.values), orders)["norm"].values
+        transformed = transform_block(mesh, lattice, lattice.half, settings)
+        true = norm(exact.copy(data=transformed.values - exact.values), orders)["norm"].values
         forecast = SizeHistogram.of(mesh).quadrature_error(lattice, orders, tolerance)
         assert (forecast > 0.5 * true).all()
         assert (forecast < 15 * true).all()

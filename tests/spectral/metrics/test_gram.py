@@ -27,15 +27,15 @@ def test_blocks_of_products_give_every_distance() -> None:
         part = np.stack([(f - center).values[LATTICE.place(block)].ravel()[arrangement.order] for f in fields])
         parts.append(arrangement.products(part, part))
         own.append(arrangement.squares(part))
-    found, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))
+    sums, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))
     for i in range(4):
         for j in range(i):
             expected = distance(fields[i], fields[j], ORDERS)["distance"].values
-            assert np.sqrt(found.squares.sum(axis=1)[:, i, j]) == pytest.approx(expected, rel=1e-10)
+            assert np.sqrt(sums.squares.sum(axis=1)[:, i, j]) == pytest.approx(expected, rel=1e-10)
             shells = shell_sums((fields[i] - fields[j]).values, None, LATTICE, LATTICE.half)
             direct = sums_of_shells(shells, WEIGHTS)
-            assert found.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
-            assert found.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
+            assert sums.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
+            assert sums.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
     assert not cancelled[~np.eye(4, dtype=bool)].any()
     assert cancelled.diagonal().all()
 
@@ -81,13 +81,13 @@ def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
     arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
     pair = np.stack([one[arrangement.order], twin[arrangement.order]])
     squares = arrangement.squares(pair)
-    found, _ = differences(arrangement.products(pair, pair), squares, squares)
+    sums, _ = differences(arrangement.products(pair, pair), squares, squares)
     expected = arrangement.squares((twin - one)[arrangement.order][None])
-    assert found.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
+    assert sums.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
 
 
 def single(value: float, *shape: int) -> Sums:
-    """One order, all of the square in the first residue."""
+    """Return sums of one order with all of the square in the first residue."""
     squares = np.zeros((1, 4, *shape))
     squares[0, 0] = value
     return Sums(squares, np.zeros((2, *shape)))
@@ -96,6 +96,6 @@ def single(value: float, *shape: int) -> Sums:
 def test_near_twins_are_reported() -> None:
     _, cancelled = differences(single(4.0 - 1e-7, 1, 1), single(4.0, 1), single(4.0, 1))
     assert cancelled[0, 0]
-    found, cancelled = differences(single(3.9, 1, 1), single(4.0, 1), single(4.0, 1))
+    sums, cancelled = differences(single(3.9, 1, 1), single(4.0, 1), single(4.0, 1))
     assert not cancelled[0, 0]
-    assert found.squares.sum() == pytest.approx(0.2)
+    assert sums.squares.sum() == pytest.approx(0.2)
