@@ -73,13 +73,14 @@ class Problem:
         return cls(surfaces, orders, accuracy, Support(area, extent.widths, extent.reach), label, threads)
 
     @property
-    def rounding(self) -> float:
-        """Smallest norm that can be told from zero."""
-        return _ROUNDING * float(self.support.areas)
+    def area(self) -> float:
+        """Area of the surfaces together."""
+        return float(self.support.areas)
 
-    def error_target(self, values: Reals, accuracy: Accuracy) -> ErrorTarget:
-        """Return the target of all fields together for an accuracy of norms or distances (orders,)."""
-        return error_target(values, self.orders, accuracy, float(self.support.areas))
+    @property
+    def rounding(self) -> float:
+        """Smallest norm that differs from zero by more than rounding."""
+        return _ROUNDING * self.area
 
     def samples(self, lattice: Lattice) -> Samples:
         """Return samples of all surfaces at the same frequencies."""
@@ -175,7 +176,7 @@ def solve(problem: Problem) -> Solution:
     """Compute a norm or a distance to an accuracy.
 
     Returns:
-        The first of a few rounds that meets the accuracy, or the last.
+        The solution of the first of a few rounds that meets the accuracy, or of the last.
 
     Raises:
         AccuracyError: A pilot shows that the accuracy cannot be met within the memory.
@@ -186,7 +187,7 @@ def solve(problem: Problem) -> Solution:
         values = before.estimate.values if before else _ESTIMATE_CAUTION * estimate(samples, problem.orders)
         problem.require_above_rounding(values)
         accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
-        target = problem.error_target(values, accuracy).tightened(inexact)
+        target = error_target(values, problem.orders, accuracy, problem.area).tightened(inexact)
         return target, problem.dtype(lattice, target)
 
     for solution in islice(_solutions(problem, plan), _ROUNDS):
@@ -205,7 +206,9 @@ def run_pilot(problem: Problem) -> Pilot:
 
     def plan(samples: Samples, lattice: Lattice, before: Solution | None, is_pilot: bool) -> _Round:
         values = estimate(samples, problem.orders)
-        return problem.error_target(values, _of_pilot(problem.accuracy)).tightened(_PAIR), "complex128"
+        return error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(
+            _PAIR
+        ), "complex128"
 
     for solution in _solutions(problem, plan):
         values = solution.estimate.values
@@ -213,7 +216,7 @@ def run_pilot(problem: Problem) -> Pilot:
         needed, is_pilot = _next_lattice(problem, solution)
         if not is_pilot:
             break
-    target = problem.error_target(values, problem.accuracy).tightened(_PAIR)
+    target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
     return Pilot(values, needed, problem.dtype(needed, target) == "complex64")
 
 

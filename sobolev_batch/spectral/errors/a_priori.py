@@ -188,7 +188,8 @@ def _interpolated_errors(rule: TriangleRule, phases: Reals) -> tuple[Reals, Real
 
 
 def _radii(lattice: Lattice) -> Reals:
-    return (np.arange(_RADII) + 0.5) / _RADII * _BALL * lattice.xi_max
+    radii: Reals = (np.arange(_RADII) + 0.5) / _RADII * _BALL * lattice.xi_max
+    return radii
 
 
 def _weight_masses(lattice: Lattice, orders: Sequence[float]) -> Reals:

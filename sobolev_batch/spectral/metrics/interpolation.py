@@ -32,53 +32,6 @@ _GATHERED = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """Interpolation along one axis of the lattice.
-
-    Attributes:
-        lattice: Lattice of the field.
-        center: Centre of the box along the axis, in units of length.
-        reach: Half the side of the box.
-        width: Number of neighbours.
-    """
-
-    lattice: Lattice
-    center: float
-    reach: float
-    width: int
-
-    @classmethod
-    def of(cls, lattice: Lattice, lowest: float, highest: float) -> _Axis:
-        """Return the axis of a box from a lowest to a highest coordinate."""
-        return cls(lattice, (lowest + highest) / 2, (highest - lowest) / 2, min(_WIDTH, lattice.M + 1))
-
-    def neighbours(self, frequencies: Reals, lowest: int) -> _Neighbours:
-        """Return the neighbours of frequencies (n,), in cycles per unit length, of samples from k = ``lowest`` on."""
-        positions = frequencies / self.lattice.spacing
-        first = np.floor(positions).astype(np.int64) - (self.width // 2 - 1)
-        first = np.clip(first, lowest, self.lattice.M // 2 + 1 - self.width)
-        centred, errors = self._fitted(positions - first)
-        # A box off the origin turns the phase of the samples.
-        indices = first[:, None] + np.arange(self.width)
-        turns = np.exp(2j * np.pi * self.center * self.lattice.spacing * (indices - positions[:, None]))
-        return _Neighbours(indices - lowest, centred * turns, errors, np.abs(centred).sum(axis=1))
-
-    def _fitted(self, positions: Reals) -> tuple[Reals, Reals]:
-        """Return weights (n, width) for positions counted from the first neighbour, and their largest error."""
-        nodes, masses = np.polynomial.legendre.leggauss(_FITTED)
-        angles = 2 * np.pi * self.lattice.spacing * self.reach * nodes
-        rows = np.outer(angles, np.arange(self.width) - self.width / 2)
-        targets = np.outer(angles, positions - self.width / 2)
-        matrix, wanted = (np.concatenate([np.cos(phases), np.sin(phases)]) for phases in (rows, targets))
-        scales = np.tile(np.sqrt(masses / 2), 2)[:, None]
-        left, singular, right = np.linalg.svd(scales * matrix, full_matrices=False)
-        damped = (singular / (singular**2 + _NOISE**2))[:, None] * (left.T @ (scales * wanted))
-        weights = right.T @ damped
-        errors = (matrix @ weights - wanted).reshape(2, _FITTED, -1)
-        return np.asarray(weights.T), np.asarray(np.hypot(errors[0], errors[1]).max(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
 class _Neighbours:
     """Neighbours of frequencies along one axis.
 
@@ -93,6 +46,20 @@ class _Neighbours:
     weights: Complexes
     errors: Reals
     moduli: Reals
+
+    @classmethod
+    def of(cls, lattice: Lattice, bounds: tuple[float, float], frequencies: Reals, lowest: int) -> _Neighbours:
+        """Return the neighbours of frequencies (n,) among samples from k = ``lowest`` on, for a box with bounds."""
+        width = min(_WIDTH, lattice.M + 1)
+        center, reach = (bounds[0] + bounds[1]) / 2, (bounds[1] - bounds[0]) / 2
+        positions = frequencies / lattice.spacing
+        first = np.floor(positions).astype(np.int64) - (width // 2 - 1)
+        first = np.clip(first, lowest, lattice.M // 2 + 1 - width)
+        centred, errors = _fitted_weights(2 * np.pi * lattice.spacing * reach, positions - first, width)
+        # A box off the origin turns the phase of the samples.
+        indices = first[:, None] + np.arange(width)
+        turns = np.exp(2j * np.pi * center * lattice.spacing * (indices - positions[:, None]))
+        return cls(indices - lowest, centred * turns, errors, np.abs(centred).sum(axis=1))
 
 
 def interpolate(field: xr.DataArray, frequencies: ArrayLike, *, reach: float | None = None) -> xr.DataArray:
@@ -127,13 +94,16 @@ def interpolate(field: xr.DataArray, frequencies: ArrayLike, *, reach: float | N
     """
     lattice = Lattice.of(field_of(field, None, ()))
     wanted = _frequencies(frequencies, lattice)
-    axes = [_Axis.of(lattice, *bounds) for bounds in _box(field, lattice, reach)]
+    box = _box(field, lattice, reach)
     # μ is real: at -ξ the field is the conjugate of that at ξ.
     mirrored = wanted[:, 2] < 0
     upper = np.where(mirrored[:, None], -wanted, wanted)
-    samples = _extended(field, axes[2].width)
+    samples = _extended(field, min(_WIDTH, lattice.M + 1))
     origin = lattice.M // 2, lattice.M // 2, samples.shape[2] - lattice.M // 2 - 1
-    near = [axis.neighbours(column, -count) for axis, column, count in zip(axes, upper.T, origin, strict=True)]
+    near = [
+        _Neighbours.of(lattice, bounds, column, -index)
+        for bounds, column, index in zip(box, upper.T, origin, strict=True)
+    ]
     values = _weighted_sums(samples, near)
     # Each exponential of the measure is replaced by a product of three, each with its error.
     error = np.expm1(np.log1p(np.stack([one.errors for one in near])).sum(axis=0))
@@ -160,6 +130,26 @@ def _weighted_sums(samples: Complexes, near: list[_Neighbours]) -> Complexes:
         along = np.einsum("nijk,nk->nij", gathered, near[2].weights[batch])
         values[batch] = np.einsum("nij,nj,ni->n", along, near[1].weights[batch], near[0].weights[batch])
     return values
+
+
+def _fitted_weights(phase: float, positions: Reals, width: int) -> tuple[Reals, Reals]:
+    """Return weights (n, width) for positions counted from the first neighbour, and their largest error.
+
+    Args:
+        phase: Phase of the exponentials at the end of the box, per sample.
+        positions: Positions of the frequencies (n,), in samples.
+        width: Number of neighbours.
+    """
+    nodes, masses = np.polynomial.legendre.leggauss(_FITTED)
+    rows = np.outer(phase * nodes, np.arange(width) - width / 2)
+    targets = np.outer(phase * nodes, positions - width / 2)
+    matrix, wanted = (np.concatenate([np.cos(phases), np.sin(phases)]) for phases in (rows, targets))
+    scales = np.tile(np.sqrt(masses / 2), 2)[:, None]
+    left, singular, right = np.linalg.svd(scales * matrix, full_matrices=False)
+    damped = (singular / (singular**2 + _NOISE**2))[:, None] * (left.T @ (scales * wanted))
+    weights = right.T @ damped
+    errors = (matrix @ weights - wanted).reshape(2, _FITTED, -1)
+    return np.asarray(weights.T), np.asarray(np.hypot(errors[0], errors[1]).max(axis=0))
 
 
 def full_lattice(field: xr.DataArray) -> xr.DataArray:
