@@ -22,7 +22,7 @@ from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
-from sobolev_batch.spectral.shells import shell_weights
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 
@@ -231,5 +231,5 @@ def _weights(lattice: sb.Lattice, orders: Sequence[float]) -> Iterator[Reals]:
     """For each order what a real or imaginary part counts for in the squared norm (2 · samples,)."""
     trapezoid = lattice.trapezoid_weights(lattice.half).ravel()
     shells = lattice.shells(lattice.half).ravel()
-    for by_shell in shell_weights(lattice, orders):
+    for by_shell in SobolevWeights(lattice, tuple(orders)).per_shell:
         yield np.repeat(trapezoid * by_shell[shells], 2)

@@ -14,7 +14,7 @@ from benchmarks.paper import Complexes, faster_upsampling, relative_distance, wh
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.errors.a_priori import Goal, settle
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
@@ -48,7 +48,7 @@ class Case:
     dtype: ComplexDtype
     threads: int
     upsampling: float
-    goal: Goal
+    goal: ErrorTarget
 
     @classmethod
     @cache
@@ -64,7 +64,7 @@ class Case:
 
     def ours(self, mesh: sb.Mesh) -> Complexes:
         """The package's transform, on half the lattice."""
-        settings = settle(mesh, self.lattice, self.goal, TransformSettings(dtype=self.dtype))
+        settings = choose_settings(mesh, self.lattice, self.goal, TransformSettings(dtype=self.dtype))
         same_eps = replace(settings, eps=_EPS[self.dtype])
         return transform_block(mesh, self.lattice, self.lattice.half, same_eps, Execution(threads=self.threads)).values
 
@@ -92,15 +92,15 @@ class Case:
         return ours, relative_distance(self.papers(self.mesh), self.lattice, ORDER)
 
 
-def goal_of_the_paper(mesh: sb.Mesh) -> Goal:
+def goal_of_the_paper(mesh: sb.Mesh) -> ErrorTarget:
     """The error of a field that keeps the digits of its mesh's distance to the unit sphere."""
     distance = sb.distance(mesh, sb.Sphere(), ORDER, rtol=1e-2)["distance"].item()
-    return Goal((ORDER,), (_FIELD_ERROR * distance,))
+    return ErrorTarget((ORDER,), (_FIELD_ERROR * distance,))
 
 
 def settings_of_the_paper(mesh: sb.Mesh, lattice: sb.Lattice, dtype: ComplexDtype) -> TransformSettings:
     """The settings that items 1 and 3 arrive at for a mesh."""
-    settings = settle(mesh, lattice, goal_of_the_paper(mesh), TransformSettings(dtype=dtype))
+    settings = choose_settings(mesh, lattice, goal_of_the_paper(mesh), TransformSettings(dtype=dtype))
     return replace(settings, eps=_EPS[dtype])
 
 

@@ -30,7 +30,8 @@ def byte_count(memory: float | str) -> int:
     (4000000000, 838860800, 2000000000)
     """
     try:
-        count = int(_BYTE_SIZE.validate_python(memory))
+        # Pydantic refuses a float that is no whole number.
+        count = int(_BYTE_SIZE.validate_python(int(memory) if isinstance(memory, float) else memory))
     except (ValidationError, ValueError, OverflowError):
         count = 0
     if count <= 0 or isinstance(memory, bool):

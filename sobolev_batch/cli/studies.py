@@ -129,7 +129,7 @@ def _plan_lines(plan: Plan, place: Location, crew: Workers) -> Iterator[tuple[st
     )
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
     if study.accuracy is not None:
-        allowed = f"{_size(study.accuracy.memory)} for a transform, M <= {study.accuracy.largest_intervals}"
+        allowed = f"{_size(study.accuracy.allowed_bytes)} for a transform, M <= {study.accuracy.largest_intervals}"
         yield "accuracy", f"rtol {study.accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
         for reason in plan.choice.reasons:
             yield "chosen", reason

@@ -13,13 +13,13 @@ import xarray as xr
 from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
-from sobolev_batch.spectral.errors.a_priori import Goal, settle
+from sobolev_batch.spectral.errors.a_priori import Goal, choose_settings
 from sobolev_batch.spectral.errors.probe import Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.shells import Orders, check_orders
+from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.sphere import Sphere
@@ -180,9 +180,9 @@ def field_for(
     if isinstance(surface, Sphere):
         return compute_field(surface, lattice, settings, goal.orders, sample=sample)
     for _ in range(_ATTEMPTS):
-        settled = settle(surface, lattice, goal, settings)
+        settled = choose_settings(surface, lattice, goal, settings)
         field = compute_field(surface, lattice, settled, goal.orders, execution, sample=sample)
-        excess = float(np.max(field.quality.probe.norms(lattice, goal.orders) / goal.norms))
+        excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, goal.orders)) / goal.norms))
         if excess <= 1:
             break
         goal = goal.tightened(2 * excess)

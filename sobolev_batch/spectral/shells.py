@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,15 +18,36 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
 _LOWEST_ORDER = -100.0
-# Samples weighed at a time.
-_BLOCK_SAMPLES = 1 << 20
+
+
+@dataclass(frozen=True)
+class SobolevWeights:
+    """Weights (1 + |ξ|²)^s of one or several orders on a lattice.
+
+    Attributes:
+        lattice: Lattice of ξ, in cycles per unit length.
+        orders: Orders s.
+    """
+
+    lattice: Lattice
+    orders: tuple[float, ...]
+
+    @cached_property
+    def per_shell(self) -> Reals:
+        """Weight of each shell |k|² for each order, float64 (orders, lattice.shell_count)."""
+        squares = 1 + self.lattice.spacing**2 * np.arange(self.lattice.shell_count, dtype=np.float64)
+        return np.stack([squares**s for s in self.orders])
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tasks carry these weights: it is cheaper to compute them again than to send them.
+        return {"lattice": self.lattice, "orders": self.orders}
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:
-    """The orders as a tuple of floats.
+    """Return one or several orders as a tuple of floats.
 
     Raises:
-        OrderError: none at all, or one that is not between -100 and -1/2.
+        OrderError: No order is given, or one does not lie between -100 and -1/2.
     """
     orders = tuple(float(s) for s in np.atleast_1d(np.asarray(order, dtype=np.float64)))
     if not orders:
@@ -40,17 +63,17 @@ def check_orders(order: Orders) -> tuple[float, ...]:
 def shell_sums(
     values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block
 ) -> Reals:
-    """Trapezoidal sums of Re(a conj b) over each shell of one block of the half lattice.
+    """Sum Re(a conj b) by the trapezoidal rule over each shell of one block of the half lattice.
 
     Args:
-        values: a, complex (..., *block.shape).
-        others: b, likewise; None stands for a itself.
-        lattice: where the values lie.
-        block: which part of it they are.
+        values: Field a, complex (..., *block.shape).
+        others: Field b, likewise. None stands for a itself.
+        lattice: Lattice of the fields.
+        block: Block that the values fill.
 
     Returns:
-        float64 (..., lattice.shell_count): indexed by |k|². The sums of all blocks add up to those of
-        the whole lattice, conjugate half included. NaN anywhere makes its shells NaN.
+        float64 (..., lattice.shell_count), indexed by |k|². The sums of all blocks add up to those of
+        the whole lattice, conjugate half included. A NaN makes the sum of its shell NaN.
     """
     # The type that counting needs, and the weights, once for all fields.
     shells = lattice.shells(block).ravel().astype(np.intp)
@@ -66,16 +89,13 @@ def shell_sums(
     return sums
 
 
-def shell_weights(lattice: Lattice, orders: Sequence[float]) -> Reals:
-    """(1 + h²|k|²)^s for each order and each shell, float64 (orders, lattice.shell_count)."""
-    squares = 1 + lattice.spacing**2 * np.arange(lattice.shell_count, dtype=np.float64)
-    return np.stack([squares**s for s in orders])
-
-
+@lru_cache(maxsize=16)
 def shell_volumes(lattice: Lattice) -> Reals:
-    """The trapezoidal weights of each shell together, float64 (lattice.shell_count,): what a field of ones sums to."""
+    """Return the sum of the trapezoidal weights of each shell, float64 (lattice.shell_count,)."""
+    x, y, z = lattice.axis_weights(lattice.half)
+    squares = lattice.half.indices(0) ** 2
+    plane = np.bincount((squares[:, None] + squares).ravel(), weights=np.outer(x, y).ravel())
     volumes = np.zeros(lattice.shell_count)
-    for block in lattice.split(_BLOCK_SAMPLES):
-        weights = lattice.trapezoid_weights(block).ravel()
-        volumes += np.bincount(lattice.shells(block).ravel(), weights=weights, minlength=lattice.shell_count)
+    for k, weight in enumerate(z):
+        volumes[k * k : k * k + len(plane)] += weight * plane
     return volumes

@@ -1,4 +1,4 @@
-"""All of the coverage check: python -m tests.coverage [--seed N] [--cases N]."""
+"""Run the whole coverage check: python -m tests.coverage [--seed N] [--cases N]."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0
 
 
 @click.command()
-@click.option("--seed", default=0, show_default=True, help="Of the random cases.")
-@click.option("--cases", "count", default=400, show_default=True, help="How many, at least.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the random cases.")
+@click.option("--cases", "count", default=400, show_default=True, help="Least number of cases.")
 def main(count: int, seed: int) -> None:
     """Compare reported errors with true ones over random cases; status 1 if they fall short."""
     pairs = list(all_cases(seed, count))
@@ -40,10 +40,10 @@ def main(count: int, seed: int) -> None:
 
 
 def described(verdict: Verdict) -> str:
-    """A verdict in a line that leads back to its case."""
+    """Return a line that identifies a verdict and its case."""
     case = verdict.case
     return (
-        f"{case.kind}, pair {case.place}, order {case.order:g}, {case.setting}: {verdict.value:.8g} ± "
+        f"{case.kind}, pair {case.index}, order {case.order:g}, {case.setting}: {verdict.value:.8g} ± "
         f"{verdict.reported:.2g}, truly {verdict.truth.value:.8g} ± {verdict.truth.uncertainty:.1g}"
     )
 

@@ -27,8 +27,8 @@ _CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 
 
 @dataclass(frozen=True)
-class Given:
-    """A lattice and a way of computing fields that somebody has chosen, well or badly."""
+class ChosenLattice:
+    """A lattice and settings as a user might choose them, well or badly."""
 
     lattice: Lattice
     eps: float
@@ -36,13 +36,13 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """An accuracy relative to the distance; everything else is left to the package."""
+class ChosenAccuracy:
+    """An accuracy relative to the distance; the package chooses everything else."""
 
     rtol: float
 
 
-Setting = Given | Asked
+Setting = ChosenLattice | ChosenAccuracy
 
 
 @dataclass(frozen=True)
@@ -50,44 +50,44 @@ class Case:
     """One distance.
 
     Attributes:
-        kind: of the pair.
-        place: of the pair among all; its cases share it.
-        pair: the two surfaces, within about the unit ball.
-        order: s.
-        setting: how the distance is computed.
+        kind: Kind of the pair.
+        index: Index of the pair, which its cases share.
+        pair: Two surfaces within about the unit ball.
+        order: Order s.
+        setting: Lattice or accuracy of the distance.
     """
 
     kind: str
-    place: int
+    index: int
     pair: Pair
     order: float
     setting: Setting
 
 
-def cases_of(seed: int, place: int) -> list[Case]:
-    """The cases of one random pair, one per order; the same seed and place give the same ones."""
-    rng = np.random.default_rng([seed, place])
-    kind = tuple(KINDS)[place % len(KINDS)]
+def cases_of(seed: int, index: int) -> list[Case]:
+    """Return the cases of one random pair, one per order; the same seed and index give the same ones."""
+    rng = np.random.default_rng([seed, index])
+    kind = tuple(KINDS)[index % len(KINDS)]
     a, b = KINDS[kind](rng)
     pair = (a, b) if rng.random() < 0.5 else (b, a)
-    return [Case(kind, place, pair, order, _setting(rng, pair)) for order in ORDERS]
+    return [Case(kind, index, pair, order, _setting(rng, pair)) for order in ORDERS]
 
 
 def all_cases(seed: int, count: int) -> Iterator[list[Case]]:
-    """At least so many cases, pair by pair."""
-    for place in range(-(-count // len(ORDERS))):
-        yield cases_of(seed, place)
+    """Yield at least ``count`` cases, pair by pair."""
+    for index in range(-(-count // len(ORDERS))):
+        yield cases_of(seed, index)
 
 
 def _setting(rng: np.random.Generator, pair: Pair) -> Setting:
-    """Two spheres without a lattice have a closed form, so they are always given one."""
+    """Return a random setting; two spheres always get a lattice, without which they have a closed form."""
     if rng.random() < 0.5 or all(isinstance(surface, Sphere) for surface in pair):
-        return _given(rng, pair)
-    return Asked(float(10.0 ** rng.uniform(-6, -2)))
+        return _chosen_lattice(rng, pair)
+    return ChosenAccuracy(float(10.0 ** rng.uniform(-6, -2)))
 
 
-def _given(rng: np.random.Generator, pair: Pair) -> Given:
-    """A lattice whose period leaves between a third of a unit and three units of room around the surfaces."""
+def _chosen_lattice(rng: np.random.Generator, pair: Pair) -> ChosenLattice:
+    """Return a lattice whose period leaves a third of a unit to three units around the surfaces."""
     extent = Extent.union([surface.extent for surface in pair])
     reach = float(np.abs([extent.lowest, extent.highest]).max())
     widest = float(extent.widths.max())
@@ -95,11 +95,11 @@ def _given(rng: np.random.Generator, pair: Pair) -> Given:
     period = max(2.1 * reach, widest + rng.uniform(0.3, 3.0))
     lattice = Lattice(float(xi_max), 2 * int(np.ceil(xi_max * period)))
     quadrature: str | int = int(rng.integers(1, 5)) if rng.random() < 0.4 else "auto"
-    return Given(lattice, float(10.0 ** rng.uniform(-9, -4)), quadrature)
+    return ChosenLattice(lattice, float(10.0 ** rng.uniform(-9, -4)), quadrature)
 
 
 def _near(rng: np.random.Generator) -> float:
-    """How far apart near surfaces are, in units of length."""
+    """Return a random distance of near surfaces, in units of length."""
     return float(10.0 ** rng.uniform(-4, -1))
 
 
@@ -130,7 +130,7 @@ def _box(rng: np.random.Generator) -> Mesh:
 
 
 def _changed(rng: np.random.Generator, mesh: Mesh) -> Mesh:
-    """The mesh a little scaled and moved, or sheared."""
+    """Return the mesh a little scaled and moved, or sheared."""
     amount = _near(rng)
     if rng.random() < 0.5:
         return Mesh((1 - amount * rng.random()) * mesh.vertices + amount * _direction(rng), mesh.triangles)
@@ -161,7 +161,7 @@ def _box_and_sphere(rng: np.random.Generator) -> Pair:
 
 
 def _icosphere_and_sphere(rng: np.random.Generator) -> Pair:
-    """An icosphere and the sphere it approximates, or another one."""
+    """Return an icosphere and the sphere that it approximates, or another one."""
     level, sphere = int(rng.integers(0, 5)), _sphere(rng)
     mesh = icosphere(level)
     mesh = Mesh(sphere.radius * mesh.vertices @ _rotation(rng).T + np.asarray(sphere.center), mesh.triangles)
@@ -169,7 +169,7 @@ def _icosphere_and_sphere(rng: np.random.Generator) -> Pair:
 
 
 def _icospheres(rng: np.random.Generator) -> Pair:
-    """Two levels of one sphere, one level twice and nearly at one place, or two spheres' icospheres."""
+    """Return two levels of one sphere, near-duplicates of one level, or icospheres of two spheres."""
     first, second = rng.choice(4, size=2, replace=False)
     sphere, choice = _sphere(rng), rng.random()
     a = _placed(icosphere(int(first)), sphere)
@@ -183,23 +183,23 @@ def _placed(mesh: Mesh, sphere: Sphere) -> Mesh:
 
 
 def _solids(rng: np.random.Generator) -> Pair:
-    """A prism, a torus or a capsule, and itself changed a little, or in fewer triangles."""
+    """Return a prism, a torus or a capsule, and the same changed a little or in fewer triangles."""
     thick, choice = rng.uniform(0.1, 0.3), rng.random()
     sections = int(rng.integers(5, 9) if choice < 0.6 else rng.integers(10, 20))
     counts = (sections, sections - 2)
     if choice < 0.3:
-        made = [trimesh.creation.cylinder(thick, 1.2, count) for count in counts]
+        solids = [trimesh.creation.cylinder(thick, 1.2, count) for count in counts]
     elif choice < 0.8:
-        made = [trimesh.creation.torus(0.6, thick, count, 3 if choice < 0.6 else 8) for count in counts]
+        solids = [trimesh.creation.torus(0.6, thick, count, 3 if choice < 0.6 else 8) for count in counts]
     else:
-        made = [trimesh.creation.capsule(0.8, thick, count=[count, count]) for count in counts]
+        solids = [trimesh.creation.capsule(0.8, thick, count=[count, count]) for count in counts]
     turn = _rotation(rng)
-    first, second = (Mesh((part.vertices - part.centroid) @ turn.T, part.faces) for part in made)
+    first, second = (Mesh((solid.vertices - solid.centroid) @ turn.T, solid.faces) for solid in solids)
     return first, second if rng.random() < 0.5 else _changed(rng, first)
 
 
 def _cortices(rng: np.random.Generator) -> Pair:
-    """The cortical surface in two numbers of triangles, or in one and changed a little."""
+    """Return the cortical surface with two numbers of triangles, or twice with a small change."""
     first, second = rng.choice([100, 150, 200, 400, 1600, 3200], size=2, replace=False)
     a = cortex(int(first))
     return a, cortex(int(second)) if rng.random() < 0.6 else _changed(rng, a)
@@ -211,7 +211,7 @@ def _cortex_and_sphere(rng: np.random.Generator) -> Pair:
 
 @lru_cache
 def cortex(triangles: int) -> Mesh:
-    """The cortical surface in so many triangles, within the unit ball."""
+    """Return the cortical surface with a number of triangles, within the unit ball."""
     (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
     loaded = DecimatedMember("cortex", 0, original, triangles).load()
     mesh = Similarity.to_unit_ball(loaded).apply(loaded)

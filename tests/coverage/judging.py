@@ -1,4 +1,4 @@
-"""Whether a reported error covers the true one, and how much larger it is."""
+"""Comparison of reported errors with true ones."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from sobolev_batch import AccuracyError, distance, fourier_transform
-from tests.coverage.cases import Case, Given
+from tests.coverage.cases import Case, ChosenLattice
 from tests.coverage.truth import Truth, truths
 
-# A case is telling if its true error is so many times what is uncertain about the truth.
+# A case is telling if its true error is at least so many times the uncertainty of the truth.
 _TELLING = 10.0
-# Bytes that the package may plan with, so that hundreds of cases take minutes.
+# Memory for an rtol, so that hundreds of cases take minutes.
 _MEMORY = 500_000_000
-# Beyond this an answer is none.
+# A larger rtol is no answer.
 _LARGEST_RTOL = 0.5
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A distance, the error reported with it, and the truth.
+    """A distance, its reported error, and the truth.
 
-    A true error cannot be known better than the truth: a case is covered if it may be, given the
-    truth's uncertainty, and it is `telling` if its true error is ten times that. Ratios are taken
-    of telling cases alone.
+    The true error is as uncertain as the truth. A case counts as covered if it may be covered within that
+    uncertainty, and as `telling` if its true error is ten times as large. Ratios are those of telling cases.
     """
 
     case: Case
@@ -35,81 +34,80 @@ class Verdict:
 
     @property
     def true_error(self) -> float:
-        """As far as the truth is known."""
+        """Difference of the distance from the truth."""
         return abs(self.value - self.truth.value)
 
     @property
     def covered(self) -> bool:
-        """Whether the true value may lie within the reported error; NaN never covers."""
+        """True if the truth may lie within the reported error; NaN never covers."""
         return self.true_error <= self.reported + self.truth.uncertainty
 
     @property
     def telling(self) -> bool:
-        """Whether the true error is known to a tenth of itself."""
+        """True if the uncertainty is at most a tenth of the true error."""
         return self.true_error > _TELLING * self.truth.uncertainty
 
     @property
     def ratio(self) -> float:
-        """The reported error over the true one."""
+        """Reported error over the true one."""
         return self.reported / self.true_error if self.true_error else np.inf
 
 
 def evaluate(case: Case) -> tuple[float, float] | None:
-    """The distance of a case and its error, as the package reports them.
+    """Return the distance of a case and its error, as the package reports them.
 
-    Where what is asked for is out of reach, one and a half times what is in reach is asked for
-    instead; None where that is no answer either.
+    If the accuracy is out of reach, one and a half times the reachable one is tried. None if that fails too.
     """
     setting = case.setting
-    if isinstance(setting, Given):
+    if isinstance(setting, ChosenLattice):
         a, b = (
             fourier_transform(surface, setting.lattice, setting.eps, quadrature=setting.quadrature, order=[case.order])
             for surface in case.pair
         )
-        found = distance(a, b, case.order)
+        dataset = distance(a, b, case.order)
     else:
         try:
-            found = distance(*case.pair, case.order, rtol=setting.rtol, memory=_MEMORY)
+            dataset = distance(*case.pair, case.order, rtol=setting.rtol, memory=_MEMORY)
         except AccuracyError as refusal:
             reachable = 1.5 * refusal.reachable
             if not reachable <= _LARGEST_RTOL:
                 return None
             try:
-                found = distance(*case.pair, case.order, rtol=reachable, memory=_MEMORY)
+                dataset = distance(*case.pair, case.order, rtol=reachable, memory=_MEMORY)
             except AccuracyError:
                 return None
-    return found["distance"].item(), found["error"].item()
+    return dataset["distance"].item(), dataset["error"].item()
 
 
 def judge(cases: Sequence[Case]) -> list[Verdict]:
-    """The verdicts on the cases of one pair; those that the package refuses have none."""
-    known = truths(*cases[0].pair, [case.order for case in cases])
-    answers = [(case, evaluate(case), truth) for case, truth in zip(cases, known, strict=True)]
+    """Return the verdicts on the cases of one pair, without those that the package refuses."""
+    truths_of_pair = truths(*cases[0].pair, [case.order for case in cases])
+    answers = [(case, evaluate(case), truth) for case, truth in zip(cases, truths_of_pair, strict=True)]
     return [Verdict(case, *answer, truth) for case, answer, truth in answers if answer is not None]
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What many verdicts come to."""
+    """Summary of many verdicts."""
 
     verdicts: tuple[Verdict, ...]
 
     @property
     def covered(self) -> int:
-        """How many are covered."""
+        """Number of covered cases."""
         return sum(verdict.covered for verdict in self.verdicts)
 
     @property
     def ratios(self) -> list[float]:
-        """Of the telling ones."""
+        """Ratios of the telling cases."""
         return [verdict.ratio for verdict in self.verdicts if verdict.telling]
 
     @property
     def median_ratio(self) -> float:
-        """NaN where nothing is telling."""
+        """Median ratio; NaN if no case is telling."""
         return float(np.median(self.ratios)) if self.ratios else float("nan")
 
     @property
     def worst(self) -> Verdict | None:
-        """The uncovered one whose true error exceeds the reported one most."""
+        """Uncovered case whose true error exceeds the reported one most."""
         return min((v for v in self.verdicts if not v.covered), key=lambda v: v.ratio, default=None)

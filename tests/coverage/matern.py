@@ -1,8 +1,8 @@
-"""The Sobolev norm in real space: a Matérn kernel, integrated over spheres and triangles.
+"""Sobolev norms in real space: a Matérn kernel, integrated over spheres and triangles.
 
 With a = -s a whole number of at least 2, ||m||_s² = ∬ K_a(|x-y|) dm dm, where the kernel
 K_a(r) = 2 π^a / Γ(a) · r^(a-3/2) · K_{a-3/2}(2πr) is exp(-2πr) times a polynomial (DLMF 10.49.12).
-Nothing here knows of frequencies, lattices or fields, nor of any rule that the package picks.
+This module uses no frequencies, lattices or fields, and none of the package's rules.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _EDGE_NODES = 16
 
 
 def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
-    """K_a at some distances; `decay` is exp(-2πr), where that is known already."""
+    """Return K_a at some distances; `decay` is exp(-2πr) if that was computed before."""
     z = 2 * np.pi * distances
     decay = np.exp(-z) if decay is None else decay
     first, *rest = _coefficients(power)
@@ -44,12 +44,12 @@ def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
 
 
 def radial_integral(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
-    """∫_r^∞ K_a(t) t dt = a K_{a+1}(r) / (2π²); `decay` as for `kernel`."""
+    """Return ∫_r^∞ K_a(t) t dt = a K_{a+1}(r) / (2π²); `decay` as for `kernel`."""
     return power / (2 * np.pi**2) * kernel(distances, power + 1, decay)
 
 
 def sphere_potential(sphere: Sphere, points: Reals, power: int) -> Reals:
-    """∫ K_a(|x-y|) dσ(y) over a sphere, at points (n, 3)."""
+    """Return ∫ K_a(|x-y|) dσ(y) over a sphere, at points (n, 3)."""
     apart = np.maximum(np.linalg.norm(points - np.asarray(sphere.center), axis=1), 1e-7)
     shorter, longer = np.abs(apart - sphere.radius), apart + sphere.radius
     return np.asarray(
@@ -58,7 +58,7 @@ def sphere_potential(sphere: Sphere, points: Reals, power: int) -> Reals:
 
 
 def double_sum(points: Reals, weights: Reals, powers: Sequence[int]) -> Reals:
-    """Σ w_i w_j K_a(|x_i - x_j|) for each a; points (n, 3), weights (n,)."""
+    """Return Σ w_i w_j K_a(|x_i - x_j|) for each a; points (n, 3), weights (n,)."""
     starts = range(0, len(points), _TILE)
 
     def tile(pair: tuple[int, int]) -> Reals:
@@ -74,14 +74,14 @@ def double_sum(points: Reals, weights: Reals, powers: Sequence[int]) -> Reals:
 
 @dataclass(frozen=True)
 class Sides:
-    """The directed sides of flat faces.
+    """Directed sides of flat faces.
 
     Attributes:
-        starts: (E, 3) the first end of each.
-        tangents: (E, 3) unit vectors along it.
-        lengths: (E,)
-        outwards: (E, 3) unit vectors in the plane of the face, away from it.
-        normals: (E, 3) unit vectors across that plane.
+        starts: First end of each side (E, 3).
+        tangents: Unit vectors along the sides (E, 3).
+        lengths: Lengths of the sides (E,).
+        outwards: Unit vectors in the plane of the face, away from it (E, 3).
+        normals: Unit normals of that plane (E, 3).
     """
 
     starts: Reals
@@ -92,7 +92,7 @@ class Sides:
 
     @classmethod
     def of(cls, mesh: Mesh) -> Sides:
-        """The sides of a mesh's triangles, without those between two triangles of one plane, which cancel."""
+        """Return the sides of a mesh's triangles, without those between two triangles of one plane, which cancel."""
         corners = mesh.vertices[mesh.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -109,7 +109,7 @@ class Sides:
 
 
 def mesh_potentials(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals:
-    """∫ K_a(|x-y|) dy over the faces, at points (n, 3), for each a: (len(powers), n).
+    """Return ∫ K_a(|x-y|) dy over the faces, at points (n, 3), for each a: (len(powers), n).
 
     In polar coordinates around the foot of x on a face's plane, at the height d over it, the radial
     integral is closed, which leaves one over each side: p ∫ [G(d) - G(r)] / (r² - d²) dt, with p the
@@ -140,10 +140,10 @@ def _potentials_of_part(sides: Sides, points: Reals, powers: Sequence[int]) -> R
 
 
 def graded_points(mesh: Mesh, count: int) -> tuple[Reals, Reals]:
-    """Points (n, 3) and weights (n,) on a mesh that gather at the edges and corners of its triangles.
+    """Return points (n, 3) and weights (n,) on a mesh that gather at the edges and corners of its triangles.
 
-    Each triangle is cut into six along its medians; `count` nodes in either direction of each, with
-    a third power towards the corner and the side. Potentials have weak singularities there.
+    Each triangle is split into six along its medians. Each of these gets `count` nodes in either direction,
+    which gather by a third power towards the corner and the side. Potentials have weak singularities there.
     """
     nodes, weights = _gauss(count)
     graded, slopes = nodes**3, 3 * nodes**2 * weights
@@ -164,7 +164,7 @@ _COWPER = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.1099517
 
 
 def divided_points(mesh: Mesh, level: int) -> tuple[Reals, Reals]:
-    """Points (n, 3) and weights (n,) of a rule of degree 4 on a mesh's triangles cut into 4^level."""
+    """Return points (n, 3) and weights (n,) of a rule of degree 4 on a mesh's triangles cut into 4^level."""
     triangles = mesh.vertices[mesh.triangles]
     for _ in range(level):
         triangles = np.concatenate(list(_quarters(triangles)))
@@ -185,14 +185,14 @@ def _quarters(triangles: Reals) -> Iterator[Reals]:
 
 @lru_cache
 def _gauss(count: int) -> tuple[Reals, Reals]:
-    """Gauss nodes and weights on [0, 1]."""
+    """Return Gauss nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 
 
 @lru_cache
 def _coefficients(power: int) -> tuple[float, ...]:
-    """K_a = exp(-z) Σ c_k z^(n-k), z = 2πr, n = a - 2; from the highest power of z to the lowest."""
+    """Return c_k of K_a = exp(-z) Σ c_k z^(n-k), z = 2πr, n = a - 2; from the highest power of z to the lowest."""
     n = power - 2
     scale = 2 * math.pi**power / math.factorial(power - 1) * (2 * math.pi) ** (1.5 - power) * math.sqrt(math.pi / 2)
     return tuple(

@@ -1,4 +1,4 @@
-"""A sample of the coverage check, and checks of what it rests on."""
+"""Sample of the coverage check, and checks of its own foundations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL = Mesh(0.9 * BOX.vertices, BOX.triangles)
 
 @pytest.fixture(scope="module")
 def sample() -> Tally:
-    """The cases of one pair of each kind."""
+    """Verdicts on one pair of each kind."""
     pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
     return Tally(tuple(verdict for cases in all_cases(1, len(KINDS) * len(ORDERS)) for verdict in judge(cases)))
 
@@ -68,10 +68,10 @@ def test_cases_depend_on_the_seed_and_the_place_alone() -> None:
 )
 def test_three_ways_to_the_truth_agree_within_what_they_claim(a: Surface, b: Surface) -> None:
     ways = [way(a, b, ORDERS) for way in (closed_within, summed_in_real_space, on_fine_lattice)]
-    for order, found in zip(ORDERS, zip(*ways, strict=True), strict=True):
-        best = min(found, key=lambda truth: truth.uncertainty)
-        for truth in found:
-            assert abs(truth.value - best.value) <= 3 * truth.uncertainty + best.uncertainty, (order, found)
+    for order, candidates in zip(ORDERS, zip(*ways, strict=True), strict=True):
+        best = min(candidates, key=lambda truth: truth.uncertainty)
+        for truth in candidates:
+            assert abs(truth.value - best.value) <= 3 * truth.uncertainty + best.uncertainty, (order, candidates)
         assert best.uncertainty < 3e-5 * best.value
 
 
@@ -85,14 +85,14 @@ def test_the_kernel_is_the_matern_function_and_its_integral_that_of_the_kernel(p
 
 
 def test_real_space_agrees_with_the_closed_form_of_spheres() -> None:
-    # Icospheres come nearer to spheres by a factor of 4 a level; extrapolated, they are there.
+    # Icospheres come nearer to spheres by a factor of 4 a level; extrapolation leads to them.
     first, second = Sphere(), Sphere(0.5, (0.2, 0.1, 0.0))
-    found = []
+    levels = []
     for level in (0, 1, 2):
         outer = icosphere(level)
         inner = Mesh(0.5 * outer.vertices + np.array(second.center), outer.triangles)
-        found.append([truth.value for truth in summed_in_real_space(outer, inner, ORDERS, 16_000)])
-    coarse, middle, fine = np.array(found)
+        levels.append([truth.value for truth in summed_in_real_space(outer, inner, ORDERS, 16_000)])
+    coarse, middle, fine = np.array(levels)
     near, nearer = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
     exact = [truth.value for truth in truths(first, second, ORDERS)]
     assert np.allclose(nearer + (nearer - near) / 15, exact, rtol=4e-4, atol=0)

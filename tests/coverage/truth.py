@@ -41,64 +41,64 @@ _POINTS_ROUGH, _POINTS_SMOOTH = 40_000, 10_000
 # Lattices far finer than those under test. Surfaces within the unit ball: periods of 5 and 6 keep
 # their images away.
 _FINE_ROUGH, _FINE_SMOOTH = Lattice(16.0, 160), Lattice(10.0, 120)
-# Rounding of sums of some thousand terms, relative to the squared norms.
 # The last change of an extrapolation was seen to be half of its error where levels are few.
 _EXTRAPOLATION_CAUTION = 3.0
+# Rounding of sums of some thousand terms, relative to the squared norms.
 _ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
 class Truth:
-    """An independent value of a distance, and how far from the true one it may be."""
+    """An independent value of a distance, with its uncertainty."""
 
     value: float
     uncertainty: float
 
     @classmethod
     def of_square(cls, square: float, slack: float) -> Truth:
-        """From the squared distance and its uncertainty."""
+        """Return the truth from the squared distance and its uncertainty."""
         value = np.sqrt(max(square, 0.0))
         low, high = np.sqrt(max(square - slack, 0.0)), np.sqrt(max(square + slack, 0.0))
         return cls(float(value), float(max(high - value, value - low)))
 
 
 def truths(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
-    """The distance of two surfaces within about the unit ball, for each of some whole orders."""
+    """Return the distance of two surfaces within about the unit ball for each of some whole orders."""
     meshes = [surface for surface in (a, b) if isinstance(surface, Mesh)]
     if not meshes:
         closed = distance(a, b, orders)
         pairs = zip(closed["distance"].values, closed["error"].values, strict=True)
         return tuple(Truth(float(value), float(error)) for value, error in pairs)
     rough, smooth = ([order for order in orders if (order > _SMOOTH) == side] for side in (True, False))
-    known: dict[float, Truth] = {}
+    by_order: dict[float, Truth] = {}
     for chosen, points in ((rough, _POINTS_ROUGH), (smooth, _POINTS_SMOOTH)):
         if chosen:
-            known |= dict(zip(chosen, _most_certain(a, b, chosen, points), strict=True))
-    return tuple(known[order] for order in orders)
+            by_order |= dict(zip(chosen, _most_certain(a, b, chosen, points), strict=True))
+    return tuple(by_order[order] for order in orders)
 
 
 def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth]:
     triangles = sum(len(surface.triangles) for surface in (a, b) if isinstance(surface, Mesh))
     # An extrapolation needs two levels at least.
     summable = 24 * triangles <= points
-    found = []
+    candidates = []
     if triangles <= _FEW and orders[0] > _SMOOTH:
-        found.append(closed_within(a, b, orders))
-        # Still of use against spheres, whose potential has a kink where they cross a face.
+        candidates.append(closed_within(a, b, orders))
+        # Still useful against spheres, whose potential has a kink where they cross a face.
         points = _POINTS_SMOOTH
     elif not summable or orders[0] > _SMOOTH:
-        found.append(on_fine_lattice(a, b, orders))
+        candidates.append(on_fine_lattice(a, b, orders))
     if summable:
-        found.append(summed_in_real_space(a, b, orders, points))
-    return [min(each, key=lambda truth: truth.uncertainty) for each in zip(*found, strict=True)]
+        candidates.append(summed_in_real_space(a, b, orders, points))
+    return [min(alternatives, key=lambda truth: truth.uncertainty) for alternatives in zip(*candidates, strict=True)]
 
 
 def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
-    """By the potentials of the faces; the uncertainty is the change from one outer rule to a finer one."""
+    """Integrate the potentials of the faces; the uncertainty is the change from one outer rule to a finer one."""
     powers = [round(-order) for order in orders]
     signed = ((a, 1.0), (b, -1.0))
     meshes = [(Sides.of(surface), sign) for surface, sign in signed if isinstance(surface, Mesh)]
-    found = []
+    candidates = []
     for count in _OUTER:
         squares, norms = _spheres_alone(a, b, orders)
         for surface, sign in signed:
@@ -110,8 +110,8 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
             norms = norms + np.abs(potentials) @ weights
             # The mesh against a sphere, and the sphere against the mesh.
             squares = squares + 2 * sign * (_of_spheres(signed, points, powers) @ weights)
-        found.append(squares)
-    coarse, fine = found
+        candidates.append(squares)
+    coarse, fine = candidates
     slack = np.abs(fine - coarse) + _ROUNDING * norms
     return tuple(map(Truth.of_square, fine.tolist(), slack.tolist()))
 
@@ -119,7 +119,7 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
 def summed_in_real_space(
     a: Surface, b: Surface, orders: Sequence[float], most: int = _POINTS_SMOOTH
 ) -> tuple[Truth, ...]:
-    """By double sums over points, extrapolated; the uncertainty is a multiple of what the last extrapolation changed.
+    """Extrapolate double sums over points; the uncertainty is a multiple of the last extrapolation's change.
 
     The kernel of a = -s has the term r^(2a-3), which leaves an error of h^(2a-1) beside the rule's h^6.
     """
@@ -148,9 +148,9 @@ def summed_in_real_space(
 
 
 def on_fine_lattice(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
-    """On a lattice far finer than those under test; the uncertainty is the error reported there.
+    """Compute on a lattice far finer than those under test; the uncertainty is the error reported there.
 
-    Not independent of the way that errors are found, but of how well that works where they are large.
+    This relies on the reported errors, but only where they are small.
     """
     lattice = _FINE_ROUGH if max(orders) > _SMOOTH else _FINE_SMOOTH
     first, second = (fourier_transform(surface, lattice, 1e-13, order=orders) for surface in (a, b))
@@ -160,14 +160,14 @@ def on_fine_lattice(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Tr
 
 
 def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Reals, Reals]:
-    """What spheres add to the squared distance by themselves, and the size of that."""
+    """Return the contribution of the spheres alone to the squared distance, and its size."""
     spheres = [surface for surface in (a, b) if isinstance(surface, Sphere)]
     alone = np.array([sum(sphere_inner_product(sphere, sphere, order) for sphere in spheres) for order in orders])
     return alone, alone
 
 
 def _of_spheres(signed: Sequence[tuple[Surface, float]], points: Reals, powers: Sequence[int]) -> Reals:
-    """The potential of the spheres among the surfaces, with their signs: (len(powers), n)."""
+    """Return the signed potential of the spheres among the surfaces, (len(powers), n)."""
     total = np.zeros((len(powers), len(points)))
     for surface, sign in signed:
         if isinstance(surface, Sphere):

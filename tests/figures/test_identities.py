@@ -1,4 +1,4 @@
-"""What has to add up, on a real surface: the cortex of workflows/cortex.toml, decimated, against itself."""
+"""Identities on a real surface: the cortex of workflows/cortex.toml, decimated, against itself."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytest.importorskip("nilearn", reason="the cortex comes with the extra 'studies'
 
 @pytest.fixture(scope="module")
 def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:
-    """Midpoint rules of the cortex with 1,280 triangles and of the whole one."""
+    """Points of the midpoint rule on the cortex with 1,280 triangles, and on the whole one."""
     study = sb.Study.from_toml(WORKFLOW)
     members = members_of(study)
     whole, coarse = (members[label][1].load() for label in ("reference", "decimated/1280"))
@@ -55,11 +55,11 @@ def test_bands_add_up(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
 
 
 def test_area_and_shape_add_up(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
-    found = sb.proportion(*fields, ORDERS)
-    parts = found["area_part"] ** 2 + found["shape_part"] ** 2
+    dataset = sb.proportion(*fields, ORDERS)
+    parts = dataset["area_part"] ** 2 + dataset["shape_part"] ** 2
     xr.testing.assert_allclose(parts, sb.distance(*fields, ORDERS)["distance"] ** 2, rtol=1e-12)
     # Decimation loses area, and no other change of the whole by a factor explains all of the rest.
-    assert (found["shape_part"] > 0.05 * found["distance"]).all()
+    assert (dataset["shape_part"] > 0.05 * dataset["distance"]).all()
 
 
 def test_the_witness_integrates_to_the_squared_distance(

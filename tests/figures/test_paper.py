@@ -1,4 +1,4 @@
-"""The figures of K. Koga's paper, "Computing weak distance between the 2-sphere and its nonsmooth approximations"."""
+"""Figures of K. Koga's paper, "Computing weak distance between the 2-sphere and its nonsmooth approximations"."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ FIGURE_3B = (
 @pytest.mark.parametrize("intervals", FIGURE_1B)
 def test_figure_1b_trapezoidal_rule_for_the_sphere(intervals: int) -> None:
     exact = norm(Sphere(), [-5.0, -10.0])["norm"].values ** 2
-    found = norm(fourier_transform(Sphere(), Lattice(5.0, intervals)), [-5.0, -10.0])["norm"].values ** 2
-    errors = np.abs(exact - found) / exact
+    computed = norm(fourier_transform(Sphere(), Lattice(5.0, intervals)), [-5.0, -10.0])["norm"].values ** 2
+    errors = np.abs(exact - computed) / exact
     for error, expected in zip(errors, FIGURE_1B[intervals], strict=True):
         # The two smallest are a few roundings of the sum itself.
         assert error == pytest.approx(expected, rel=1e-3, abs=5e-15)

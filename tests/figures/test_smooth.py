@@ -1,4 +1,4 @@
-"""The table of docs/numerics.md: refinements that converge to an ellipsoid and to a torus."""
+"""Table of docs/numerics.md: refinements that converge to an ellipsoid and to a torus."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def test_refinements_converge_with_second_order(
 ) -> None:
     exact = fourier_transform(surface, LATTICE)
     meshes = [mesh(level) for level in range(5)]
-    found = [distance(fourier_transform(part, LATTICE), exact, [-5.0, -10.0]) for part in meshes]
-    distances = np.array([each["distance"].values for each in found])
+    datasets = [distance(fourier_transform(mesh, LATTICE), exact, [-5.0, -10.0]) for mesh in meshes]
+    distances = np.array([dataset["distance"].values for dataset in datasets])
     assert distances[:, 0] == pytest.approx(figures(shape)[:5], rel=5e-3)
-    sizes = np.array([part.edge_lengths.mean() for part in meshes])
+    sizes = np.array([mesh.edge_lengths.mean() for mesh in meshes])
     for column in distances.T:
         assert column[3] / column[4] == pytest.approx(4.0, rel=0.005)
         assert np.polyfit(np.log(sizes[2:]), np.log(column[2:]), 1)[0] == pytest.approx(2.0, abs=0.02)

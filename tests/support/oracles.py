@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import quad
@@ -13,7 +14,7 @@ from sobolev_batch import Lattice
 
 
 def torus_value(R: float, r: float, across: float, along: float) -> float:
-    """The transform at a frequency with these parts across and along the axis: the angle around it is closed."""
+    """Return the transform of a torus at a frequency with components across and along its axis."""
 
     def ring(v: float) -> float:
         radius = R + r * math.cos(v)
@@ -30,7 +31,7 @@ def torus_value(R: float, r: float, across: float, along: float) -> float:
 
 
 def spheroid_value(a: float, c: float, across: float, along: float) -> float:
-    """The transform of an ellipsoid with semi-axes (a, a, c), likewise."""
+    """Return the transform of an ellipsoid with semi-axes (a, a, c), likewise."""
 
     def ring(theta: float) -> float:
         sine, cosine = math.sin(theta), math.cos(theta)
@@ -47,7 +48,7 @@ def spheroid_value(a: float, c: float, across: float, along: float) -> float:
 
 
 def ellipsoid_value_along_c(a: float, b: float, c: float, along: float) -> float:
-    """The transform of an ellipsoid on the axis of c: each section's part is an elliptic integral."""
+    """Return the transform of an ellipsoid on the axis of c: an elliptic integral over each section."""
 
     def section(t: float) -> float:
         first = c**2 * (1 - t * t) * b**2 + (a * b * t) ** 2
@@ -58,15 +59,13 @@ def ellipsoid_value_along_c(a: float, b: float, c: float, along: float) -> float
 
 
 def integral(function: Callable[[float], float], low: float, high: float) -> float:
-    """To 1e-14 of the values of the function."""
-    pieces = 12
-    edges = [low + (high - low) * k / pieces for k in range(pieces + 1)]
-    parts = [quad(function, edges[k], edges[k + 1], epsabs=1e-15, epsrel=1e-13)[0] for k in range(pieces)]
-    return math.fsum(parts)
+    """Integrate a function to 1e-14 of its values."""
+    edges = [low + (high - low) * k / 12 for k in range(13)]
+    return math.fsum(quad(function, start, stop, epsabs=1e-15, epsrel=1e-13)[0] for start, stop in pairwise(edges))
 
 
 def full_lattice_norm(values: np.ndarray, lattice: Lattice, order: float) -> float:
-    """The trapezoidal rule spelt out on the whole cube, conjugate half and all."""
+    """Return the norm by the trapezoidal rule on the whole cube, conjugate half included."""
     mirrored = np.conj(values[::-1, ::-1, :0:-1])
     whole = np.concatenate([mirrored, values], axis=2)
     axis = lattice.axes[0]

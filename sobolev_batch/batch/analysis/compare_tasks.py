@@ -19,7 +19,7 @@ from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.errors import InputError, MeshError, StoreError
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation
-from sobolev_batch.spectral.shells import shell_weights
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -104,11 +104,10 @@ def compare_by_witness(
         evaluation = Evaluation(
             # Others may lie anywhere, beyond the lattice's period too.
             mesh.used_coordinates,
-            lattice,
-            shell_weights(lattice, orders),
+            SobolevWeights(lattice, orders),
             TransformSettings(),
             threads=1,
-            memory=memory,
+            allowed_bytes=memory,
         )
         found = np.zeros((len(orders), len(mesh.used_vertices)))
         for number, block in enumerate(blocks):

@@ -25,6 +25,7 @@ from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made anew.
@@ -109,6 +110,7 @@ def tabulate_fields(
 def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
     """The reducer of a store, with what the records say of its fields."""
     lattice, orders = plan.lattice, plan.study.orders
+    weights = SobolevWeights(lattice, orders)
     qualities = {
         i: Quality.from_json(record.quality)
         for i, record in enumerate(records)
@@ -116,7 +118,7 @@ def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center:
     }
     areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
     for i, quality in qualities.items():
-        areas[i], errors[:, i] = quality.area, quality.probe.norms(lattice, orders)
+        areas[i], errors[:, i] = quality.area, quality.probe.norms(weights)
     extents = [quality.extent for quality in qualities.values()]
     widths = Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS))
     checksums = {i: record.checksums for i, record in enumerate(records) if record is not None}

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, add_sums, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, add_sums, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
-from sobolev_batch.spectral.shells import shell_sums
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -54,6 +55,11 @@ class Reducer:
     errors: Reals
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
+
+    @cached_property
+    def weights(self) -> SobolevWeights:
+        """Weights of the lattice's shells."""
+        return SobolevWeights(self.lattice, self.orders)
 
     def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
         """Rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
@@ -110,7 +116,7 @@ class Reducer:
                     centers = np.broadcast_to(center, values.shape)
                     products[part] += shell_sums(values, centers, self.lattice, block)
         of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
-        norms = self._assess(sums_of_shells(own, self.lattice, self.orders), *of_rows)
+        norms = self._assess(sums_of_shells(own, self.weights), *of_rows)
         if self.center is None:
             unknown = np.full_like(norms.values, np.nan)
             return norms, NormEstimate(*[unknown] * 4), Proportion(*[unknown] * 3)
@@ -118,8 +124,8 @@ class Reducer:
         apart = np.array([row != self.center for row in rows], dtype=np.float64)
         areas = (of_rows[0] + self.areas[self.center]) * apart
         errors = (of_rows[1] + self.errors[:, [self.center]]) * apart
-        distances = self._assess(sums_of_shells(to_center, self.lattice, self.orders), areas, errors)
-        return norms, distances, Proportion.of_shells(to_center, products, of_center, self.lattice, self.orders)
+        distances = self._assess(sums_of_shells(to_center, self.weights), areas, errors)
+        return norms, distances, Proportion.of_shells(to_center, products, of_center, self.weights)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Distances of rows to other rows, over (orders, rows, others).
@@ -148,7 +154,7 @@ class Reducer:
         return self._assess(sums, areas, errors)
 
     def _assess(self, sums: Sums, areas: Reals, errors: Reals) -> NormEstimate:
-        return estimate_norms(sums, self.lattice, self.orders, areas=areas, widths=self.widths, discretisation=errors)
+        return estimate_norms(sums, self.weights, Support(areas, self.widths), errors)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int
@@ -158,7 +164,7 @@ class Reducer:
         Of the first ``shared`` others, which are the rows, only the products on and above the diagonal.
         """
         block = self.blocks[number]
-        arrangement = Arrangement.of(self.lattice, block, self.orders)
+        arrangement = Arrangement.of(self.weights, block)
         center = None if self.center is None else self._read([self.center], number)
 
         def read(wanted: Sequence[int], room: Complexes) -> Complexes:
@@ -197,7 +203,7 @@ class Reducer:
             for number, block in enumerate(self.blocks):
                 a, b = self._read([row, other], number)
                 sums += shell_sums(a - b, None, self.lattice, block)
-        return sums_of_shells(sums, self.lattice, self.orders)
+        return sums_of_shells(sums, self.weights)
 
 
 def _parts(count: int, size: int, start: int = 0) -> Iterator[slice]:

@@ -19,8 +19,8 @@ from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.study import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
-from sobolev_batch.spectral.adaptive.solve import Aim
-from sobolev_batch.spectral.errors.a_priori import settle
+from sobolev_batch.spectral.adaptive.solve import DistanceTarget
+from sobolev_batch.spectral.errors.a_priori import choose_settings
 from sobolev_batch.spectral.errors.probe import join
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import draws_for, probe_block
@@ -61,7 +61,7 @@ class Job:
     lattice: Lattice
     transform: TransformSettings
     orders: tuple[float, ...]
-    aim: Aim | None = None
+    aim: DistanceTarget | None = None
     memory: float | None = None
     backend: Backends = "auto"
     fingerprint: str = ""
@@ -136,7 +136,7 @@ def settings_of(job: Job, surface: Surface) -> TransformSettings:
     """The settings of a field that is computed block by block: as forecast, not measured and mended."""
     if job.aim is None or isinstance(surface, Sphere):
         return job.transform
-    return settle(surface, job.lattice, job.aim.goal(surface), job.transform)
+    return choose_settings(surface, job.lattice, job.aim.error_target(surface), job.transform)
 
 
 def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
@@ -144,7 +144,7 @@ def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
     execution = Execution(backend_of(job.backend), allowed_bytes=job.memory)
     if tuple(blocks) == (job.lattice.half,):
         if job.aim is not None and not isinstance(surface, Sphere):
-            goal = job.aim.goal(surface)
+            goal = job.aim.error_target(surface)
             field = field_for(surface, job.lattice, goal, job.transform, execution)
         else:
             field = compute_field(surface, job.lattice, job.transform, job.orders, execution)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.spectral.adaptive.solve import Pilot, pilot_of
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, lattice_of
+from sobolev_batch.spectral.adaptive.lattice_selection import lattice_of
+from sobolev_batch.spectral.adaptive.solve import Pilot, Problem, run_pilot
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.errors.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -105,7 +106,7 @@ def basis_of(study: Study, similarity: Similarity, reference: Mapping[str, Any])
     if study.accuracy is None:
         return ""
     parts = {
-        "accuracy": [study.accuracy.rtol, study.accuracy.memory],
+        "accuracy": [study.accuracy.rtol, study.accuracy.allowed_bytes],
         "orders": study.orders,
         "dtype": study.dtype,
         "similarity": [similarity.scale, *similarity.origin],
@@ -139,10 +140,10 @@ def choose(
     surfaces = _pilots(members, similarity)
     extent = Extent.union([surface.extent for surface in (reference, *surfaces.values())])
     widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
-    pilots: dict[str, Pilot] = {
-        label: pilot_of(surface, reference, study.orders, accuracy, widths, reach, what=label)
-        for label, surface in surfaces.items()
-    }
+    pilots: dict[str, Pilot] = {}
+    for label, surface in surfaces.items():
+        support = Support(np.array(surface.area + reference.area), widths, reach)
+        pilots[label] = run_pilot(Problem((surface, reference), study.orders, accuracy, support, label))
     if not pilots:
         raise StudyError(
             "no surface of the study's families can be made, so there is nothing to choose a lattice from; "

@@ -12,7 +12,7 @@ from functools import cached_property
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice, basis_of, choose
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
-from sobolev_batch.spectral.adaptive.solve import Aim
+from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -84,12 +84,12 @@ class Plan:
         given = self.study.transform
         return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
 
-    def aim(self, row: Row) -> Aim | None:
+    def aim(self, row: Row) -> DistanceTarget | None:
         """What the field of a row is computed for, where an accuracy is asked for."""
         if self.study.accuracy is None:
             return None
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
-        return Aim(self.study.orders, self.study.accuracy, sample, closest)
+        return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
 
     def on(self, choice: LatticeChoice) -> Plan:
         """The same study with its fields on another lattice."""

@@ -1,36 +1,40 @@
-"""Computing until an accuracy is met: settings from forecasts, results checked, what falls short tightened."""
+"""Norms and distances to an accuracy: predict settings, compute, check the result, tighten where it falls short."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.errors.a_priori import Goal, permits_single
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate, needs_probe
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.shells import shell_sums
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
+Samples = tuple[Sample, ...]
 
 _ROUNDS = 4
-# A distance is first estimated from a few frequencies; it is seldom less than this part of that.
+# A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.
 _ESTIMATE_CAUTION = 0.7
-# The surfaces of a pair have equal parts in what both fields may err.
+# The error of a pair is divided evenly between its two fields.
 _PAIR = 2
-# No field is exact to less than this part of its area. Twins are that close: no relative accuracy is theirs.
+# No field is exact to less than this fraction of its area. Near-duplicates are that close, and have no
+# relative accuracy.
 _ROUNDING = 1e-13
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 _OFF_CENTER = 1e-3
@@ -39,95 +43,232 @@ _PILOT_RTOL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Norms or distances that were computed for an accuracy.
+class Problem:
+    """A norm of a surface, or a distance of two, and the accuracy to compute it to.
 
     Attributes:
-        assessed: the numbers, each (orders,).
-        lattice: the last one used.
-        fields: of the surfaces, on that lattice.
-        sums: of the difference of the fields.
+        surfaces: One surface, or two.
+        orders: Orders s.
+        accuracy: Accuracy of the norm or distance.
+        support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
+        label: Name of the norm or distance in messages.
+        threads: Threads to compute with.
     """
 
-    assessed: NormEstimate
+    surfaces: Sequence[Surface]
+    orders: tuple[float, ...]
+    accuracy: Accuracy
+    support: Support
+    label: str
+    threads: int = 1
+
+    @classmethod
+    def of(
+        cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
+    ) -> Self:
+        """Return the problem for surfaces alone, moved together to the centre of the lattice's period."""
+        surfaces = _centered(surfaces)
+        extent = Extent.union([surface.extent for surface in surfaces])
+        area = np.array(sum(surface.area for surface in surfaces))
+        return cls(surfaces, orders, accuracy, Support(area, extent.widths, extent.reach), label, threads)
+
+    @property
+    def area(self) -> float:
+        """Area of the surfaces together."""
+        return float(self.support.areas)
+
+    @property
+    def rounding(self) -> float:
+        """Smallest norm that differs from zero by more than rounding."""
+        return _ROUNDING * self.area
+
+    def samples(self, lattice: Lattice) -> Samples:
+        """Return samples of all surfaces at the same frequencies."""
+        draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
+        return tuple(Sample.of(surface, draws) for surface in self.surfaces)
+
+    def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:
+        """Return the cheapest dtype that meets a target."""
+        single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
+        return "complex64" if single else "complex128"
+
+    def require_above_rounding(self, values: Reals) -> None:
+        """Refuse an accuracy of norms or distances (orders,) that lies below the rounding of fields.
+
+        Raises:
+            AccuracyError: The accuracy lies below rounding; the message gives the reachable rtol.
+        """
+        parts, floor = _discretisation_parts(self.orders, self.accuracy), self.rounding
+        # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
+        below = (parts * values < floor) & (values > floor)
+        if below.any():
+            worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
+            rtol = self.accuracy.rtol
+            reachable = 2 * rtol * floor / float(parts[worst] * values[worst])
+            raise AccuracyError(
+                f"{self.label}: rtol {rtol:g} of about {values[worst]:.2g} at order {self.orders[worst]:g} is below "
+                f"the rounding of double precision; about {reachable:.1g} can be reached",
+                rtol,
+                reachable,
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Norms or distances on one lattice.
+
+    Attributes:
+        estimate: Numbers with their errors, each (orders,).
+        lattice: Lattice of the fields.
+        is_pilot: True if the lattice is a small one that only shows how large distances are.
+        fields: Fields of the surfaces.
+        sums: Sums of the difference of the fields.
+    """
+
+    estimate: NormEstimate
     lattice: Lattice
+    is_pilot: bool
     fields: tuple[Field, ...]
     sums: Sums
 
 
-def pursue(
-    surfaces: Sequence[Surface],
-    orders: Sequence[float],
-    accuracy: Accuracy,
-    *,
-    threads: int = 1,
-    what: str = "the distance",
-) -> Found:
-    """The norm of a surface, or the distance of two, to an accuracy.
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """Requirements of a pair of surfaces.
 
-    Args:
-        surfaces: one or two.
-        orders: s, each.
-        accuracy: what is asked for.
-        threads: to compute with.
-        what: names the surfaces in messages.
+    Attributes:
+        values: Rough distances (orders,).
+        lattice: Lattice that the accuracy needs.
+        single: True if single precision suffices.
+    """
+
+    values: Reals
+    lattice: Lattice
+    single: bool
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceTarget:
+    """Accuracy of the distance between a surface and a reference, for which the surface's field is computed.
+
+    Attributes:
+        orders: Orders s.
+        accuracy: Accuracy of the distance.
+        reference: Sample of the reference; None for the field of the reference itself.
+        distances: Smallest distances (orders,) that the reference's own field has to serve.
+    """
+
+    orders: tuple[float, ...]
+    accuracy: Accuracy
+    reference: Sample | None
+    distances: tuple[float, ...] = ()
+
+    def error_target(self, surface: Surface) -> ErrorTarget:
+        """Return the target for the field of a surface."""
+        values = np.array(self.distances)
+        if self.reference is not None:
+            sample = Sample.of(surface, self.reference.draws)
+            values = _ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
+        return error_target(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
+
+
+def solve(problem: Problem) -> Solution:
+    """Compute a norm or a distance to an accuracy.
 
     Returns:
-        What was found in the last of a few rounds: in most cases the first that meets the accuracy.
+        The solution of the first of a few rounds that meets the accuracy, or of the last.
 
     Raises:
-        AccuracyError: a pilot shows that it cannot be met within the memory.
+        AccuracyError: A pilot shows that the accuracy cannot be met within the memory.
     """
-    surfaces = _centered(surfaces)
-    extent = Extent.union([surface.extent for surface in surfaces])
-    widths = extent.widths
-    areas = np.array(sum(surface.area for surface in surfaces))
-    lattice, pilot = first_lattice(widths, extent.reach, orders, accuracy)
-    inexact = max(1, sum(not isinstance(surface, Sphere) for surface in surfaces))
-    values: Reals | None = None
-    for remaining in reversed(range(_ROUNDS)):
-        samples = _samples(surfaces, lattice, orders)
-        if values is None:
-            values = _ESTIMATE_CAUTION * estimate(samples, orders)
-        _refuse_below_rounding(values, orders, accuracy, float(areas), what)
-        goal = goal_of(values, orders, _of_pilot(accuracy) if pilot else accuracy, float(areas)).tightened(inexact)
-        dtype = _precision(surfaces, lattice, goal)
-        fields = tuple(
-            field_for(surface, lattice, goal, TransformSettings(dtype=dtype), Execution(threads=threads), sample=sample)
-            for surface, sample in zip(surfaces, samples, strict=True)
-        )
-        found = _assessed(fields, lattice, orders, areas, widths)
-        values = found.assessed.values
-        twins = values <= _ROUNDING * areas
-        if not remaining or np.all(accuracy.met(found.assessed) | twins):
+    inexact = max(1, sum(needs_probe(surface, TransformSettings()) for surface in problem.surfaces))
+
+    def plan(samples: Samples, lattice: Lattice, before: Solution | None, is_pilot: bool) -> _Round:
+        values = before.estimate.values if before else _ESTIMATE_CAUTION * estimate(samples, problem.orders)
+        problem.require_above_rounding(values)
+        accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
+        target = error_target(values, problem.orders, accuracy, problem.area).tightened(inexact)
+        return target, problem.dtype(lattice, target)
+
+    for solution in islice(_solutions(problem, plan), _ROUNDS):
+        near_duplicates = solution.estimate.values <= problem.rounding
+        if np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
             break
-        lattice, pilot = _next(lattice, pilot, found.sums, orders, accuracy, areas=areas, widths=widths, what=what)
-    return found
+    return solution
 
 
-def _next(
-    lattice: Lattice,
-    pilot: bool,
-    sums: Sums,
-    orders: Sequence[float],
-    accuracy: Accuracy,
-    *,
-    areas: Reals,
-    widths: Reals,
-    what: str,
-) -> tuple[Lattice, bool]:
-    """The lattice of the next round, and whether it is but a larger pilot."""
+def run_pilot(problem: Problem) -> Pilot:
+    """Find out on a small lattice what a pair of surfaces needs for an accuracy.
+
+    Raises:
+        AccuracyError: The accuracy cannot be met within the memory.
+    """
+
+    def plan(samples: Samples, lattice: Lattice, before: Solution | None, is_pilot: bool) -> _Round:
+        values = estimate(samples, problem.orders)
+        return error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(
+            _PAIR
+        ), "complex128"
+
+    for solution in _solutions(problem, plan):
+        values = solution.estimate.values
+        problem.require_above_rounding(values)
+        needed, is_pilot = _next_lattice(problem, solution)
+        if not is_pilot:
+            break
+    target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
+    return Pilot(values, needed, problem.dtype(needed, target) == "complex64")
+
+
+_Round = tuple[ErrorTarget, ComplexDtype]
+
+
+def _solutions(
+    problem: Problem, plan: Callable[[Samples, Lattice, Solution | None, bool], _Round]
+) -> Iterator[Solution]:
+    """Yield solutions, each on the lattice that the sums of the one before call for.
+
+    Args:
+        problem: Norm or distance to compute.
+        plan: Function that returns the error target and the dtype of the fields of a round.
+    """
+    lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
+    solution = None
+    while True:
+        samples = problem.samples(lattice)
+        target, dtype = plan(samples, lattice, solution, is_pilot)
+        settings = TransformSettings(dtype=dtype)
+        fields = tuple(
+            field_for(surface, lattice, target, settings, Execution(threads=problem.threads), sample=sample)
+            for surface, sample in zip(problem.surfaces, samples, strict=True)
+        )
+        solution = _solution(problem, lattice, is_pilot, fields)
+        yield solution
+        lattice, is_pilot = _next_lattice(problem, solution)
+
+
+def _solution(problem: Problem, lattice: Lattice, is_pilot: bool, fields: tuple[Field, ...]) -> Solution:
+    weights = SobolevWeights(lattice, problem.orders)
+    difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
+    sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
+    errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
+    return Solution(estimate_norms(sums, weights, problem.support, errors), lattice, is_pilot, fields, sums)
+
+
+def _next_lattice(problem: Problem, solution: Solution) -> tuple[Lattice, bool]:
+    """Return the lattice of the next round, and True if it is but a larger pilot."""
+    weights = SobolevWeights(solution.lattice, problem.orders)
     try:
-        return refined(lattice, sums, orders, accuracy, areas=areas, widths=widths, what=what), False
+        return refined(solution.sums, weights, problem.support, problem.accuracy, problem.label), False
     except AccuracyError:
-        larger = larger_pilot(lattice, accuracy) if pilot else None
+        larger = larger_pilot(solution.lattice, problem.accuracy) if solution.is_pilot else None
         if larger is None:
             raise
         return larger, True
 
 
 def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
-    """Return the surfaces moved together to the centre of a lattice's period, which no distance notices."""
+    """Return the surfaces moved together to the centre of a lattice's period, which changes no distance."""
     lowest, highest = Extent.union([surface.extent for surface in surfaces]).box
     if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
         return surfaces
@@ -136,134 +277,15 @@ def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
     return [move.apply(surface) for surface in surfaces]
 
 
-def _refuse_below_rounding(values: Reals, orders: Sequence[float], accuracy: Accuracy, area: float, what: str) -> None:
-    parts = np.array([accuracy.discretisation_part(order) for order in orders])
-    floor = _ROUNDING * area
-    # A distance of no more than rounding is that of twins, for whom no relative accuracy exists.
-    below = (parts * values < floor) & (values > floor)
-    if below.any():
-        worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
-        reachable = 2 * accuracy.rtol * floor / float(parts[worst] * values[worst])
-        raise AccuracyError(
-            f"{what}: rtol {accuracy.rtol:g} of about {values[worst]:.2g} at order {orders[worst]:g} is below the "
-            f"rounding of double precision; about {reachable:.1g} can be reached",
-            accuracy.rtol,
-            reachable,
-        )
+def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:
+    """Return the target of both fields of a pair together at these distances (orders,): never below rounding."""
+    errors = np.maximum(_discretisation_parts(orders, accuracy) * values, _ROUNDING * area)
+    return ErrorTarget(orders, tuple(errors.tolist()))
 
 
-@dataclass(frozen=True, eq=False)
-class Pilot:
-    """What a pair of surfaces needs.
-
-    Attributes:
-        values: the distances (orders,), roughly.
-        lattice: that the accuracy needs.
-        single: whether single precision is enough.
-    """
-
-    values: Reals
-    lattice: Lattice
-    single: bool
-
-
-def pilot_of(
-    surface: Surface,
-    reference: Surface,
-    orders: Sequence[float],
-    accuracy: Accuracy,
-    widths: Reals,
-    reach: float,
-    *,
-    what: str,
-    threads: int = 1,
-) -> Pilot:
-    """What a pair of surfaces needs for an accuracy, found out on a small lattice.
-
-    Args:
-        surface: one of them.
-        reference: the other.
-        orders: s, each.
-        accuracy: what is asked for.
-        widths: extents (13,) of all surfaces that share the lattice.
-        reach: their largest |coordinate|.
-        what: names the surface in messages.
-        threads: to compute with.
-
-    Raises:
-        AccuracyError: it cannot be met within the memory.
-    """
-    lattice, pilot = first_lattice(widths, reach, orders, accuracy)
-    area = surface.area + reference.area
-    while True:
-        samples = _samples((surface, reference), lattice, orders)
-        goal = goal_of(estimate(samples, orders), orders, _of_pilot(accuracy), area).tightened(_PAIR)
-        fields = [
-            field_for(each, lattice, goal, TransformSettings(), Execution(threads=threads), sample=sample)
-            for each, sample in zip((surface, reference), samples, strict=True)
-        ]
-        found = _assessed(fields, lattice, orders, np.array(area), widths)
-        values = found.assessed.values
-        _refuse_below_rounding(values, orders, accuracy, area, what)
-        needed, larger = _next(
-            lattice, pilot, found.sums, orders, accuracy, areas=np.array(area), widths=widths, what=what
-        )
-        if not larger:
-            break
-        lattice = needed
-    final = goal_of(values, orders, accuracy, area).tightened(_PAIR)
-    single = all(permits_single(each, needed, final) for each in (surface, reference))
-    return Pilot(values, needed, single)
-
-
-@dataclass(frozen=True, eq=False)
-class Aim:
-    """What the field of a surface is computed for: its distance to a reference, to an accuracy.
-
-    Attributes:
-        orders: s, each.
-        accuracy: what is asked for.
-        reference: a sample of the reference; None for the reference itself, then
-        distances: are the smallest (orders,) that its field has to serve.
-    """
-
-    orders: tuple[float, ...]
-    accuracy: Accuracy
-    reference: Sample | None
-    distances: tuple[float, ...] = ()
-
-    def goal(self, surface: Surface) -> Goal:
-        """What the field of a surface may err."""
-        values = np.array(self.distances)
-        if self.reference is not None:
-            sample = Sample.of(surface, self.reference.draws)
-            values = _ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
-        return goal_of(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
-
-
-def goal_of(values: Reals, orders: Sequence[float], accuracy: Accuracy, area: float) -> Goal:
-    """What the fields of a pair at these distances (orders,) may err, both together: never below rounding."""
-    parts = np.array([accuracy.discretisation_part(order) for order in orders])
-    return Goal(tuple(orders), tuple(np.maximum(parts * values, _ROUNDING * area).tolist()))
+def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
+    return np.array([accuracy.discretisation_part(order) for order in orders])
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:
     return replace(accuracy, rtol=max(accuracy.rtol, _PILOT_RTOL))
-
-
-def _precision(surfaces: Sequence[Surface], lattice: Lattice, goal: Goal) -> ComplexDtype:
-    return "complex64" if all(permits_single(surface, lattice, goal) for surface in surfaces) else "complex128"
-
-
-def _samples(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float]) -> tuple[Sample, ...]:
-    """Samples of all surfaces at the same frequencies."""
-    draws = draws_for(surfaces, lattice, orders, USUAL_DEGREE)
-    return tuple(Sample.of(surface, draws) for surface in surfaces)
-
-
-def _assessed(fields: Sequence[Field], lattice: Lattice, orders: Sequence[float], areas: Reals, widths: Reals) -> Found:
-    whole = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
-    sums = sums_of_shells(shell_sums(whole, None, lattice, lattice.half), lattice, orders)
-    errors = np.sum([field.quality.probe.norms(lattice, orders) for field in fields], axis=0)
-    assessed = estimate_norms(sums, lattice, orders, areas=areas, widths=widths, discretisation=errors)
-    return Found(assessed, lattice, tuple(fields), sums)

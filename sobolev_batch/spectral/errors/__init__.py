@@ -1,4 +1,4 @@
-"""Errors: what a field, a norm or a distance may be wrong by, predicted before and measured after.
+"""Errors of fields, norms and distances: predicted before a computation, measured after it.
 
 In: fields, their sums and a few exact values. Out: truncation, aliasing and discretisation errors.
 """

@@ -1,4 +1,4 @@
-"""What is known about the quality of a computed field, in a form that travels and is stored with it."""
+"""Quality of a computed field, in a form that is stored and sent with it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 
 @dataclass(frozen=True)
 class Quality:
-    """What the error of a norm or distance needs to know of a field.
+    """Properties of a field that the errors of norms and distances follow from.
 
     Attributes:
         area: Area of the surface, in squared units of length.
@@ -31,12 +31,11 @@ class Quality:
         return cls(surface.area, surface.extent, probe)
 
     def to_json(self) -> str:
-        """One line of JSON."""
-        parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
-        return json.dumps(parts)
+        """Return the quality as one line of JSON."""
+        return json.dumps([self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The quality that a line holds."""
+        """Read a quality from a line of `to_json`."""
         area, lowest, highest, shells, sums = json.loads(text)
         return cls(area, Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums)))

@@ -1,4 +1,4 @@
-"""Metrics: norms, inner products, distances, and what is behind a distance.
+"""Metrics of fields: norms, distances, inner products, spectra, decompositions, witness functions.
 
-In: fields, or surfaces that become fields. Out: xarray datasets over orders, frequencies or points.
+In: fields, or surfaces with a lattice or a tolerance. Out: labelled datasets in which numbers have their errors.
 """

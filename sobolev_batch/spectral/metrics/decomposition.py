@@ -1,26 +1,35 @@
-"""The proportion of two surfaces: how much of their distance a mere change of total area explains."""
+"""Decomposition of a distance: a mere change of total area, and the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, over_orders, pair_of, read_blocks
-from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
+from sobolev_batch.spectral.metrics.datasets import NORM, NUMBER, labelled, lattice_attributes
+from sobolev_batch.spectral.metrics.inputs import Operand, pair_of, read_blocks
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
+
+_LABELS = {
+    "distance": ("Sobolev distance", NORM),
+    "area_part": ("distance explained by a change of area", NORM),
+    "shape_part": ("rest of the distance", NORM),
+    "area_share": ("share of the squared distance explained by a change of area", NUMBER),
+    "excess": ("relative excess of area over the reference", NUMBER),
+}
 
 
 @dataclass(frozen=True)
 class Proportion:
-    """The two orthogonal parts of distances to a reference, each (orders, ...).
+    """Two orthogonal parts of distances to a reference, each (orders, ...).
 
     Attributes:
-        area: what multiplying the reference by a number explains.
-        shape: the rest. The squares of both add up to the squared distance.
-        excess: by how much that number exceeds one.
+        area: Part that a multiple of the reference explains.
+        shape: Rest. The squares of both add up to the squared distance.
+        excess: Difference of that multiple from one.
     """
 
     area: Reals
@@ -31,25 +40,21 @@ class Proportion:
         yield from (self.area, self.shape, self.excess)
 
     @classmethod
-    def of_shells(
-        cls, squares: Reals, products: Reals, reference: Reals, lattice: Lattice, orders: Sequence[float]
-    ) -> Proportion:
-        """The parts of distances to a reference b, from shell sums of the differences e = a - b.
+    def of_shells(cls, squares: Reals, products: Reals, reference: Reals, weights: SobolevWeights) -> Proportion:
+        """Return the parts of distances to a reference b, from shell sums of the differences e = a - b.
 
-        The best multiple c of b has c - 1 = <e, b>/<b, b>. Nothing of it cancels for near twins, since a
+        The best multiple c of b has c - 1 = <e, b>/<b, b>. Nothing cancels in it for near-duplicates, since a
         itself does not occur. The square of the shape part is what the area part leaves over of the
         squared distance, and good to 1e-15 of that.
 
         Args:
-            squares: of |e|², (..., lattice.shell_count); see `shell_sums`.
-            products: of Re(e conj b), likewise.
-            reference: of |b|², (lattice.shell_count,).
-            lattice: on which they were summed.
-            orders: s, each.
+            squares: Shell sums of |e|², (..., lattice.shell_count); see `shell_sums`.
+            products: Shell sums of Re(e conj b), likewise.
+            reference: Shell sums of |b|², (lattice.shell_count,).
+            weights: Weights of the shells.
         """
-        weights = shell_weights(lattice, orders)
-        square, product = (np.tensordot(weights, sums, axes=(1, -1)) for sums in (squares, products))
-        norm = np.sqrt(weights @ reference).reshape(-1, *[1] * (square.ndim - 1))
+        square, product = (np.tensordot(weights.per_shell, sums, axes=(1, -1)) for sums in (squares, products))
+        norm = np.sqrt(weights.per_shell @ reference).reshape(-1, *[1] * (square.ndim - 1))
         with np.errstate(divide="ignore", invalid="ignore"):
             area = np.abs(product) / norm
             excess = product / norm**2
@@ -59,39 +64,45 @@ class Proportion:
 
 
 def proportion(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
-    """The distance ||a - b||_s split into what a pure change of total area explains, and the rest.
+    """Return the distance ||a - b||_s split into a pure change of total area and the rest.
 
     Of all multiples of b, c b with c = <a, b>_s/<b, b>_s is nearest to a. Then a - b = (c - 1) b + (a - c b),
     and both parts are orthogonal in the norm of order s.
 
     Args:
-        a: a field from `fourier_transform` or a store, or a surface.
-        b: the reference: a field on the same lattice, or a surface.
-        order: one order s < -1/2, or several.
-        lattice: where surfaces are to be transformed; a field brings its own.
+        a: Field from `fourier_transform` or a store, or a surface.
+        b: Reference: a field on the same lattice, or a surface.
+        order: One order s < -1/2, or several.
+        lattice: Lattice to transform surfaces on. A field brings its own.
 
     Returns:
-        A dataset over `order` with `distance`, `area_part` = |c - 1| ||b||_s, `shape_part` = ||a - c b||_s,
+        Dataset over `order` with `distance`, `area_part` = |c - 1| ||b||_s, `shape_part` = ||a - c b||_s,
         `area_share` = area_part² / distance² (NaN between equal fields), and `excess` = c - 1, positive
-        where a has more area than b. The squares of both parts add up to that of the distance.
+        where a has more area than b. All are float64. The squares of both parts add up to that of the
+        distance. A single order has no dimension. Attributes hold the lattice and the kernel.
 
     Raises:
-        OrderError: an order that is not below -1/2.
-        LatticeError: fields on different lattices, or a surface that does not fit into the lattice.
-        InputError: a mesh, and no lattice from anywhere.
+        OrderError: An order is not below -1/2.
+        LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
+        InputError: A surface comes without a lattice.
+
+    >>> from sobolev_batch import Lattice, Sphere, proportion
+    >>> parts = proportion(Sphere(0.9), Sphere(), -2.0, lattice=Lattice(3.0, 32))
+    >>> f"{parts['excess'].item():.3f}", f"{parts['area_share'].item():.2f}"
+    ('-0.206', '0.19')
     """
     orders = check_orders(order)
     first, second = pair_of(a, b, lattice, orders)
-    known = Lattice.of(first)
-    squares, products, reference = np.zeros((3, known.shell_count))
-    for block, (values, others) in read_blocks(known, first, second):
+    weights = SobolevWeights(Lattice.of(first), orders)
+    squares, products, reference = np.zeros((3, weights.lattice.shell_count))
+    for block, (values, others) in read_blocks(weights.lattice, first, second):
         difference = values - others
-        squares += shell_sums(difference, None, known, block)
-        products += shell_sums(difference, others, known, block)
-        reference += shell_sums(others, None, known, block)
-    area, shape, excess = Proportion.of_shells(squares, products, reference, known, orders)
-    distance = np.sqrt(shell_weights(known, orders) @ squares)
+        squares += shell_sums(difference, None, weights.lattice, block)
+        products += shell_sums(difference, others, weights.lattice, block)
+        reference += shell_sums(others, None, weights.lattice, block)
+    area, shape, excess = Proportion.of_shells(squares, products, reference, weights)
+    distance = np.sqrt(weights.per_shell @ squares)
     with np.errstate(invalid="ignore"):
         share = (area / distance) ** 2
     parts = {"distance": distance, "area_part": area, "shape_part": shape, "area_share": share, "excess": excess}
-    return over_orders(order, parts)
+    return labelled(order, parts, _LABELS, lattice_attributes(weights.lattice, first, second))

@@ -8,206 +8,244 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.adaptive.solve import pursue
+from sobolev_batch.parameters import byte_count
+from sobolev_batch.spectral.adaptive.solve import Problem, solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.datasets import LENGTH, NORM, labelled, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
+    Operand,
     check_surface,
     field_of,
-    over_orders,
     pair_of,
     quality_of,
     read_blocks,
     shells_of,
 )
-from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, shell_weights
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.sphere import Sphere
-from sobolev_batch.surfaces.shapes.surface import Surface
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
+_LABELS = {
+    "norm": ("Sobolev norm", NORM),
+    "distance": ("Sobolev distance", NORM),
+    "error": ("largest error", NORM),
+    "truncation": ("error by frequencies beyond xi_max", NORM),
+    "aliasing": ("error by the spacing of the lattice", NORM),
+    "discretisation": ("error by the quadrature and the NUFFT", NORM),
+}
 
 
 def norm(
-    a: Surface | xr.DataArray,
+    a: Operand,
     order: Orders,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
-    memory: float | None = None,
+    memory: float | str | None = None,
 ) -> xr.Dataset:
-    """The Sobolev norm ||a||_s of a surface's area measure, with its error.
+    """Return the Sobolev norm ||a||_s of a surface's area measure, with its error.
 
     Args:
-        a: a field from `fourier_transform` or a store, or a surface. A sphere without a lattice is
-            answered in closed form.
-        order: one order s < -1/2, or several.
-        lattice: where a surface is to be transformed; a field brings its own.
-        rtol: instead of a lattice, the accuracy that is asked for; see `distance`.
-        memory: bytes that a transform may take with rtol; default 2e9.
+        a: Field from `fourier_transform` or a store, or a surface. The norm of a sphere without a lattice
+            is a closed form.
+        order: One order s < -1/2, or several.
+        lattice: Lattice to transform a surface on. A field brings its own.
+        rtol: Largest relative error, in place of a lattice; see `distance`.
+        memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
 
     Returns:
-        A dataset over `order` with `norm`, its `error`, and the parts of that: `truncation` (what
-        lies beyond xi_max; it can only add to the norm), `aliasing` and `discretisation`. The error
-        is NaN for fields that do not say what they were computed from.
+        Dataset over `order` with `norm`, its `error`, and the three parts of the error: `truncation`
+        (frequencies beyond xi_max; it can only add to the norm), `aliasing` and `discretisation`. All are
+        float64, in the square root of a unit length. The error is NaN for fields without the attribute
+        `quality`. A single order has no dimension. Attributes hold the lattice and the kernel.
 
     Raises:
-        OrderError: an order that is not below -1/2.
-        InputError: a mesh without a lattice or an rtol; or both of these.
-        AccuracyError: the rtol is out of reach within the memory.
+        OrderError: An order is not below -1/2.
+        InputError: A surface comes without a lattice or an rtol, or with both.
+        AccuracyError: The rtol is out of reach within the memory.
+
+    >>> from sobolev_batch import Lattice, Sphere, icosphere, norm
+    >>> f"{norm(Sphere(), -2.0)['norm'].item():.6f}"
+    '4.442778'
+    >>> norms = norm(icosphere(2), [-2.0, -5.0], lattice=Lattice(3.0, 32))
+    >>> norms["norm"].round(3).values.tolist()
+    [4.39, 3.258]
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _pursued("norm", (a,), order, lattice, _accuracy(rtol, memory))
-    if memory is not None:
-        raise InputError("memory limits what an rtol may cost; without an rtol it has no meaning")
+        return _to_accuracy("norm", (a,), order, lattice, _accuracy(rtol, memory))
+    _refuse_memory(memory)
     if isinstance(a, Sphere) and lattice is None:
         values = np.array([sphere_norm(a, s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
     field = field_of(a, lattice, orders)
-    known = Lattice.of(field)
-    return _dataset("norm", order, _assessed(shells_of(field, None, known), known, orders, [field]))
+    weights = SobolevWeights(Lattice.of(field), orders)
+    return _from_fields("norm", order, weights, shells_of(field, None, weights.lattice), [field])
 
 
-def inner_product(
-    a: Surface | xr.DataArray, b: Surface | xr.DataArray, order: Orders, *, lattice: Lattice | None = None
-) -> xr.Dataset:
-    """The Sobolev inner product <a, b>_s, with the arguments of `distance`; real, since measures are.
+def inner_product(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
+    """Return the Sobolev inner product <a, b>_s of two surfaces' area measures, which is real.
+
+    Args:
+        a: Field, or a surface. The inner product of two spheres without a lattice is a closed form.
+        b: Field on the same lattice, or a surface.
+        order: One order s < -1/2, or several.
+        lattice: Lattice to transform surfaces on. A field brings its own.
 
     Returns:
-        A dataset over `order` with `inner_product`.
+        Dataset over `order` with `inner_product`, float64, in units of length. A single order has no
+        dimension. Attributes hold the lattice and the kernel.
+
+    Raises:
+        OrderError: An order is not below -1/2.
+        LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
+        InputError: A surface comes without a lattice.
+
+    >>> from sobolev_batch import Sphere, inner_product
+    >>> f"{inner_product(Sphere(), Sphere(0.5), -2.0)['inner_product'].item():.6f}"
+    '1.758104'
     """
     orders = check_orders(order)
+    labels = {"inner_product": ("Sobolev inner product", LENGTH)}
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
-        values = np.array([sphere_inner_product(a, b, s) for s in orders])
-    else:
-        first, second = pair_of(a, b, lattice, orders)
-        known = Lattice.of(first)
-        sums = np.zeros(known.shell_count)
-        for block, (values_a, values_b) in read_blocks(known, first, second):
-            sums += shell_sums(values_a, values_b, known, block)
-        values = shell_weights(known, orders) @ sums
-    return over_orders(order, {"inner_product": values})
+        products = np.array([sphere_inner_product(a, b, s) for s in orders])
+        return labelled(order, {"inner_product": products}, labels, {})
+    first, second = pair_of(a, b, lattice, orders)
+    weights = SobolevWeights(Lattice.of(first), orders)
+    sums = np.zeros(weights.lattice.shell_count)
+    for block, (values, others) in read_blocks(weights.lattice, first, second):
+        sums += shell_sums(values, others, weights.lattice, block)
+    attributes = lattice_attributes(weights.lattice, first, second)
+    return labelled(order, {"inner_product": weights.per_shell @ sums}, labels, attributes)
 
 
 def distance(
-    a: Surface | xr.DataArray,
-    b: Surface | xr.DataArray,
+    a: Operand,
+    b: Operand,
     order: Orders,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
-    memory: float | None = None,
+    memory: float | str | None = None,
 ) -> xr.Dataset:
-    """The Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
+    """Return the Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
     Args:
-        a: a field, or a surface. Two spheres without a lattice are answered in closed form.
-        b: a field on the same lattice, or a surface.
-        order: one order s < -1/2, or several.
-        lattice: where surfaces are to be transformed; a field brings its own.
-        rtol: instead of a lattice, the largest error of the distance relative to it. Lattice,
-            triangle rules, NUFFT accuracy and precision are then chosen, and chosen again where the
-            result's own error falls short; the attributes of what is returned tell what they were.
-        memory: bytes that a transform may take with rtol; default 2e9.
+        a: Field, or a surface. The distance of two spheres without a lattice is a closed form.
+        b: Field on the same lattice, or a surface.
+        order: One order s < -1/2, or several.
+        lattice: Lattice to transform surfaces on. A field brings its own.
+        rtol: Largest error of the distance relative to it, in place of a lattice. Lattice, triangle rules,
+            eps and dtype are then chosen, and chosen again where the error of the result is too large. The
+            attributes of the dataset hold the last choice.
+        memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
 
     Returns:
-        A dataset over `order` with `distance`, its `error`, and the parts of that; see `norm`. With
-        rtol, `within` says whether the error is below rtol times the distance.
+        Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. With
+        rtol, `within` is True where the error is below rtol times the distance.
 
     Raises:
-        OrderError: an order that is not below -1/2.
-        LatticeError: fields on different lattices, or a surface that does not fit into the lattice.
-        InputError: a mesh, and no lattice from anywhere; or a lattice or a field, and an rtol.
-        AccuracyError: the rtol is out of reach within the memory; says what can be reached.
+        OrderError: An order is not below -1/2.
+        LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
+        InputError: A surface comes without a lattice, or an rtol with a lattice or a field.
+        AccuracyError: The rtol is out of reach within the memory; the message gives the reachable one.
+
+    >>> from sobolev_batch import Sphere, distance, icosphere
+    >>> f"{distance(Sphere(), Sphere(0.9), -2.0)['distance'].item():.6f}"
+    '2.205136'
+    >>> near = distance(icosphere(2), Sphere(), -5.0, rtol=1e-2)
+    >>> f"{near['distance'].item():.2f}", near["within"].item()
+    ('0.09', True)
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _pursued("distance", (a, b), order, lattice, _accuracy(rtol, memory))
-    if memory is not None:
-        raise InputError("memory limits what an rtol may cost; without an rtol it has no meaning")
+        return _to_accuracy("distance", (a, b), order, lattice, _accuracy(rtol, memory))
+    _refuse_memory(memory)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         values = np.array([sphere_distance(a, b, s) for s in orders])
         squares = np.array([sphere_norm(a, s) ** 2 + sphere_norm(b, s) ** 2 for s in orders])
         return _dataset("distance", order, _closed_form(values, squares))
     first, second = pair_of(a, b, lattice, orders)
-    known = Lattice.of(first)
-    return _dataset("distance", order, _assessed(shells_of(first, second, known), known, orders, [first, second]))
+    weights = SobolevWeights(Lattice.of(first), orders)
+    return _from_fields("distance", order, weights, shells_of(first, second, weights.lattice), [first, second])
 
 
-def _accuracy(rtol: float, memory: float | None) -> Accuracy:
-    return Accuracy(rtol) if memory is None else Accuracy(rtol, memory)
+def _accuracy(rtol: float, memory: float | str | None) -> Accuracy:
+    return Accuracy(rtol) if memory is None else Accuracy(rtol, byte_count(memory))
 
 
-def _pursued(
-    name: str, parts: Sequence[Surface | xr.DataArray], order: Orders, lattice: Lattice | None, accuracy: Accuracy
+def _refuse_memory(memory: float | str | None) -> None:
+    if memory is not None:
+        raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
+
+
+def _to_accuracy(
+    name: str, operands: Sequence[Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy
 ) -> xr.Dataset:
-    """A norm or distance to an accuracy, with what was chosen for it in the attributes."""
-    surfaces = [part for part in parts if not isinstance(part, xr.DataArray)]
-    if lattice is not None or len(surfaces) < len(parts):
+    """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen."""
+    surfaces = [operand for operand in operands if not isinstance(operand, xr.DataArray)]
+    if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     for surface in surfaces:
         check_surface(surface)
-    orders = check_orders(order)
-    found = pursue(surfaces, orders, accuracy, threads=os.cpu_count() or 1, what=f"the {name}")
-    dataset = _dataset(name, order, found.assessed)
-    within = accuracy.met(found.assessed).reshape(np.shape(order))
-    settings = [field.settings for field in found.fields]
-    return dataset.assign(within=(dataset[name].dims, within)).assign_attrs(
-        rtol=accuracy.rtol,
-        xi_max=found.lattice.xi_max,
-        M=found.lattice.M,
-        dtype=settings[0].dtype,
-        eps=[setting.eps for setting in settings],
-        tolerance=[setting.tolerance for setting in settings],
-        points=[field.points for field in found.fields],
-    )
+    solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1))
+    settings = [field.settings for field in solution.fields]
+    attributes = {
+        "rtol": accuracy.rtol,
+        "xi_max": solution.lattice.xi_max,
+        "M": solution.lattice.M,
+        "dtype": settings[0].dtype,
+        "eps": [setting.eps for setting in settings],
+        "tolerance": [setting.tolerance for setting in settings],
+        "points": [field.points for field in solution.fields],
+    }
+    dataset = _dataset(name, order, solution.estimate, attributes)
+    within = accuracy.met(solution.estimate).reshape(np.shape(order))
+    return dataset.assign(within=(dataset[name].dims, within, {"long_name": "error within rtol of the value"}))
 
 
-def _assessed(sums: Reals, lattice: Lattice, orders: Sequence[float], fields: Sequence[xr.DataArray]) -> NormEstimate:
-    """The norm of what the fields add up to, with the error that follows from their qualities."""
-    qualities = [quality_of(field) for field in fields]
-    known = [quality for quality in qualities if quality is not None]
-    complete = len(known) == len(qualities)
-    found = estimate_norms(
-        sums_of_shells(sums, lattice, orders),
-        lattice,
-        orders,
-        areas=np.array(sum(quality.area for quality in known)),
-        widths=Extent.union([quality.extent for quality in known]).widths if complete else np.zeros(len(DIRECTIONS)),
-        discretisation=np.sum([quality.probe.norms(lattice, orders) for quality in known], axis=0),
-    )
-    if complete:
-        return found
-    unknown = np.full(len(orders), np.nan)
-    return NormEstimate(found.values, unknown, unknown, unknown)
+def _from_fields(
+    name: str, order: Orders, weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray]
+) -> xr.Dataset:
+    """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities."""
+    qualities = [quality for quality in map(quality_of, fields) if quality is not None]
+    complete = len(qualities) == len(fields)
+    areas = np.array(sum(quality.area for quality in qualities))
+    widths = Extent.union([quality.extent for quality in qualities]).widths if complete else np.zeros(len(DIRECTIONS))
+    errors = np.sum([quality.probe.norms(weights) for quality in qualities], axis=0)
+    estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, widths), errors)
+    if not complete:
+        estimate = NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 3)
+    return _dataset(name, order, estimate, lattice_attributes(weights.lattice, *fields))
 
 
 def _closed_form(values: Reals, squares: Reals) -> NormEstimate:
-    """Values whose squares are exact up to a small part of some squared norms."""
-    nothing = np.zeros_like(values)
+    """Return values whose squares are exact up to a small fraction of some squared norms."""
+    zeros = np.zeros_like(values)
     rounding = _CLOSED_FORM_ACCURACY * squares
-    return NormEstimate(
-        values, nothing, nothing, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0)
-    )
+    return NormEstimate(values, zeros, zeros, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0))
 
 
-def _dataset(name: str, order: Orders, found: NormEstimate) -> xr.Dataset:
-    """A number with its error and the parts of that."""
-    parts = {
-        name: found.values,
-        "error": found.errors,
-        "truncation": found.truncation,
-        "aliasing": found.aliasing,
-        "discretisation": found.discretisation,
+def _dataset(
+    name: str, order: Orders, estimate: NormEstimate, attributes: Mapping[str, object] | None = None
+) -> xr.Dataset:
+    """Return a number with its error and the parts of the error."""
+    variables = {
+        name: estimate.values,
+        "error": estimate.errors,
+        "truncation": estimate.truncation,
+        "aliasing": estimate.aliasing,
+        "discretisation": estimate.discretisation,
     }
-    return over_orders(order, parts)
+    return labelled(order, variables, _LABELS, attributes or {})

@@ -1,4 +1,4 @@
-"""Observed rates of convergence between the levels of a family."""
+"""Observed orders of convergence between the levels of a family."""
 
 from __future__ import annotations
 
@@ -11,22 +11,26 @@ Reals = NDArray[np.float64]
 
 
 def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
-    """The exponent p in distance ~ size^p between each mesh and the next coarser one, with its error.
+    """Return the observed order p in distance ~ size^p between each mesh and the next coarser one, with its error.
 
     Args:
-        distances: (n,) to the reference; NaN where missing.
-        errors: (n,) of the distances.
-        sizes: (n,) mean edge lengths, in units of length; NaN where missing.
+        distances: Distances to the reference (n,), NaN where missing.
+        errors: Errors of the distances (n,).
+        sizes: Mean edge lengths (n,), in units of length, NaN where missing.
 
     Returns:
-        (n,) log(d_coarse/d)/log(h_coarse/h) and its error, in the order of the arguments; NaN for the
-        coarsest, for meshes without a distance or size, for those whose distance has sunk below its
-        error and carries no rate, and where neighbours have the same size.
+        log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each, in the order of the arguments. NaN for the
+        coarsest mesh, for meshes without a distance or size, for distances below their error, and between
+        neighbours of the same size.
+
+    >>> sizes = np.array([0.4, 0.2, 0.1])
+    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
+    array([nan,  2.,  2.])
     """
     rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
     usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
-    ordered = usable[np.argsort(-sizes[usable], kind="stable")]
-    for coarse, fine in pairwise(ordered):
+    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
+    for coarse, fine in pairwise(by_size):
         if sizes[coarse] > sizes[fine]:
             span = np.log(sizes[coarse] / sizes[fine])
             rates[fine] = np.log(distances[coarse] / distances[fine]) / span

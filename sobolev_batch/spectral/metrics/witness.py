@@ -1,4 +1,4 @@
-"""The witness function: where two surfaces differ, as the norm sees it."""
+"""Witness functions: where two surfaces differ, as seen by the norm."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, read_blocks, triples_of
-from sobolev_batch.spectral.shells import Orders, check_orders, shell_weights
+from sobolev_batch.spectral.metrics.datasets import KERNEL, LENGTH, described, lattice_attributes, order_axis
+from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, point_array, read_blocks
+from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import require_points_inside
 
-# Of a given memory, what blocks of fields may take; the rest is for the NUFFT.
-_SHARE_OF_BLOCKS = 0.25
+# Fraction of a given memory for blocks of fields; the rest is for the NUFFT.
+_BLOCK_FRACTION = 0.25
 # Samples of a block besides their coefficients: two fields, their difference, its weights and its shells.
 _SAMPLE_BYTES = 72
 
@@ -37,119 +39,126 @@ def witness(
     eps: float | None = None,
     dtype: ComplexDtype = "complex128",
     threads: int | None = None,
-    memory: float | None = None,
+    memory: float | str | None = None,
 ) -> xr.DataArray:
-    """The witness function of two surfaces at points: positive where a has area that b lacks.
+    """Return the witness function of two surfaces at points: positive where a has area that b lacks.
 
     It is w(x) = ∫ (1 + |ξ|²)^s (a^ - b^)(ξ) exp(+2πi ξ·x) dξ, by the trapezoidal rule over the lattice
     as in norms: the difference of the area measures, smoothed by the norm's kernel. Its integral
     against that difference is the squared distance, ∫ w d(a - b) = ||a - b||_s².
 
     Args:
-        a: a field from `fourier_transform` or a store, or a surface.
-        b: a field on the same lattice, or a surface.
-        order: one order s < -1/2, or several.
-        points: x, real (n, 3), in the fields' unit of length: such as ``mesh.vertices`` of a mesh that
-            the similarity of its study has been applied to.
-        lattice: where surfaces are to be transformed; a field brings its own.
-        eps: accuracy of the NUFFT, relative to the sum of the moduli of all terms; the error reached is
-            a small multiple of it. Default 1e-9, or 1e-6 in single precision.
-        dtype: "complex128" or "complex64": of the arithmetic, whatever the fields'.
-        threads: of the NUFFT; default one per core.
-        memory: bytes that this may take besides points, result and fields held in memory; default as
-            many as are fastest.
+        a: Field from `fourier_transform` or a store, or a surface.
+        b: Field on the same lattice, or a surface.
+        order: One order s < -1/2, or several.
+        points: Points x, real (n, 3), in the fields' unit of length. For example ``mesh.vertices`` of a mesh
+            after the similarity of its study.
+        lattice: Lattice to transform surfaces on. A field brings its own.
+        eps: Accuracy of the NUFFT, relative to the sum of the moduli of all terms. The error is a small
+            multiple of it. Default 1e-9, or 1e-6 in single precision.
+        dtype: "complex128" or "complex64", the dtype of the arithmetic, whatever that of the fields.
+        threads: Threads of the NUFFT; default one per core.
+        memory: Memory for the computation besides points, result and fields in memory, in bytes or as a text
+            such as "4GB". Default as much as is fastest.
 
     Returns:
-        `witness` over (order, point), or (point,) of a single order: float64, or float32 with complex64.
-        In 1 / unit length. NaN everywhere if a field has NaN anywhere.
+        `witness` over (order, point), or (point,) for a single order, with the coordinates `order` and `x`,
+        `y`, `z` of the points: float64, or float32 with complex64, in 1 / unit length. NaN everywhere if a
+        field has NaN anywhere.
 
     Raises:
-        OrderError: an order that is not below -1/2.
-        LatticeError: fields on different lattices, or points beyond the half period 1/(2h).
-        InputError: points that are not finite or not (n, 3); a mesh, and no lattice from anywhere;
-            settings out of range; too little memory.
+        OrderError: An order is not below -1/2.
+        LatticeError: The fields lie on different lattices, or points lie beyond the half period 1/(2h).
+        InputError: Points are not finite or not (n, 3); a surface comes without a lattice; settings are out
+            of range; the memory is too little.
 
     Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
+
+    >>> from sobolev_batch import Lattice, Sphere, witness
+    >>> w = witness(Sphere(), Sphere(0.9), -4.0, [[1, 0, 0], [0, 0, 0]], lattice=Lattice(3.0, 32))
+    >>> (w > 0).values.tolist()
+    [True, False]
     """
     orders = check_orders(order)
     settings = TransformSettings(eps, dtype)
+    allowed_bytes = None if memory is None else byte_count(memory)
     coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
-    known = Lattice.of(first)
-    require_points_inside(coordinates, known)
-    evaluation = Evaluation(coordinates, known, shell_weights(known, orders), settings, threads, memory)
+    lattice = Lattice.of(first)
+    require_points_inside(coordinates, lattice)
+    evaluation = Evaluation(coordinates, SobolevWeights(lattice, orders), settings, threads, allowed_bytes)
     values = np.zeros((len(orders), coordinates.shape[1]))
     # FINUFFT refuses to evaluate nothing.
-    for block, (of_a, of_b) in read_blocks(known, first, second, largest=evaluation.largest) if values.size else ():
+    for block, (of_a, of_b) in read_blocks(lattice, first, second, largest=evaluation.largest) if values.size else ():
         values += evaluation.of_block(block, of_a - of_b)
-    return _labelled(values.astype(np.float32 if dtype == "complex64" else np.float64), order)
+    dims, labels, _ = axis = order_axis(order)
+    values = values.astype(np.float32 if dtype == "complex64" else np.float64)
+    places = {name: ("point", row, described(name, LENGTH)) for name, row in zip("xyz", coordinates, strict=True)}
+    return xr.DataArray(
+        values.reshape(*labels.shape, coordinates.shape[1]),
+        dims=(*dims, "point"),
+        coords={"order": axis, **places},
+        name="witness",
+        attrs={
+            **described("witness function", "1 / unit length"),
+            "description": "positive where the first surface has area that the second lacks",
+            "kernel": KERNEL,
+            **lattice_attributes(lattice, first, second),
+        },
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Evaluates witness functions at points, one block of the difference of two fields after the other.
+    """Evaluation of witness functions at points, one block of the difference of two fields after the other.
 
     Attributes:
-        coordinates: of the points, float64 (3, n), contiguous, n > 0, within the half period.
-        lattice: of the fields.
-        weights: of its shells, (orders, lattice.shell_count).
-        settings: accuracy and precision of the NUFFT.
-        threads: of the NUFFT; one per core by default.
-        memory: bytes that a block may take, besides points, result and the fields themselves.
+        coordinates: Points, float64 (3, n), contiguous, n > 0, within the half period.
+        weights: Weights of the shells of the fields' lattice.
+        settings: eps and dtype of the NUFFT.
+        threads: Threads of the NUFFT; one per core by default.
+        allowed_bytes: Memory that a block may take, besides points, result and the fields themselves.
     """
 
     coordinates: NDArray[np.float64]
-    lattice: Lattice
-    weights: NDArray[np.float64]
+    weights: SobolevWeights
     settings: TransformSettings
     threads: int | None = None
-    memory: float | None = None
+    allowed_bytes: float | None = None
 
     @property
     def largest(self) -> int:
-        """Samples that a block should have at most."""
-        if self.memory is None:
+        """Largest number of samples that a block should have."""
+        if self.allowed_bytes is None:
             return BLOCK_SAMPLES
-        each = _SAMPLE_BYTES + len(self.weights) * np.dtype(self.settings.dtype).itemsize
-        return max(1, min(BLOCK_SAMPLES, int(_SHARE_OF_BLOCKS * self.memory / each)))
+        sample_bytes = _SAMPLE_BYTES + len(self.weights.orders) * np.dtype(self.settings.dtype).itemsize
+        return max(1, min(BLOCK_SAMPLES, int(_BLOCK_FRACTION * self.allowed_bytes / sample_bytes)))
 
     def of_block(self, block: Block, difference: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-        """What a block adds to the witness functions, (orders, n)."""
-        dtype = self.settings.dtype
-        weighted = difference * self.lattice.trapezoid_weights(block)
-        shells = self.lattice.shells(block)
-        coefficients = np.empty((len(self.weights), *block.shape), dtype=dtype)
-        for row, weight in zip(coefficients, self.weights, strict=True):
+        """Return the contribution of a block to the witness functions, (orders, n)."""
+        lattice, dtype = self.weights.lattice, self.settings.dtype
+        weighted = difference * lattice.trapezoid_weights(block)
+        shells = lattice.shells(block)
+        coefficients = np.empty((len(self.weights.orders), *block.shape), dtype=dtype)
+        for row, weight in zip(coefficients, self.weights.per_shell, strict=True):
             np.multiply(weighted, weight[shells], out=row, casting="same_kind")
         threads = self.threads or os.cpu_count() or 1
         batching = Batching(NufftSpec(block.shape, self.settings.eps, dtype, threads=threads))
-        if self.memory is not None:
+        if self.allowed_bytes is not None:
             count = self.coordinates.shape[1]
-            allowed_bytes = (1 - _SHARE_OF_BLOCKS) * self.memory
+            allowed_bytes = (1 - _BLOCK_FRACTION) * self.allowed_bytes
             batching = fastest_batching(batching, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
-        return evaluate_at(self.coordinates, coefficients, self.lattice, block, batching)
+        return evaluate_at(self.coordinates, coefficients, lattice, block, batching)
 
 
 def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
-    """Points (n, 3) as one contiguous row per axis (3, n).
+    """Return points (n, 3) as one contiguous row per axis (3, n).
 
     Raises:
-        InputError: they are not real, finite or of that shape.
+        InputError: The points are not real, finite or of that shape.
     """
-    found = triples_of(points, "points")
-    bad = int(np.count_nonzero(~np.isfinite(found).all(axis=1)))
+    array = point_array(points, "points")
+    bad = int(np.count_nonzero(~np.isfinite(array).all(axis=1)))
     if bad:
-        raise InputError(f"{bad} of {len(found)} points have NaN or infinite coordinates")
-    return np.ascontiguousarray(found.T)
-
-
-def _labelled(values: NDArray[np.floating], order: Orders) -> xr.DataArray:
-    orders = np.asarray(order, dtype=np.float64)
-    dimensions = ("order",) * orders.ndim
-    return xr.DataArray(
-        values.reshape(*orders.shape, values.shape[1]),
-        dims=(*dimensions, "point"),
-        coords={"order": (dimensions, orders)},
-        name="witness",
-        attrs={"description": "positive where the first surface has area that the second lacks"},
-    )
+        raise InputError(f"{bad} of {len(array)} points have NaN or infinite coordinates")
+    return np.ascontiguousarray(array.T)

@@ -16,7 +16,7 @@ from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.spectral.shells import shell_sums, shell_weights
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
 
 ROWS = 11
@@ -84,7 +84,7 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
         found[:, np.array(others)[:, None], np.array(rows)] = np.swapaxes(values, 1, 2)
     assert np.array_equal(found, np.swapaxes(found, 1, 2))
     assert (np.diagonal(found, axis1=1, axis2=2) == 0).all()
-    weights = shell_weights(lattice, reducer.orders)
+    weights = SobolevWeights(lattice, reducer.orders).per_shell
     for i in range(ROWS):
         sums = shell_sums(fields - fields[i], None, lattice, lattice.half)
         assert found[:, i] == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-10)
@@ -114,13 +114,13 @@ def test_tiles_whose_others_are_all_other_rows(
     lattice = reducer.lattice
     differences = (fields[rows][:, None] - fields[others]).reshape(-1, *lattice.shape)
     sums = shell_sums(differences, None, lattice, lattice.half)
-    expected = np.sqrt(shell_weights(lattice, reducer.orders) @ sums.T).reshape(found.shape)
+    expected = np.sqrt(SobolevWeights(lattice, reducer.orders).per_shell @ sums.T).reshape(found.shape)
     assert found == pytest.approx(expected, rel=1e-10)
 
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     norms, to_center, parts = reducer.norms([1, 3, CENTER])
-    weights = shell_weights(reducer.lattice, reducer.orders)
+    weights = reducer.weights.per_shell
     for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
         sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
         assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)

@@ -18,13 +18,13 @@ from sobolev_batch.batch.study import lattice_choice as choice_module
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables.convergence import format_table
-from sobolev_batch.spectral.adaptive.solve import pilot_of
+from sobolev_batch.spectral.adaptive.solve import run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from tests.support.studies import small_table, variable
 
 RTOL = 1e-3
-original = pilot_of
+original = run_pilot
 
 
 def asking(rtol: float = RTOL, **changes: Any) -> Study:
@@ -91,7 +91,7 @@ def test_a_lattice_that_turns_out_too_small_grows(
 ) -> None:
     chosen = make_plan(asking()).choice
     small = Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
-    monkeypatch.setattr(choice_module, "pilot_of", lambda *_, **__: replace(original(*_, **__), lattice=small))
+    monkeypatch.setattr(choice_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=small))
     summary = run(asking(), store_path, client)
     grown = stored_choice(store_path)
     assert grown is not None
@@ -106,7 +106,7 @@ def test_what_falls_short_in_the_end_is_marked(
 ) -> None:
     monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
     monkeypatch.setattr(
-        choice_module, "pilot_of", lambda *_, **__: replace(original(*_, **__), lattice=Lattice(1.2, 12))
+        choice_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=Lattice(1.2, 12))
     )
     run(asking(), store_path, client)
     convergence = open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/1", order=-4.0)

@@ -26,7 +26,7 @@ from sobolev_batch import (
 from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.spectral.adaptive.solve import Aim
+from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.surfaces.sources.registry import Member, SurfaceMember
 from tests.support.smooth_shapes import roof, roof_derivatives, turned_torus
 from tests.support.studies import variable
@@ -200,10 +200,10 @@ def test_aims_of_smooth_references_are_met_by_settings() -> None:
     del table["lattice"]
     plan = make_plan(Study.from_table(table))
     aim = plan.aim(next(row for row in plan.rows if row.label == "reference"))
-    assert isinstance(aim, Aim)
+    assert isinstance(aim, DistanceTarget)
     assert plan.sample is not None
     assert np.abs(plan.sample.exact).max() > 0
-    goal = aim.goal(Torus(2.0 / 2.8, 0.8 / 2.8))
+    goal = aim.error_target(Torus(2.0 / 2.8, 0.8 / 2.8))
     assert all(norm > 0 for norm in goal.norms)
 
 

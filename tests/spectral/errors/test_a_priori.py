@@ -9,8 +9,15 @@ import pytest
 import trimesh
 
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.errors.a_priori import Census, Goal, loosest_tolerance, permits_single, settle
+from sobolev_batch.spectral.errors.a_priori import (
+    ErrorTarget,
+    SizeHistogram,
+    choose_settings,
+    loosest_tolerance,
+    permits_single,
+)
 from sobolev_batch.spectral.fields import field_for
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -36,13 +43,13 @@ def test_settled_fields_keep_their_goal_and_are_not_wasteful(name: str, order: f
     scale = norm(exact, order)["norm"].item()
     points = []
     for relative in (1e-2, 1e-4, 1e-6, 1e-8):
-        goal = Goal((order,), (relative * scale,))
-        settings = settle(mesh, LATTICE, goal, TransformSettings())
-        made = transform_block(mesh, LATTICE, LATTICE.half, settings)
-        error = norm(exact.copy(data=made.values - exact.values), order)["norm"].item()
+        target = ErrorTarget((order,), (relative * scale,))
+        settings = choose_settings(mesh, LATTICE, target, TransformSettings())
+        transformed = transform_block(mesh, LATTICE, LATTICE.half, settings)
+        error = norm(exact.copy(data=transformed.values - exact.values), order)["norm"].item()
         # The forecast is no bound: the probe says what came of it, and whoever needs it tightens.
-        assert error < 4 * goal.norms[0]
-        points.append(made.points)
+        assert error < 4 * target.norms[0]
+        points.append(transformed.points)
     assert points == sorted(points)
     careful = transform_block(mesh, LATTICE, LATTICE.half, TransformSettings(1e-8)).points
     assert points[-1] <= careful
@@ -52,11 +59,11 @@ def test_settled_fields_keep_their_goal_and_are_not_wasteful(name: str, order: f
 def test_probed_fields_keep_their_goal(name: str) -> None:
     mesh, orders = MESHES[name], (-2.0, -8.0)
     exact = fourier_transform(mesh, LATTICE, 1e-13)
-    goal = Goal(orders, tuple((1e-5 * norm(exact, orders)["norm"].values).tolist()))
-    field = field_for(mesh, LATTICE, goal, TransformSettings())
+    target = ErrorTarget(orders, tuple((1e-5 * norm(exact, orders)["norm"].values).tolist()))
+    field = field_for(mesh, LATTICE, target, TransformSettings())
     errors = norm(exact.copy(data=field.values - exact.values), orders)["norm"].values
-    assert (errors <= goal.norms).all()
-    assert (field.quality.probe.norms(LATTICE, orders) <= goal.norms).all()
+    assert (errors <= target.norms).all()
+    assert (field.quality.probe.norms(SobolevWeights(LATTICE, orders)) <= target.norms).all()
 
 
 def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
@@ -64,34 +71,34 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
     exact = fourier_transform(mesh, lattice, 1e-13)
     for tolerance in (0.2, 1e-2, 1e-3):
         settings = TransformSettings(1e-13, tolerance=tolerance)
-        made = transform_block(mesh, lattice, lattice.half, settings)
-        true = norm(exact.copy(data=made.values - exact.values), orders)["norm"].values
-        forecast = Census.of(mesh).quadrature_error(lattice, orders, tolerance)
+        transformed = transform_block(mesh, lattice, lattice.half, settings)
+        true = norm(exact.copy(data=transformed.values - exact.values), orders)["norm"].values
+        forecast = SizeHistogram.of(mesh).quadrature_error(lattice, orders, tolerance)
         assert (forecast > 0.5 * true).all()
         assert (forecast < 15 * true).all()
 
 
 def test_a_stricter_goal_never_loosens_the_rules() -> None:
     mesh = MESHES["drawn"]
-    goals = [Goal((-3.0,), (value,)) for value in np.geomspace(1e-1, 1e-12, 12)]
-    tolerances = [loosest_tolerance(mesh, LATTICE, goal) for goal in goals]
+    targets = [ErrorTarget((-3.0,), (value,)) for value in np.geomspace(1e-1, 1e-12, 12)]
+    tolerances = [loosest_tolerance(mesh, LATTICE, target) for target in targets]
     assert tolerances == sorted(tolerances, reverse=True)
-    assert goals[0].tightened(10.0).norms == pytest.approx([1e-2])
+    assert targets[0].tightened(10.0).norms == pytest.approx([1e-2])
 
 
 def test_single_precision_is_for_goals_above_its_rounding() -> None:
     area = Sphere().area
-    assert permits_single(Sphere(), LATTICE, Goal((-2.0,), (1e-4 * area,)))
-    assert not permits_single(Sphere(), LATTICE, Goal((-2.0,), (1e-8 * area,)))
-    field = field_for(Sphere(), LATTICE, Goal((-2.0,), (1e-4 * area,)), TransformSettings(dtype="complex64"))
+    assert permits_single(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-4 * area,)))
+    assert not permits_single(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-8 * area,)))
+    field = field_for(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-4 * area,)), TransformSettings(dtype="complex64"))
     # The rounding of a closed form to single precision is an error like any other.
     exact = fourier_transform(Sphere(), LATTICE)
     true = norm(exact.copy(data=field.values - exact.values), -2.0)["norm"].item()
-    assert 0 < true < field.quality.probe.norms(LATTICE, [-2.0])[0] < 1e-6 * area
+    assert 0 < true < field.quality.probe.norms(SobolevWeights(LATTICE, (-2.0,)))[0] < 1e-6 * area
 
 
 def test_settings_keep_precision_and_quadrature() -> None:
     given = TransformSettings(dtype="complex64")
-    settled = settle(BOX, LATTICE, Goal((-2.0,), (1e-9,)), given)
+    settled = choose_settings(BOX, LATTICE, ErrorTarget((-2.0,), (1e-9,)), given)
     assert replace(settled, eps=given.eps, tolerance=given.tolerance) == given
     assert settled.eps == 2e-7

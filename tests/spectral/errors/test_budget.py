@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.errors.budget import Sums, truncated
+from sobolev_batch.spectral.errors.budget import Sums, Support, truncated
 from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -34,11 +35,11 @@ def test_reported_errors_cover_the_true_ones_and_stay_near_them() -> None:
     for name, (a, b) in PAIRS.items():
         truth = distance(a, b, ORDERS, lattice=FINE)
         for lattice in COARSE:
-            found = distance(a, b, ORDERS, lattice=lattice)
-            true_errors = np.abs(found["distance"].values - truth["distance"].values)
+            dataset = distance(a, b, ORDERS, lattice=lattice)
+            true_errors = np.abs(dataset["distance"].values - truth["distance"].values)
             # Where the fine lattice cannot tell, there is nothing to compare with.
             telling = true_errors > 20 * truth["error"].values
-            ratio = found["error"].values[telling] / true_errors[telling]
+            ratio = dataset["error"].values[telling] / true_errors[telling]
             assert (ratio > 1).all(), (name, lattice, ratio)
             ratios.append(ratio)
     every = np.concatenate(ratios)
@@ -51,10 +52,10 @@ def test_closed_forms_lie_within_the_error() -> None:
     exact = distance(a, b, ORDERS)
     assert (exact["error"] <= 1e-12 * norm(a, ORDERS)["norm"] ** 2 / exact["distance"]).all()
     for lattice in (Lattice(3.0, 20), Lattice(5.0, 64)):
-        found = distance(a, b, ORDERS, lattice=lattice)
-        assert (np.abs(found["distance"] - exact["distance"]) <= found["error"] + exact["error"]).all()
-        total = found["truncation"] + found["aliasing"] + found["discretisation"]
-        assert np.allclose(found["error"], total, rtol=1e-14, atol=0)
+        dataset = distance(a, b, ORDERS, lattice=lattice)
+        assert (np.abs(dataset["distance"] - exact["distance"]) <= dataset["error"] + exact["error"]).all()
+        total = dataset["truncation"] + dataset["aliasing"] + dataset["discretisation"]
+        assert np.allclose(dataset["error"], total, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 4])
@@ -74,27 +75,28 @@ def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> Non
     assert first.probe.shells == again.probe.shells
     other = Quality.from_json(fourier_transform(icosphere(1), lattice).attrs["quality"])
     assert other.probe.shells != first.probe.shells
-    assert (first.probe.norms(lattice, [-1.3, -7.7]) > 0).all()
+    assert (first.probe.norms(SobolevWeights(lattice, (-1.3, -7.7))) > 0).all()
 
 
 def test_fields_of_unknown_origin_have_numbers_without_errors() -> None:
     lattice = Lattice(4.0, 32)
     field = fourier_transform(BOX, lattice)
-    found = norm(2 * field.drop_attrs(), ORDERS)
-    assert np.isnan(found["error"]).all()
-    assert np.allclose(found["norm"], 2 * norm(field, ORDERS)["norm"], rtol=1e-13)
+    dataset = norm(2 * field.drop_attrs(), ORDERS)
+    assert np.isnan(dataset["error"]).all()
+    assert np.allclose(dataset["norm"], 2 * norm(field, ORDERS)["norm"], rtol=1e-13)
 
 
 def test_truncation_only_adds() -> None:
     exact = norm(Sphere(), -2.0)["norm"].item()
-    found = norm(Sphere(), -2.0, lattice=Lattice(3.0, 48))
-    assert found["norm"].item() < exact <= found["norm"].item() + found["truncation"].item()
+    dataset = norm(Sphere(), -2.0, lattice=Lattice(3.0, 48))
+    assert dataset["norm"].item() < exact <= dataset["norm"].item() + dataset["truncation"].item()
 
 
 @pytest.mark.parametrize("growth", [1e-4, 3e-4, 1e-3, 1e-2])
 def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
     lattice = Lattice(4.0, 16)
     sums = Sums(np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
-    bound = truncated(sums, lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
-    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), lattice, (-2.0, -0.6), np.ones(1), np.full(13, 2.0))
+    weights, support = SobolevWeights(lattice, (-2.0, -0.6)), Support(np.ones(1), np.full(13, 2.0))
+    bound = truncated(sums, weights, support)
+    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), weights, support)
     assert bound == pytest.approx(flat, rel=0.3)

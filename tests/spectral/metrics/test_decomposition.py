@@ -1,4 +1,4 @@
-"""Area and shape: that they add up, are what a projection spelt out gives, and tell scaled surfaces from others."""
+"""Decompositions into area and shape against direct projections and closed forms."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ def test_is_the_projection_spelt_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     b = random_values(rng)
     a = rng.uniform(-2, 2) * b + rng.uniform(0, 2) * random_values(rng)
-    found = proportion(as_field(a), as_field(b), ORDERS)
+    dataset = proportion(as_field(a), as_field(b), ORDERS)
     for order in ORDERS:
-        here = found.sel(order=order)
+        row = dataset.sel(order=order)
 
         def norm(values: Complexes, order: float = order) -> float:
             return full_lattice_norm(values, LATTICE, order)
 
         # The inner product by polarisation.
         multiple = (norm(a + b) ** 2 - norm(a - b) ** 2) / (4 * norm(b) ** 2)
-        assert here["excess"].item() == pytest.approx(multiple - 1, rel=1e-10, abs=1e-12)
-        assert here["area_part"].item() == pytest.approx(abs(multiple - 1) * norm(b), rel=1e-10)
-        assert here["shape_part"].item() == pytest.approx(norm(a - multiple * b), rel=1e-10)
+        assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-10, abs=1e-12)
+        assert row["area_part"].item() == pytest.approx(abs(multiple - 1) * norm(b), rel=1e-10)
+        assert row["shape_part"].item() == pytest.approx(norm(a - multiple * b), rel=1e-10)
         # Any other multiple is farther away.
-        assert all(norm(a - (multiple + d) * b) > here["shape_part"].item() for d in (-1e-3, 1e-3))
+        assert all(norm(a - (multiple + d) * b) > row["shape_part"].item() for d in (-1e-3, 1e-3))
 
 
 def test_parts_add_up_to_the_squared_distance() -> None:
     rng = np.random.default_rng(7)
     a, b = as_field(random_values(rng)), as_field(random_values(rng))
-    found = proportion(a, b, ORDERS)
+    dataset = proportion(a, b, ORDERS)
     squares = distance(a, b, ORDERS)["distance"].values ** 2
-    assert (found["area_part"] ** 2 + found["shape_part"] ** 2).values == pytest.approx(squares, rel=1e-12)
-    assert found["distance"].values ** 2 == pytest.approx(squares, rel=1e-12)
-    assert found["area_share"].values == pytest.approx(found["area_part"].values ** 2 / squares, rel=1e-12)
+    assert (dataset["area_part"] ** 2 + dataset["shape_part"] ** 2).values == pytest.approx(squares, rel=1e-12)
+    assert dataset["distance"].values ** 2 == pytest.approx(squares, rel=1e-12)
+    assert dataset["area_share"].values == pytest.approx(dataset["area_part"].values ** 2 / squares, rel=1e-12)
 
 
 def test_near_twins_keep_their_digits() -> None:
@@ -69,33 +69,33 @@ def test_near_twins_keep_their_digits() -> None:
     b = np.round(random_values(rng) * 2**10) / 2**10
     e = np.round((0.3 * b + random_values(rng)) * 2**6) / 2**42
     assert np.array_equal((b + e) - b, e)
-    found = proportion(as_field(b + e), as_field(b), -3.0)
+    dataset = proportion(as_field(b + e), as_field(b), -3.0)
     larger = proportion(as_field(b + 2**30 * e), as_field(b), -3.0)
     for name in ("excess", "area_part", "shape_part"):
-        assert 2**30 * found[name].item() == pytest.approx(larger[name].item(), rel=1e-12)
+        assert 2**30 * dataset[name].item() == pytest.approx(larger[name].item(), rel=1e-12)
 
 
 def test_a_scaled_field_differs_in_area_alone() -> None:
     b = as_field(random_values(np.random.default_rng(9)))
-    found = proportion(0.75 * b, b, ORDERS)
-    assert found["excess"].values == pytest.approx(-0.25, rel=1e-12)
-    assert found["area_share"].values == pytest.approx(1, rel=1e-12)
-    assert (found["shape_part"] < 1e-7 * found["distance"]).all()
+    dataset = proportion(0.75 * b, b, ORDERS)
+    assert dataset["excess"].values == pytest.approx(-0.25, rel=1e-12)
+    assert dataset["area_share"].values == pytest.approx(1, rel=1e-12)
+    assert (dataset["shape_part"] < 1e-7 * dataset["distance"]).all()
 
 
 def test_spheres_of_two_radii_against_their_closed_forms() -> None:
     a, b = Sphere(0.9), Sphere()
-    found = proportion(a, b, [-10.0, -4.0], lattice=Lattice(5.0, 64))
+    dataset = proportion(a, b, [-10.0, -4.0], lattice=Lattice(5.0, 64))
     for order in (-10.0, -4.0):
-        here = found.sel(order=order)
+        row = dataset.sel(order=order)
         multiple = sphere_inner_product(a, b, order) / sphere_inner_product(b, b, order)
-        assert here["excess"].item() == pytest.approx(multiple - 1, rel=1e-4)
+        assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-4)
         left_over = sphere_inner_product(a, a, order) - multiple * sphere_inner_product(a, b, order)
-        assert here["shape_part"].item() ** 2 == pytest.approx(left_over, rel=1e-3)
+        assert row["shape_part"].item() ** 2 == pytest.approx(left_over, rel=1e-3)
 
 
 def share_in_the_limit(mesh: Mesh, radius: float, order: float) -> float:
-    """The area share of a mesh close to a sphere, from its mean displacement and lack of area alone.
+    """Return the area share of a mesh close to a sphere, from its mean displacement and lack of area alone.
 
     To first order the difference is -α σ^ - β ∂/∂R 4πr² sinc(2R|ξ|), α the relative lack of area and β
     the mean displacement: radial integrals, no lattice and no NUFFT.
@@ -127,10 +127,10 @@ def test_icospheres_against_the_sphere(radius: float, order: float) -> None:
     mesh = Mesh(radius * icosphere(3).vertices, icosphere(3).triangles)
     sphere = fourier_transform(Sphere(radius), lattice)
     field = fourier_transform(mesh, lattice, 1e-11)
-    found = proportion(field, sphere, order)
+    dataset = proportion(field, sphere, order)
     square = distance(field, sphere, order)["distance"].item() ** 2
-    assert (found["area_part"] ** 2 + found["shape_part"] ** 2).item() == pytest.approx(square, rel=1e-10)
-    assert found["area_share"].item() == pytest.approx(share_in_the_limit(mesh, radius, order), rel=0.04)
+    assert (dataset["area_part"] ** 2 + dataset["shape_part"] ** 2).item() == pytest.approx(square, rel=1e-10)
+    assert dataset["area_share"].item() == pytest.approx(share_in_the_limit(mesh, radius, order), rel=0.04)
 
 
 def test_area_dominates_between_surfaces_smaller_than_the_wavelengths_of_the_norm() -> None:
@@ -140,19 +140,19 @@ def test_area_dominates_between_surfaces_smaller_than_the_wavelengths_of_the_nor
     shares = {}
     for radius in (1.0, 0.3, 0.1):
         mesh = Mesh(radius * icosphere(3).vertices, icosphere(3).triangles)
-        found = proportion(mesh, Sphere(radius), -10.0, lattice=lattice)
-        shares[radius] = found["area_share"].item()
-        assert found["excess"].item() < 0
+        dataset = proportion(mesh, Sphere(radius), -10.0, lattice=lattice)
+        shares[radius] = dataset["area_share"].item()
+        assert dataset["excess"].item() < 0
     assert shares[1.0] == pytest.approx(0.2, abs=0.01)
     assert shares[0.3] > 0.9
     assert shares[0.1] > 0.999
 
 
 def test_a_moved_surface_differs_in_shape_alone() -> None:
-    found = proportion(Sphere(0.7, (0.05, 0, 0)), Sphere(0.7), -4.0, lattice=Lattice(4.0, 40))
+    dataset = proportion(Sphere(0.7, (0.05, 0, 0)), Sphere(0.7), -4.0, lattice=Lattice(4.0, 40))
     # <a, b> < <b, b>: of what has moved, a little less of the reference is the best.
-    assert found["excess"].item() < 0
-    assert found["area_share"].item() < 0.05
+    assert dataset["excess"].item() < 0
+    assert dataset["area_share"].item() < 0.05
 
 
 def test_equal_and_missing_fields() -> None:

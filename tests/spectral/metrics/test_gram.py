@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.errors.budget import Sums, add_sums, sums_of_shells
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
-from sobolev_batch.spectral.shells import shell_sums
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 LATTICE = Lattice(4.0, 24)
 ORDERS = (-2.0, -7.5)
+WEIGHTS = SobolevWeights(LATTICE, ORDERS)
 
 
 def test_blocks_of_products_give_every_distance() -> None:
@@ -22,19 +23,19 @@ def test_blocks_of_products_give_every_distance() -> None:
     center = fourier_transform(Sphere(), LATTICE)
     parts, own = [], []
     for block in LATTICE.split(2_000):
-        arrangement = Arrangement.of(LATTICE, block, ORDERS)
+        arrangement = Arrangement.of(WEIGHTS, block)
         part = np.stack([(f - center).values[LATTICE.place(block)].ravel()[arrangement.order] for f in fields])
         parts.append(arrangement.products(part, part))
         own.append(arrangement.squares(part))
-    found, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))
+    sums, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))
     for i in range(4):
         for j in range(i):
             expected = distance(fields[i], fields[j], ORDERS)["distance"].values
-            assert np.sqrt(found.squares.sum(axis=1)[:, i, j]) == pytest.approx(expected, rel=1e-10)
+            assert np.sqrt(sums.squares.sum(axis=1)[:, i, j]) == pytest.approx(expected, rel=1e-10)
             shells = shell_sums((fields[i] - fields[j]).values, None, LATTICE, LATTICE.half)
-            direct = sums_of_shells(shells, LATTICE, ORDERS)
-            assert found.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
-            assert found.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
+            direct = sums_of_shells(shells, WEIGHTS)
+            assert sums.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
+            assert sums.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
     assert not cancelled[~np.eye(4, dtype=bool)].any()
     assert cancelled.diagonal().all()
 
@@ -49,10 +50,10 @@ def random_fields(count: int, lattice: Lattice) -> NDArray[np.complex128]:
 def test_sums_are_those_of_shells(intervals: int) -> None:
     lattice = Lattice(4.0, intervals)
     fields = random_fields(3, lattice)
-    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
     squares = arrangement.squares(np.take(fields, arrangement.order, axis=1))
     expected = sums_of_shells(
-        shell_sums(fields.reshape(3, *lattice.shape), None, lattice, lattice.half), lattice, ORDERS
+        shell_sums(fields.reshape(3, *lattice.shape), None, lattice, lattice.half), SobolevWeights(lattice, ORDERS)
     )
     assert squares.squares == pytest.approx(expected.squares, rel=1e-13)
     # Of noise, the mean of n samples is known to 1/√n, and n is 1024 or more in each window.
@@ -61,14 +62,14 @@ def test_sums_are_those_of_shells(intervals: int) -> None:
 
 def test_an_arrangement_has_every_sample_once_and_few_of_the_outer_ones() -> None:
     lattice = Lattice(4.0, 64)
-    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
     assert np.array_equal(np.sort(arrangement.order), np.arange(lattice.half.size))
-    ends = [(piece.samples.start, piece.samples.stop) for piece in arrangement.pieces]
+    ends = [(run.samples.start, run.samples.stop) for run in arrangement.runs]
     assert [start for start, _ in ends] == [0, *(stop for _, stop in ends[:-1])]
     assert ends[-1][1] == lattice.half.size
-    for piece in arrangement.pieces:
-        assert np.all(arrangement.shells[piece.samples] % 4 == piece.residue)
-    sampled = sum(piece.samples.stop - piece.samples.start for piece in arrangement.pieces if piece.window is not None)
+    for run in arrangement.runs:
+        assert np.all(arrangement.shells[run.samples] % 4 == run.residue)
+    sampled = sum(run.samples.stop - run.samples.start for run in arrangement.runs if run.window is not None)
     assert sampled < lattice.half.size / 15
 
 
@@ -77,16 +78,16 @@ def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
     lattice = Lattice(4.0, 40)
     one, two = random_fields(2, lattice)
     twin = one + 1e-2 * two
-    arrangement = Arrangement.of(lattice, lattice.half, ORDERS)
+    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
     pair = np.stack([one[arrangement.order], twin[arrangement.order]])
     squares = arrangement.squares(pair)
-    found, _ = differences(arrangement.products(pair, pair), squares, squares)
+    sums, _ = differences(arrangement.products(pair, pair), squares, squares)
     expected = arrangement.squares((twin - one)[arrangement.order][None])
-    assert found.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
+    assert sums.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
 
 
 def single(value: float, *shape: int) -> Sums:
-    """One order, all of the square in the first residue."""
+    """Return sums of one order with all of the square in the first residue."""
     squares = np.zeros((1, 4, *shape))
     squares[0, 0] = value
     return Sums(squares, np.zeros((2, *shape)))
@@ -95,6 +96,6 @@ def single(value: float, *shape: int) -> Sums:
 def test_near_twins_are_reported() -> None:
     _, cancelled = differences(single(4.0 - 1e-7, 1, 1), single(4.0, 1), single(4.0, 1))
     assert cancelled[0, 0]
-    found, cancelled = differences(single(3.9, 1, 1), single(4.0, 1), single(4.0, 1))
+    sums, cancelled = differences(single(3.9, 1, 1), single(4.0, 1), single(4.0, 1))
     assert not cancelled[0, 0]
-    assert found.squares.sum() == pytest.approx(0.2)
+    assert sums.squares.sum() == pytest.approx(0.2)

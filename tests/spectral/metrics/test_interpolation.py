@@ -41,12 +41,13 @@ def test_against_the_exact_transform(mesh: Mesh, M: int, inside: float, beside: 
     outer = rng.uniform(-5, 5, (150, 3))
     outer[np.arange(150), rng.integers(0, 3, 150)] = rng.choice([-1, 1], 150) * rng.uniform(5 - lattice.spacing, 5, 150)
     for frequencies, tolerance in ((inner, inside), (outer, beside)):
-        found = interpolate(field, frequencies)
-        errors = np.abs(found.values - exact_transform(mesh, frequencies))
+        interpolated = interpolate(field, frequencies)
+        errors = np.abs(interpolated.values - exact_transform(mesh, frequencies))
         assert errors.max() < tolerance * mesh.area
-        # What it says of its error holds, and is not idle.
-        assert (errors <= found["error"].values + 3 * EPS * mesh.area * found["amplification"].values).all()
-        assert found["error"].values.max() < 1e-4 * mesh.area
+        # The bound holds, and is not idle.
+        bounds, amplification = interpolated["error"].values, interpolated["amplification"].values
+        assert (errors <= bounds + 3 * EPS * mesh.area * amplification).all()
+        assert bounds.max() < 1e-4 * mesh.area
 
 
 def test_known_bounds() -> None:
@@ -64,12 +65,12 @@ def test_samples_and_their_conjugates_come_back() -> None:
     lattice = Lattice(3.0, 48)
     field = fourier_transform(away((0.3, 0.2, -0.1)), lattice, EPS)
     frequencies = np.array([[0, 0, 0], [1.5, -0.75, 2.0], [-3, 3, -3], [-1.5, 0.75, -2.0]])
-    found = interpolate(field, frequencies).values
+    interpolated = interpolate(field, frequencies).values
     expected = field.sel(xi_x=1.5, xi_y=-0.75, xi_z=2.0).item()
-    assert found[0] == pytest.approx(field.sel(xi_x=0, xi_y=0, xi_z=0).item(), rel=1e-9)
-    assert found[1] == pytest.approx(expected, rel=0, abs=1e-9)
-    assert found[3] == np.conj(found[1])
-    assert found[2] == pytest.approx(np.conj(field.sel(xi_x=3, xi_y=-3, xi_z=3).item()), rel=0, abs=1e-7)
+    assert interpolated[0] == pytest.approx(field.sel(xi_x=0, xi_y=0, xi_z=0).item(), rel=1e-9)
+    assert interpolated[1] == pytest.approx(expected, rel=0, abs=1e-9)
+    assert interpolated[3] == np.conj(interpolated[1])
+    assert interpolated[2] == pytest.approx(np.conj(field.sel(xi_x=3, xi_y=-3, xi_z=3).item()), rel=0, abs=1e-7)
 
 
 def test_fields_that_do_not_know_their_box() -> None:
@@ -78,8 +79,8 @@ def test_fields_that_do_not_know_their_box() -> None:
     frequencies = np.random.default_rng(2).uniform(-3, 3, (20, 3))
     with pytest.raises(InputError, match="pass reach"):
         interpolate(field, frequencies)
-    found = interpolate(field, frequencies, reach=0.8)
-    assert found.values == pytest.approx(sphere_transform(sphere, frequencies), rel=0, abs=1e-9)
+    interpolated = interpolate(field, frequencies, reach=0.8)
+    assert interpolated.values == pytest.approx(sphere_transform(sphere, frequencies), rel=0, abs=1e-9)
     with pytest.raises(LatticeError, match="reach must lie between"):
         interpolate(field, frequencies, reach=3.3)
 
@@ -104,8 +105,8 @@ def test_the_whole_lattice() -> None:
     for name in ("xi_x", "xi_y", "xi_z"):
         assert np.array_equal(full[name], lattice.axes[0])
     frequencies: Reals = np.random.default_rng(3).integers(-4, 5, (40, 3)) * lattice.axes[2][1]
-    found = [full.sel(xi_x=x, xi_y=y, xi_z=z).item() for x, y, z in frequencies]
-    assert np.asarray(found) == pytest.approx(exact_transform(mesh, frequencies), rel=0, abs=1e-11)
+    interpolated = [full.sel(xi_x=x, xi_y=y, xi_z=z).item() for x, y, z in frequencies]
+    assert np.asarray(interpolated) == pytest.approx(exact_transform(mesh, frequencies), rel=0, abs=1e-11)
     stacked = xr.concat([field, 2 * field], dim="mesh").assign_coords(mesh=["a", "b"])
     lazy = full_lattice(stacked.chunk({"mesh": 1}).transpose("xi_z", "mesh", "xi_x", "xi_y"))
     assert isinstance(lazy.data, dask.array.Array)

@@ -21,7 +21,6 @@ from sobolev_batch import (
 )
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
-from sobolev_batch.spectral.shells import shell_sums, shell_weights
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -38,8 +37,8 @@ def test_norm_is_the_trapezoidal_rule_over_the_whole_cube(order: float) -> None:
 
 def test_distance_is_the_norm_of_the_difference() -> None:
     a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(), LATTICE)
-    found = distance(a, b, [-1.0, -3.0])["distance"].values
-    assert found == pytest.approx([full_lattice_norm((a - b).values, LATTICE, s) for s in (-1.0, -3.0)], rel=1e-13)
+    distances = distance(a, b, [-1.0, -3.0])["distance"].values
+    assert distances == pytest.approx([full_lattice_norm((a - b).values, LATTICE, s) for s in (-1.0, -3.0)], rel=1e-13)
 
 
 def test_inner_product_polarises() -> None:
@@ -117,11 +116,3 @@ def test_single_precision_fields_are_summed_in_double() -> None:
     field = fourier_transform(icosphere(2), LATTICE, 1e-6)
     single = norm(field.astype(np.complex64), -2)["norm"].item()
     assert single == pytest.approx(norm(field, -2)["norm"].item(), rel=1e-7)
-
-
-def test_shell_sums_of_blocks_add_up() -> None:
-    field = fourier_transform(BOX, LATTICE)
-    parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
-    whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
-    assert np.allclose(parts, whole, rtol=1e-13, atol=0)
-    assert shell_weights(LATTICE, [-2.0]) @ whole == pytest.approx(norm(field, -2)["norm"].item() ** 2, rel=1e-14)

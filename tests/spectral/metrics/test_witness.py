@@ -1,4 +1,4 @@
-"""The witness function against direct sums, the kernel in real space, and the squared distance it integrates to."""
+"""Witness functions against direct sums, the kernel in real space, and the squared distance."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ORDERS = [-0.8, -3.0, -10.0]
 
 
 def random_pair(seed: int) -> tuple[Complexes, Complexes]:
-    """Two half fields of random points: real measures, but nothing smooth about them."""
+    """Return two fields of random points: real measures that are not smooth."""
     rng = np.random.default_rng(seed)
     fields: list[Complexes] = []
     for _ in range(2):
@@ -51,7 +51,7 @@ def random_pair(seed: int) -> tuple[Complexes, Complexes]:
 
 
 def direct_sum(difference: Complexes, lattice: Lattice, order: float, points: Reals) -> Reals:
-    """The trapezoidal rule spelt out on the whole cube, conjugate half and all."""
+    """Return the witness function by the trapezoidal rule on the whole cube, conjugate half included."""
     whole = np.concatenate([np.conj(difference[::-1, ::-1, :0:-1]), difference], axis=2)
     axis = lattice.axes[0]
     ends = np.where(np.abs(axis) == lattice.xi_max, 0.5, 1.0) * lattice.spacing
@@ -71,12 +71,12 @@ def as_field(values: Complexes) -> xr.DataArray:
 def test_is_the_direct_sum_over_the_whole_lattice(seed: int) -> None:
     a, b = random_pair(seed)
     points = np.random.default_rng(seed).uniform(-0.99, 0.99, (23, 3)) * LATTICE.half_period
-    found = witness(as_field(a), as_field(b), ORDERS, points, eps=1e-13)
-    assert found.dims == ("order", "point")
+    evaluated = witness(as_field(a), as_field(b), ORDERS, points, eps=1e-13)
+    assert evaluated.dims == ("order", "point")
     for order in ORDERS:
         expected = direct_sum(a - b, LATTICE, order, points)
         # A lattice of so few samples: the sum of all terms is not much above the largest values.
-        assert found.sel(order=order).values == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
+        assert evaluated.sel(order=order).values == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
 
 
 def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,16 +132,16 @@ def test_is_the_difference_smoothed_by_the_matern_kernel() -> None:
             r = np.linalg.norm(points[:, None] - batch.coordinates.T, axis=2)
             kernel = 2 * np.pi**power / gamma(power) * r ** (power - 1.5) * kv(1.5 - power, 2 * np.pi * r)
             expected += sign * kernel @ batch.weights
-    found = witness(BOX, shrunk, order, points, lattice=Lattice(7.0, 80)).values
-    assert found == pytest.approx(expected, rel=0, abs=1e-7 * np.abs(expected).max())
+    evaluated = witness(BOX, shrunk, order, points, lattice=Lattice(7.0, 80)).values
+    assert evaluated == pytest.approx(expected, rel=0, abs=1e-7 * np.abs(expected).max())
 
 
 def test_is_positive_where_the_first_has_more() -> None:
     lattice = Lattice(4.0, 40)
     right = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
-    found = witness(Sphere(0.5, (0.5, 0, 0)), Sphere(0.5, (-0.5, 0, 0)), -4.0, right, lattice=lattice).values
-    assert found[0] > 0 > found[1]
-    assert found[0] == pytest.approx(-found[1], rel=1e-9)
+    evaluated = witness(Sphere(0.5, (0.5, 0, 0)), Sphere(0.5, (-0.5, 0, 0)), -4.0, right, lattice=lattice).values
+    assert evaluated[0] > 0 > evaluated[1]
+    assert evaluated[0] == pytest.approx(-evaluated[1], rel=1e-9)
     assert witness(Sphere(), Sphere(), -4.0, right, lattice=lattice).values == pytest.approx([0, 0], abs=1e-15)
 
 
@@ -154,7 +154,7 @@ def test_single_precision_and_little_memory() -> None:
     single = witness(a, b, -3.0, points, dtype="complex64", threads=1)
     assert single.dtype == np.float32
     assert 1e-9 * scale < float(np.abs(single - exact).max()) < 1e-4 * scale
-    little = witness(a, b, -3.0, points, eps=1e-12, memory=1.5e7)
+    little = witness(a, b, -3.0, points, eps=1e-12, memory="15MB")
     assert float(np.abs(little - exact).max()) < 1e-9 * scale
     with pytest.raises(InputError, match="give at least"):
         witness(a, b, -3.0, points, memory=1e5)

@@ -1,0 +1,177 @@
+"""Lattices that give an accuracy: a first one from the surfaces' sizes, a refined one from their sums."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import accumulate, repeat, takewhile
+from operator import mul
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from scipy.special import betainc
+
+from sobolev_batch.errors import AccuracyError
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import (
+    ALIASING_CAUTION,
+    TRUNCATION_CAUTION,
+    Sums,
+    Support,
+    aliased,
+    image_weight,
+    truncated,
+)
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.shells import SobolevWeights
+
+Reals = NDArray[np.float64]
+
+# Before a pair is measured: how much larger than the kernel alone predicts its images may be, and
+# how much larger its tail than that of two surfaces close to each other.
+_IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
+# If those laws ask for more than this, a pilot lattice of this size measures the pair first.
+_PILOT_M = 64
+# Before an accuracy is refused, a larger pilot may look further.
+_LARGER_PILOT_M = 128
+_HIGHEST_FREQUENCY = 1e4
+# Surfaces end this much short of the period.
+_CLEARANCE = 1.001
+# An accuracy called reachable must hold when it is asked for, on a pilot that differs a little.
+_REACHABLE_MARGIN = 1.5
+_STEP = 1.04
+
+
+def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
+    """Return the lattice for two surfaces close to each other, before anything else is known of them.
+
+    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that asks for
+    a large lattice, the result is a small pilot lattice.
+
+    Args:
+        support: Sizes of the surfaces, reach included: the period is above twice that.
+        orders: Orders s.
+        accuracy: Accuracy of the distance.
+
+    Returns:
+        The lattice, and True if it is a pilot that is likely to be `refined`.
+    """
+    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
+    radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
+    highest = radii[0]
+    for order in orders:
+        # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
+        tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
+        allowed = accuracy.truncation_part(order) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+        enough = np.flatnonzero(tails <= allowed)
+        highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
+    most = min(_PILOT_M, accuracy.largest_intervals)
+    return lattice_of(highest, period, most), 2 * highest * period > most
+
+
+def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
+    """Return a pilot that sees further than one on which an accuracy seemed out of reach, or None."""
+    intervals = min(_LARGER_PILOT_M, accuracy.largest_intervals)
+    return Lattice(intervals * lattice.spacing / 2, intervals) if intervals > lattice.M else None
+
+
+def lattice_of(highest: float, period: float, most: int) -> Lattice:
+    """Return the lattice of a period 1/h that reaches to a frequency, or as far as M allows.
+
+    Args:
+        highest: Frequency to reach, in cycles per unit length. A good M may reach beyond it.
+        period: Period 1/h, in units of length.
+        most: Largest M.
+    """
+    intervals = most if 2 * highest * period > most else min(good_intervals(2 * highest * period), most)
+    return Lattice(intervals / (2 * period), intervals)
+
+
+def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Accuracy, label: str) -> Lattice:
+    """Return the lattice that distances need, from their sums on a smaller one.
+
+    Args:
+        sums: Sums of the difference of a pair of surfaces, or of several pairs.
+        weights: Weights of these sums, on the smaller lattice.
+        support: Sizes of the surfaces.
+        accuracy: Accuracy of the distances.
+        label: Name of the pair in messages.
+
+    Returns:
+        A lattice at least as fine and as large as the smaller one.
+
+    Raises:
+        AccuracyError: The lattice does not fit into the memory; the message gives the reachable rtol.
+    """
+    lattice, orders = weights.lattice, weights.orders
+    period = _refined_period(sums, weights, support.widths, accuracy)
+
+    def tail(highest: float) -> Reals:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tails = np.nan_to_num(truncated(sums, weights, support, highest) / (2 * sums.totals), posinf=0.0)
+        return np.asarray(tails.reshape(len(orders), -1).max(axis=1))
+
+    most = accuracy.largest_intervals
+    allowed = np.array([accuracy.truncation_part(order) for order in orders])
+    larger = accumulate(repeat(_STEP), mul, initial=lattice.xi_max)
+    candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
+    highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
+    if highest is None:
+        excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
+        worst = int(np.argmax(excess))
+        reachable = _rounded_up(_REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol)
+        advice = f"about {reachable:g} can be reached; ask for that, allow more memory, or take"
+        if reachable >= 1:
+            advice = "not even one digit can be reached; allow more memory or take"
+        raise AccuracyError(
+            f"{label}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: within "
+            f"{accuracy.allowed_bytes / 1e9:.3g} GB (M <= {most}) {advice} a more negative order",
+            accuracy.rtol,
+            reachable,
+        )
+    return lattice_of(highest, period, most)
+
+
+def good_intervals(least: float) -> int:
+    """Return an even M of at least ``least`` for which the FFT of the fine grid is fast and hardly padded."""
+
+    def fine_grid(modes: int) -> int:
+        return 2 * int(next_fast_len(modes, real=True))
+
+    smallest = 2 * math.ceil(least / 2)
+    choices = range(smallest, smallest + max(8, smallest // 8), 2)
+    return min(choices, key=lambda M: (fine_grid(M + 1) ** 2 * fine_grid(M // 2 + 1), -M))
+
+
+def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy: Accuracy) -> float:
+    """Return the period 1/h at which the images that the sums show are small enough."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        images = np.nan_to_num(aliased(sums, weights, widths) / (2 * sums.totals), posinf=0.0)
+    images = images.reshape(len(weights.orders), -1).max(axis=1)
+    first = 1 / weights.lattice.spacing
+    before = [image_weight(1 / first, order, widths) for order in weights.orders]
+
+    def suffices(period: float) -> bool:
+        return period >= first + 8 or not any(
+            image * image_weight(1 / period, order, widths) / weight > accuracy.aliasing_part
+            for image, order, weight in zip(images, weights.orders, before, strict=True)
+        )
+
+    return next(filter(suffices, accumulate(repeat(0.02 / weights.lattice.spacing), initial=first)))
+
+
+def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> float:
+    """Return the period 1/h at which the kernel alone predicts images that are small enough."""
+    allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
+
+    def suffices(period: float) -> bool:
+        return all(image_weight(1 / period, order, widths) <= allowed for order in orders)
+
+    return next(filter(suffices, accumulate(repeat(1.01), mul, initial=float(widths.max()))))
+
+
+def _rounded_up(value: float) -> float:
+    """Round up to two digits: an estimate has no more."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit) * unit

@@ -1,0 +1,148 @@
+"""Norms and distances to an accuracy."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from sobolev_batch import (
+    AccuracyError,
+    InputError,
+    Lattice,
+    Mesh,
+    OrderError,
+    Sphere,
+    distance,
+    fourier_transform,
+    icosphere,
+    norm,
+)
+from tests.support.shapes import CENTRED_BOX as BOX
+
+
+@pytest.mark.parametrize(("order", "rtol"), [(-3.0, 1e-2), (-3.0, 1e-4), (-5.0, 1e-3), (-5.0, 1e-6), (-10.0, 1e-9)])
+def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: float) -> None:
+    a, b = Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.7, (-0.2, 0.1, 0.0))
+    exact = distance(a, b, order)["distance"].item()
+    dataset = distance(a, b, order, rtol=rtol)
+    assert dataset["within"].item()
+    assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= rtol * dataset["distance"].item()
+
+
+def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
+    dataset = distance(icosphere(6), Sphere(), -10.0, rtol=1e-5)
+    relative = dataset["distance"].item() / norm(Sphere(), -10.0)["norm"].item()
+    assert relative == pytest.approx(7.383836e-05, rel=1e-5)
+    # Far fewer samples and points than the paper's 129³ and 64 a triangle.
+    assert dataset.attrs["M"] <= 48
+    assert dataset.attrs["points"][0] <= 6 * 81_920
+    assert dataset.attrs["rtol"] == 1e-5
+
+
+def test_several_orders_share_what_the_most_demanding_needs() -> None:
+    box = Mesh(0.9 * BOX.vertices, BOX.triangles)
+    together = distance(BOX, box, [-3.0, -10.0], rtol=1e-3)
+    assert together["within"].all()
+    assert together["within"].dims == ("order",)
+    alone = distance(BOX, box, -10.0, rtol=1e-3)
+    assert alone.attrs["xi_max"] < together.attrs["xi_max"]
+    difference = abs(together["distance"].values[1] - alone["distance"].item())
+    assert difference <= together["error"].values[1] + alone["error"].item()
+
+
+def test_norms_too() -> None:
+    exact = norm(Sphere(0.5), -4.0)["norm"].item()
+    dataset = norm(Sphere(0.5), -4.0, rtol=1e-5)
+    assert abs(dataset["norm"].item() - exact) <= dataset["error"].item() <= 1e-5 * exact
+    assert norm(icosphere(2), -4.0, rtol=1e-4)["within"].item()
+
+
+def test_low_accuracy_is_computed_in_single_precision() -> None:
+    assert distance(icosphere(1), Sphere(), -5.0, rtol=1e-2).attrs["dtype"] == "complex64"
+    assert distance(icosphere(1), Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
+
+
+def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
+    pair = icosphere(0), icosphere(1)
+    with pytest.raises(
+        AccuracyError, match=r"rtol 1e-06 is out of reach at order -2: within 0\.6 GB .* about"
+    ) as caught:
+        distance(*pair, -2.0, rtol=1e-6, memory=6e8)
+    assert caught.value.requested == 1e-6
+    assert 1e-6 < caught.value.reachable < 0.1
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (str(copy), copy.reachable) == (str(caught.value), caught.value.reachable)
+    assert distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
+
+
+def test_equal_surfaces_have_a_distance_below_rounding() -> None:
+    dataset = distance(BOX, Mesh(BOX.vertices, BOX.triangles), -3.0, rtol=1e-3)
+    assert dataset["distance"].item() <= dataset["error"].item()
+
+
+def test_refuses_what_has_no_meaning() -> None:
+    lattice = Lattice(2.0, 16)
+    field = fourier_transform(BOX, lattice)
+    for rtol, memory in ((0.0, None), (1.0, None), (np.nan, None), (1e-3, -1.0), (None, 1e9)):
+        with pytest.raises(InputError, match=r"rtol|memory"):
+            distance(BOX, Sphere(), -2.0, rtol=rtol, memory=memory)
+    with pytest.raises(InputError, match="an rtol chooses the lattice"):
+        distance(BOX, Sphere(), -2.0, rtol=1e-3, lattice=lattice)
+    with pytest.raises(InputError, match="an rtol chooses the lattice"):
+        distance(field, Sphere(), -2.0, rtol=1e-3)
+    for wrong in ({"rtol": "a"}, {"rtol": True}):
+        with pytest.raises(InputError, match="rtol must be a number"):
+            distance(BOX, Sphere(), -2.0, **wrong)
+    with pytest.raises(InputError, match=r"memory must be a positive number of bytes, or a size .* found 'much'"):
+        distance(BOX, Sphere(), -2.0, rtol=1e-3, memory="much")
+    with pytest.raises(InputError, match="expected a Mesh"):
+        distance("box.ply", Sphere(), -2.0, rtol=1e-3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"1e-06 GB of memory are too little"):
+        distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
+
+
+def test_memory_as_text() -> None:
+    as_text, as_number = (distance(BOX, Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8))
+    assert as_text.identical(as_number)
+
+
+def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
+    a, b = icosphere(2), icosphere(3)
+    centred = distance(a, b, -3.0, rtol=1e-3)
+    away = np.array([1000.0, -2000.0, 500.0])
+    moved = distance(Mesh(a.vertices + away, a.triangles), Mesh(b.vertices + away, b.triangles), -3.0, rtol=1e-3)
+    assert moved["within"].item()
+    assert abs(centred["distance"].item() - moved["distance"].item()) <= centred["error"].item() + moved["error"].item()
+    apart = distance(Sphere(1.0, (500.0, 0, 0)), Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
+    exact = distance(Sphere(), Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
+    assert abs(apart["distance"].item() - exact) <= apart["error"].item()
+
+
+def test_a_larger_pilot_looks_before_an_accuracy_is_refused() -> None:
+    # The first pilot, up to some 8 cycles, sees the distance of near meshes still growing.
+    dataset = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
+    assert dataset["within"].item()
+    assert dataset.attrs["M"] > 64
+
+
+def test_what_lies_below_rounding_is_refused() -> None:
+    with pytest.raises(AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
+        distance(icosphere(3), Sphere(), -10.0, rtol=1e-12)
+    assert 1e-12 < caught.value.reachable < 1e-8
+    assert distance(icosphere(3), Sphere(), -10.0, rtol=1.5 * caught.value.reachable)["within"].item()
+
+
+@pytest.mark.parametrize("order", [-40.0, -100.0])
+def test_very_negative_orders(order: float) -> None:
+    exact = distance(Sphere(), Sphere(0.9), order)["distance"].item()
+    dataset = distance(Sphere(), Sphere(0.9), order, rtol=1e-4)
+    assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= 1e-4 * exact
+    with pytest.raises(OrderError, match="orders go down to -100"):
+        distance(Sphere(), Sphere(0.9), [order, -1e6], rtol=1e-4)
+
+
+def test_many_orders_at_once_end_soon() -> None:
+    with pytest.raises(AccuracyError, match=r"not even one digit|can be reached"):
+        distance(Sphere(), Sphere(1.01), [-0.6, -2.0, -20.0], rtol=1e-4)

@@ -1,0 +1,62 @@
+"""Labels of the datasets of metrics: units, long names, the lattice and the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sobolev_batch import (
+    Lattice,
+    Sphere,
+    distance,
+    fourier_transform,
+    icosphere,
+    inner_product,
+    norm,
+    proportion,
+    spectrum,
+    witness,
+)
+
+LATTICE = Lattice(2.0, 16)
+A, B = fourier_transform(icosphere(1), LATTICE), fourier_transform(Sphere(), LATTICE, dtype="complex64")
+POINTS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+METRICS: dict[str, Callable[[list[float]], xr.Dataset]] = {
+    "norm": lambda order: norm(A, order),
+    "inner_product": lambda order: inner_product(A, B, order),
+    "distance": lambda order: distance(A, B, order),
+    "proportion": lambda order: proportion(A, B, order),
+    "spectrum": lambda order: spectrum(A, B, order),
+    "witness": lambda order: witness(A, B, order, POINTS).to_dataset(promote_attrs=True),
+}
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_every_number_has_a_unit_and_a_name(name: str) -> None:
+    dataset = METRICS[name]([-2.0, -3.0])
+    assert dataset.attrs["kernel"] == "weight (1 + |xi|^2)^s, xi in cycles per unit length"
+    assert (dataset.attrs["xi_max"], dataset.attrs["M"]) == (2.0, 16)
+    assert dataset.attrs["dtype"] == ("complex128" if name == "norm" else "complex128, complex64")
+    for variable in dataset.variables:
+        assert dataset[variable].attrs["long_name"], variable
+        assert dataset[variable].attrs["units"], variable
+    assert dataset["order"].values.tolist() == [-2.0, -3.0]
+
+
+def test_closed_forms_have_no_lattice() -> None:
+    assert set(distance(Sphere(), Sphere(0.5), -2.0).attrs) == {"kernel"}
+
+
+def test_settings_of_an_accuracy_are_attributes() -> None:
+    dataset = distance(icosphere(0), Sphere(), [-5.0], rtol=0.1)
+    assert dataset["within"].attrs["long_name"]
+    assert {"kernel", "rtol", "xi_max", "M", "dtype", "eps", "tolerance", "points"} == set(dataset.attrs)
+
+
+def test_witness_keeps_the_points() -> None:
+    values = witness(A, B, [-2.0], POINTS)
+    assert np.array_equal(np.stack([values[axis].values for axis in "xyz"], axis=1), POINTS)
+    assert values["x"].dims == ("point",)
