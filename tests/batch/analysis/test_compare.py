@@ -173,11 +173,11 @@ def test_another_reference_makes_all_anew(store: Path, client: Client) -> None:
 
 
 def test_what_is_not_asked_for_any_more_goes(store: Path, client: Client) -> None:
-    fields = Store(store).rows_with_whole_fields()
+    fields = Store(store).rows_with_complete_fields()
     sb.run(sb.Study.from_table(small_table(**TO_A_MESH)), store, client)
     assert not {"witness", "proximity"} & set(sb.open_store(store).children)
     assert not (store / "witness").exists()
-    assert Store(store).rows_with_whole_fields() == fields
+    assert Store(store).rows_with_complete_fields() == fields
     _, made = run_and_count(asking(), store, client)
     assert len(made) == 8
     assert_right(store, asking())
