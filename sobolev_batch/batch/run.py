@@ -159,7 +159,7 @@ def carry_out(
                         break
                     # The records are laid out anew, that of the run with them.
                     with journal.paused():
-                        work = _Work.of(location, work.plan.on(choice))
+                        work = _Work.of(location, work.plan.with_choice(choice))
                     journal.write("running")
                     missing = work.missing()
                 repaired, not_compared = work.compare(client, crew, note)

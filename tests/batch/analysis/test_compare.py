@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -352,9 +353,8 @@ def test_vertices_that_no_triangle_uses(store_path: Path, tmp_path: Path, client
 def test_blocks_and_parts_of_the_lattice_add_up(
     store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = asking(proximity=None)
     # Fields of 40 kB in chunks of a few.
-    monkeypatch.setattr("sobolev_batch.batch.study.plan._LARGEST_CHUNK_BYTES", 16 << 10)
+    study = replace(asking(proximity=None), largest_chunk_bytes=16 << 10)
     sb.run(study, store_path, client)
     here, plan = Store.open(store_path), make_plan(study)
     assert len(plan.blocks) > 2

@@ -167,7 +167,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     Tables(store).write("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
     store.consolidate()
     assert len(server.keys(prefix)) == len(empty) + 5
-    finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
+    finer = plan.with_choice(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
     again = prepare_store(url, finer)
     assert server.keys(prefix) == empty
     assert again.records() == (None,) * 5
