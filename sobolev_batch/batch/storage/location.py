@@ -26,6 +26,8 @@ _FOLDER_SCHEMES = ("file", "local")
 class Location:
     """Location of a store. It is cheap to make, to compare and to pickle, and nothing is accessed in advance.
 
+    Methods that read or write raise a `StoreError` if the location cannot be read or written.
+
     Attributes:
         name: Path, or URL such as s3://bucket/name.zarr, without credentials.
     """
@@ -98,11 +100,7 @@ class Location:
         return None
 
     def write(self, documents: Mapping[str, bytes]) -> None:
-        """Write small documents by their keys, in any order. Each is replaced as a whole.
-
-        Raises:
-            StoreError: The location cannot be written.
-        """
+        """Write small documents by their keys, in any order. Each is replaced as a whole."""
         with self.access("written"):
             self._storage.write(documents)
 
@@ -127,20 +125,12 @@ class Location:
         return self._storage.exists()
 
     def discard(self, key: str) -> None:
-        """Remove a key if it exists.
-
-        Raises:
-            StoreError: It cannot be removed.
-        """
+        """Remove a key if it exists."""
         with self.access("written"), self._absence_ignored():
             self._storage.delete(key)
 
     def remove(self, prefix: str) -> None:
-        """Remove all keys below a prefix.
-
-        Raises:
-            StoreError: They cannot be removed.
-        """
+        """Remove all keys below a prefix."""
         with self.access("written"), self._absence_ignored():
             self._storage.delete_all(prefix)
 
@@ -149,29 +139,17 @@ class Location:
         self._storage.delete_if_empty()
 
     def remove_partial_files(self) -> None:
-        """Remove what writers left behind that were killed in the middle of a key. No other run may be writing.
-
-        Raises:
-            StoreError: It cannot be removed.
-        """
+        """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
         with self.access("written"):
             self._storage.delete_partial_files()
 
     def sizes(self, prefix: str) -> dict[str, int]:
-        """Return the number of bytes of every key below a prefix.
-
-        Raises:
-            StoreError: The location cannot be read.
-        """
+        """Return the number of bytes of every key below a prefix."""
         with self.access("read"):
             return self._storage.sizes(prefix)
 
     def names(self) -> set[str]:
-        """Return the names at the first level.
-
-        Raises:
-            StoreError: The location cannot be read.
-        """
+        """Return the names at the first level."""
         with self.access("read"):
             return self._storage.names()
 

@@ -67,11 +67,7 @@ class Lock:
 
     @classmethod
     def read(cls, location: Location) -> Self | None:
-        """Return the lock on a store, or None if it has none.
-
-        Raises:
-            StoreError: The store cannot be read.
-        """
+        """Return the lock on a store, or None if it has none."""
         text = location.read(LOCK_KEY)
         if text is None:
             return None
@@ -101,11 +97,7 @@ class Lock:
         return bool(machine) and machine == _machine()
 
     def is_held(self, location: Location) -> bool:
-        """Return whether its holder still has the store.
-
-        Raises:
-            StoreError: The store cannot be read.
-        """
+        """Return whether its holder still has the store."""
         current = Lock.read(location)
         return current is not None and current.holder == self.holder
 
@@ -183,11 +175,7 @@ def release(location: Location, lock: Lock) -> None:
 
 
 def break_lock(location: Location) -> None:
-    """Remove any lock on a store.
-
-    Raises:
-        StoreError: It cannot be removed.
-    """
+    """Remove any lock on a store."""
     for key in LOCK_KEYS:
         location.discard(key)
 

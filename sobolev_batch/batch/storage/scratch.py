@@ -25,11 +25,7 @@ class Scratch:
     location: Location
 
     def write(self, row: int, token: str, number: int, mesh: Mesh) -> None:
-        """Store a batch of a row's mesh until the row is discarded.
-
-        Raises:
-            StoreError: It cannot be written.
-        """
+        """Store a batch of a row's mesh until the row is discarded."""
         archive = io.BytesIO()
         np.savez(archive, vertices=mesh.vertices, triangles=mesh.triangles)
         self.location.write({_key(row, token, number): archive.getvalue()})

@@ -40,8 +40,8 @@ _REQUESTS_AT_ONCE = 64
 class Hierarchy:
     """Groups and arrays of a store. Cheap to make.
 
-    It keeps the metadata that it has read: make another one to see what other processes have changed of them.
-    Chunks are read anew each time.
+    Methods raise a `StoreError` if the store cannot be read or written. Metadata that were read are kept: make another
+    hierarchy to see what other processes have changed of them. Chunks are read anew each time.
 
     Attributes:
         location: Location of the store.
@@ -58,11 +58,7 @@ class Hierarchy:
         return self.location.name
 
     def exists(self) -> bool:
-        """Return whether a zarr hierarchy exists.
-
-        Raises:
-            StoreError: The location cannot be read.
-        """
+        """Return whether a zarr hierarchy exists."""
         if "" not in self.documents:
             root = self._read_document("")
             if root is None:
@@ -126,11 +122,7 @@ class Hierarchy:
         return tuple(map(str, np.asarray(self.read(name, ...)).tolist()))
 
     def write(self, name: str, selection: Any, values: Any) -> None:
-        """Write a selection of an array, made of whole chunks.
-
-        Raises:
-            StoreError: The store cannot be written.
-        """
+        """Write a selection of an array, made of whole chunks."""
         array = self.array(name)
         with self.location.access("written"):
             array[selection] = values
