@@ -50,8 +50,12 @@ class StoreError(InputError):
     """A store cannot be read or written, or belongs to another study."""
 
 
-class ClaimError(StoreError):
-    """Another run holds the lock of a store."""
+class LockError(StoreError):
+    """Another run holds the lock on a store."""
+
+
+# The name of earlier versions.
+ClaimError = LockError
 
 
 class DamageError(StoreError):

@@ -21,8 +21,8 @@ from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Claim, claimed
-from sobolev_batch.batch.store.create import prepare_store, require_place
+from sobolev_batch.batch.storage.lock import Lock, locked
+from sobolev_batch.batch.store.create import prepare_store, require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
@@ -103,36 +103,36 @@ def run(
     cluster: AbstractContextManager[Client]
     if client is None:
         # In threads, where no other process would see the store.
-        cluster = thread_client(workers) if location.is_of_this_process else local_client(workers, memory)
+        cluster = thread_client(workers) if location.is_in_memory else local_client(workers, memory)
     else:
         location, cluster = location.absolute(), nullcontext(client)
-    claim = Claim.of_this_process()
-    require_place(location)
-    with claimed(location, claim):
+    lock = Lock.of_this_process()
+    require_usable(location)
+    with locked(location, lock):
         if client is not None:
-            require_reach(client, location, claim)
-        return carry_out(study, location, claim, cluster, on_progress or (lambda progress: None))
+            require_reach(client, location, lock)
+        return carry_out(study, location, lock, cluster, on_progress or (lambda progress: None))
 
 
 def carry_out(
-    study: Study, location: Location, claim: Claim, cluster: AbstractContextManager[Client], notify: Notify
+    study: Study, location: Location, lock: Lock, cluster: AbstractContextManager[Client], notify: Notify
 ) -> Summary:
     """Run a study in a store that this process has claimed; see `run`.
 
     Args:
         study: what to compute.
         location: of the store.
-        claim: on it.
+        lock: on it.
         cluster: gives the client, if anything is to be computed.
         notify: called at each step.
     """
     plan = make_plan(study, stored_choice(location))
     # Planning may take minutes.
-    claim.require(location)
+    lock.require(location)
     work = _Work.of(location, plan)
     computed: set[int] = set()
     not_compared: dict[str, str] = {}
-    with Heartbeat(work.store, claim) as journal:
+    with Heartbeat(work.store, lock) as journal:
         missing = work.missing()
         if missing or not work.is_tabulated or not work.comparer.is_done:
             with cluster as client:
@@ -142,11 +142,11 @@ def carry_out(
                 crew = enlist(client, study.libraries)
                 # Asked before anything is computed: a GPU that nobody has would be waited for.
                 crew.with_backend(study.backend)
-                journal.worry = lambda: worry_about(client, study.backend)
+                journal.find_obstacle = lambda: worry_about(client, study.backend)
                 work.store.scratch.discard()
 
                 def note(progress: Progress) -> None:
-                    journal.require_claim()
+                    journal.require_lock()
                     journal.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                     notify(progress)
 
@@ -159,7 +159,7 @@ def carry_out(
                         break
                     # The records are laid out anew, that of the run with them.
                     with journal.paused():
-                        work = _Work.of(location, work.plan.on(choice))
+                        work = _Work.of(location, work.plan.with_choice(choice))
                     journal.write("running")
                     missing = work.missing()
                 repaired, not_compared = work.compare(client, crew, note)
@@ -199,7 +199,7 @@ class _Work:
     def missing(self) -> list[int]:
         """The rows whose fields are to be computed; records of fields that are not there are withdrawn."""
         if any(self.records):
-            whole = self.store.rows_with_whole_fields()
+            whole = self.store.rows_with_complete_fields()
             self._withdraw(
                 [
                     i
@@ -214,7 +214,7 @@ class _Work:
         """Withdraw what readers would take for facts about fields that are going to be replaced."""
         replaced = {i for i in rows if self.records[i] is not None}
         if replaced:
-            Tables(self.store).withdraw()
+            Tables(self.store).invalidate()
             self.store.write_qualities(
                 [record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)]
             )

@@ -17,8 +17,8 @@ from sobolev_batch.batch.cluster.store_access import require_reach
 from sobolev_batch.batch.cluster.worker_plugin import enlist
 from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Claim, give_up, take
-from sobolev_batch.batch.store.create import prepare_store, require_place
+from sobolev_batch.batch.storage.lock import Lock, acquire, release
+from sobolev_batch.batch.store.create import prepare_store, require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import make_plan
@@ -62,29 +62,29 @@ def submit(study: Study, store: str | Path | Location, client: Client) -> Submis
         ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
     """
     location = Location.of(store).absolute()
-    require_place(location)
-    claim = Claim.of_this_process(outlives_process=True)
-    take(location, claim)
+    require_usable(location)
+    lock = Lock.of_this_process(outlives_process=True)
+    acquire(location, lock)
     try:
-        return _hand_over(study, location, claim, client)
+        return _hand_over(study, location, lock, client)
     except BaseException:
-        give_up(location, claim)
+        release(location, lock)
         raise
 
 
-def _hand_over(study: Study, location: Location, claim: Claim, client: Client) -> Submission:
-    require_reach(client, location, claim)
+def _hand_over(study: Study, location: Location, lock: Lock, client: Client) -> Submission:
+    require_reach(client, location, lock)
     plan = make_plan(study, stored_choice(location))
     enlist(client, study.libraries).with_backend(study.backend)
     place = prepare_store(location, plan)
     missing = rows_without_field(place.records(), rows_of(place, plan))
-    journal = Heartbeat(place, claim)
+    journal = Heartbeat(place, lock)
     journal.cluster = client.scheduler.address
     journal.write("submitted")
     key = f"sobolev-batch-drive-{uuid4().hex}"
     # Before all tasks of other studies, which it takes no thread from: it leaves its own at once.
     future = client.submit(
-        drive, dict(study.table), str(study.folder.absolute()), place.path, claim.run, key=key, pure=False, priority=1
+        drive, dict(study.table), str(study.folder.absolute()), place.path, lock.run, key=key, pure=False, priority=1
     )
     fire_and_forget(future)
     _await_acceptance(client, future)
@@ -97,16 +97,16 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
     It does not fail: what goes wrong is in the store, and running into it again would not help.
     """
     location = Location.of(store)
-    claim = Claim.of_this_process(run, outlives_process=True)
+    lock = Lock.of_this_process(run, outlives_process=True)
     try:
-        there = Claim.read(location)
+        there = Lock.read(location)
         if there is None or there.run != run:
             _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
             return
-        take(location, claim)
+        acquire(location, lock)
         with worker_client() as client:
             study = Study.from_table(table, folder=folder)
-            carry_out(study, location, claim, nullcontext(client), lambda progress: None)
+            carry_out(study, location, lock, nullcontext(client), lambda progress: None)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the claim over.
@@ -116,9 +116,9 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         # Most of what goes wrong is known by now to the run's own journal, but not that a file of the
         # study is missing on this machine.
         with suppress(StoreError):  # it may be what failed
-            if claim.is_on(location):
-                Heartbeat(Store(store), claim).write("failed", f"{error} (on the worker that drove the study)")
-    give_up(location, claim)
+            if lock.is_held(location):
+                Heartbeat(Store(store), lock).write("failed", f"{error} (on the worker that drove the study)")
+    release(location, lock)
 
 
 def _await_acceptance(client: Client, future: Future) -> None:

@@ -13,13 +13,13 @@ from distributed import Client, wait
 from sobolev_batch.batch.cluster.clients import available_cores
 from sobolev_batch.batch.cluster.outcomes import outcomes
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Claim, give_up, take
+from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.store.witness_array import Witnesses
-from sobolev_batch.errors import ClaimError, DamageError, StoreError
+from sobolev_batch.errors import DamageError, LockError, StoreError
 
 _log = logging.getLogger(__name__)
 
@@ -66,22 +66,22 @@ def verify(place: str | Path | Location, on_progress: Callable[[int, int], None]
 
     Raises:
         StoreError: no store is there, or it cannot be read at all.
-        ClaimError: a run is going on in it.
+        LockError: a run is going on in it.
     """
     store = Store.open(place)
-    claim = Claim.of_this_process()
+    lock = Lock.of_this_process()
     try:
-        take(store.location, claim)
-    except ClaimError:
+        acquire(store.location, lock)
+    except LockError:
         raise
     except StoreError as error:
         _log.info("%s: read without the right to write (%s)", store.path, error)
         return _verify(store, on_progress, None)
     try:
         # Anew: the last run may have ended since.
-        return _verify(Store.open(place), on_progress, claim)
+        return _verify(Store.open(place), on_progress, lock)
     finally:
-        give_up(store.location, claim)
+        release(store.location, lock)
 
 
 def damaged_rows(client: Client, store: Store, records: Sequence[Record | None]) -> list[int]:
@@ -96,11 +96,11 @@ def damaged_rows(client: Client, store: Store, records: Sequence[Record | None])
     return [row for row, what in zip(rows, found, strict=True) if what]
 
 
-def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim: Claim | None) -> Verification:
+def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
     labels, records = store.labels(), store.records()
     complete = _complete(records)
-    damaged = {row: f"its completion record is damaged ({what})" for row, what in store.damaged_records().items()}
-    whole = store.rows_with_whole_fields() if complete else set()
+    damaged = {row: f"its completion record is damaged ({what})" for row, what in store.record_table.damaged().items()}
+    whole = store.rows_with_complete_fields() if complete else set()
 
     def damage_of(row: int) -> str:
         return _damage_of(store, row, complete[row]) if row in whole else "it is not there, or of another length"
@@ -114,13 +114,13 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, claim:
                 on_progress(done, len(complete))
     tables = Tables(store).damaged()
     notes = {kind: _damaged_notes(store, kind, complete) for kind in KINDS}
-    withdraw = claim is not None and bool(damaged or tables or any(notes.values()))
-    if claim is not None and withdraw:
+    withdraw = lock is not None and bool(damaged or tables or any(notes.values()))
+    if lock is not None and withdraw:
         # Whoever has released the store may have changed it since.
-        claim.require(store.location)
+        lock.require(store.location)
         # From a table, as long as there are some.
-        store.mend_labels()
-        Tables(store).withdraw()
+        store.repair_labels()
+        Tables(store).invalidate()
         for row in damaged:
             store.write_record(row, None)
         for kind, rows in notes.items():
@@ -152,7 +152,7 @@ def _damaged_notes(store: Store, kind: Kind, complete: Mapping[int, Record]) -> 
 
 def _damage_of(store: Store, row: int, record: Record) -> str:
     """What is wrong with the field of a row; empty if nothing is."""
-    places = store.places()
+    places = store.block_slices()
     if len(record.checksums) != len(places):
         return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
     for place, checksum in zip(places, record.checksums, strict=True):

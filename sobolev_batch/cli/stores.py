@@ -94,11 +94,11 @@ def verify_command(context: click.Context, store: Location) -> None:
 @click.option("--force", is_flag=True, help="Even if its run gave a sign of life a moment ago.")
 def release_command(store: Location, force: bool) -> None:
     """Release STORE from the claim of a run that was killed together with its machine."""
-    claim = release(store, force=force)
-    if claim is None:
+    lock = release(store, force=force)
+    if lock is None:
         click.echo(f"{store}: no run has claimed it")
     else:
-        click.echo(f"{store}: released from {claim.driver}, which had claimed it since {claim.since}")
+        click.echo(f"{store}: released from {lock.driver}, which had claimed it since {lock.since}")
 
 
 @cli.command("table")

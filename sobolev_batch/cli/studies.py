@@ -173,7 +173,7 @@ def _task_lines(plan: Plan, crew: Workers) -> Iterator[tuple[str, str]]:
 
 def _stored_keys(place: Location) -> dict[str, str]:
     store = Store(place)
-    if not store.is_there() or store.is_unfinished:
+    if not store.exists() or store.is_unfinished:
         return {}
     store.attributes()
     return {

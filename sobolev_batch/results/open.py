@@ -54,6 +54,6 @@ def open_store(place: str | Path | Location) -> xr.DataTree:
             "it is not there",
         )
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists what it knows already.
-    keys: Any = store.keys()
+    keys: Any = store.zarr_store()
     with store.location.access("read"):
         return xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)

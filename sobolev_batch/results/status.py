@@ -8,8 +8,8 @@ from pathlib import Path
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.timestamps import age_seconds
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, shortcomings
-from sobolev_batch.batch.store.heartbeat import PATIENCE_SECONDS
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, missing_comparisons
+from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
@@ -52,8 +52,8 @@ class Status:
         store = Store.open(place)
         labels, records, run = store.labels(), store.records(), store.read_run()
         # Where a study asks for none, nothing is looked for.
-        asked = (ComparisonRecords(store, kind) for kind in KINDS)
-        notes = {each.kind: each.read() for each in asked if each.name in store.documents}
+        asked = {kind: ComparisonRecords(store, kind) for kind in KINDS}
+        notes = {kind: records.read() for kind, records in asked.items() if records.name in store.documents}
         complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
         return cls(
             str(place),
@@ -64,7 +64,7 @@ class Status:
                 for label, record in zip(labels, records, strict=True)
                 if record is not None and record.status == "failed"
             },
-            shortcomings(labels, notes, complete),
+            missing_comparisons(labels, notes, complete),
             run,
             Tables(store).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
@@ -81,7 +81,7 @@ class Status:
         if self.run is None or self.run.state not in ("submitted", "running"):
             return False
         # What was submitted may wait for a busy cluster, and nobody beats for it.
-        patience = PATIENCE_SECONDS if self.run.state == "running" else _SUBMITTED_PATIENCE_SECONDS
+        patience = LOST_AFTER_SECONDS if self.run.state == "running" else _SUBMITTED_PATIENCE_SECONDS
         return self.silence_seconds > patience
 
     def lines(self) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from sobolev_batch import (
 from sobolev_batch.batch.analysis import reduce as tabulation
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study import plan as plan_module
 from tests.support.studies import SMALL_LATTICE, small_table, variable
 
 
@@ -168,11 +168,8 @@ def test_meshes_added_to_a_study_join_its_store(client: Client, store_path: Path
     assert found == pytest.approx(exact, rel=1e-6)
 
 
-def test_lattices_of_several_chunks(
-    client: Client, study: Study, finished_store: Path, store_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plan_module, "_LARGEST_CHUNK_BYTES", 8_000)
-    run(study, store_path, client)
+def test_lattices_of_several_chunks(client: Client, study: Study, finished_store: Path, store_path: Path) -> None:
+    run(replace(study, largest_chunk_bytes=8_000), store_path, client)
     chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))
     assert len(chunks) > 1
     blocks, whole = open_store(store_path), open_store(finished_store)

@@ -14,11 +14,12 @@ from threading import Barrier
 
 import pytest
 
-from sobolev_batch import ClaimError, Study, release, run
+from sobolev_batch import Study, release, run
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import CLAIM, Claim, claimed, take
+from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire, locked
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import LockError
 from tests.support.commands import command, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often.
@@ -69,7 +70,7 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
     finally:
         _, said = first.communicate("go on\n")
     assert first.returncode == 0, said
-    assert not (store_path / CLAIM).exists()
+    assert not (store_path / LOCK_KEY).exists()
     assert command("run", study, "--store", store_path).returncode == 0
 
 
@@ -81,7 +82,7 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
     # It notices at a beat, and beats while it is paused.
     _, said = first.communicate("\n" * 9)
     assert first.returncode != 0
-    assert "ClaimError" in said
+    assert "LockError" in said
     assert "is no longer its own" in said
 
 
@@ -89,9 +90,9 @@ def test_the_claim_of_another_machine_is_released_by_hand(
     study: Study, store_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run(study, store_path, workers=1)
-    elsewhere = Claim("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
-    assert Location.of(store_path).create(CLAIM, elsewhere.to_json())
-    with pytest.raises(ClaimError, match=r"process 12 on far\.example, since 2026-01-01"):
+    elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
+    assert Location.of(store_path).create(LOCK_KEY, elsewhere.to_json())
+    with pytest.raises(LockError, match=r"process 12 on far\.example, since 2026-01-01"):
         run(study, store_path, workers=1)
     assert release(store_path) == elsewhere
     assert release(store_path) is None
@@ -105,31 +106,31 @@ def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     assert child.stdout is not None
     child.stdout.readline()
     location = Location.of(tmp_path / "store")
-    with pytest.raises(ClaimError, match=f"process {child.pid} on"):
-        take(location, Claim.of_this_process())
+    with pytest.raises(LockError, match=f"process {child.pid} on"):
+        acquire(location, Lock.of_this_process())
     child.send_signal(signal.SIGKILL)
     child.communicate()
-    left = Claim.read(location)
+    left = Lock.read(location)
     assert left is not None
-    assert left.is_of_the_dead
+    assert left.holder_is_gone
     # The same number is another process if it was started at another time.
-    here = Claim.of_this_process()
-    assert not here.is_of_the_dead
+    here = Lock.of_this_process()
+    assert not here.holder_is_gone
     table = json.loads(here.to_json())
-    assert Claim(**{**table, "process": here.process + "1"}).is_of_the_dead
-    with claimed(location, here):
-        assert here.is_on(location)
+    assert Lock(**{**table, "process": here.process + "1"}).holder_is_gone
+    with locked(location, here):
+        assert here.is_held(location)
     assert not (tmp_path / "store").exists()
 
 
 CLAIMING = """
 import sys
 import threading
-from sobolev_batch.batch.storage.lock import Claim, take
+from sobolev_batch.batch.storage.lock import Lock, acquire
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
-take(Location.of(sys.argv[1]), Claim.of_this_process())
+acquire(Location.of(sys.argv[1]), Lock.of_this_process())
 print("taken", flush=True)
 threading.Event().wait()
 """
@@ -139,32 +140,32 @@ threading.Event().wait()
 @pytest.mark.parametrize("place", ["folder", "memory://claims/a"])
 def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Path) -> None:
     location = Location.of(place if ":" in place else tmp_path / place)
-    here = Claim.of_this_process()
+    here = Lock.of_this_process()
     dead = replace(here, run="r", holder="h", process=here.process + "1")
     together = Barrier(8)
 
     def attempt(number: int) -> bool:
         together.wait()
         try:
-            take(location, Claim.of_this_process())
-        except ClaimError:
+            acquire(location, Lock.of_this_process())
+        except LockError:
             return False
         return True
 
     with ThreadPoolExecutor(8) as pool:
         for _ in range(20):
             if before:
-                location.create(CLAIM, dead.to_json())
+                location.create(LOCK_KEY, dead.to_json())
             assert sum(pool.map(attempt, range(8))) == 1
-            location.discard(CLAIM)
+            location.discard(LOCK_KEY)
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}'])
 def test_a_claim_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
     location = Location.of(tmp_path / "store")
-    location.create(CLAIM, text)
-    with pytest.raises(ClaimError, match="a process that has not written its name"):
-        take(location, Claim.of_this_process())
+    location.create(LOCK_KEY, text)
+    with pytest.raises(LockError, match="a process that has not written its name"):
+        acquire(location, Lock.of_this_process())
 
 
 def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, store_path: Path) -> None:
@@ -172,16 +173,16 @@ def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, st
     there = Store.open(store_path)
     latest = there.read_run()
     assert latest is not None
-    elsewhere = Claim("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z")
-    Location.of(store_path).create(CLAIM, elsewhere.to_json())
+    elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z")
+    Location.of(store_path).create(LOCK_KEY, elsewhere.to_json())
     there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
-    with pytest.raises(ClaimError, match=r"process 12 on far\.example was alive \d s ago"):
+    with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d s ago"):
         release(store_path)
     assert release(store_path, force=True) == elsewhere
     # A claim that was just taken, before any sign of life; a store that cannot be read.
     (store_path / "zarr.json").write_text("")
-    Location.of(store_path).create(CLAIM, replace(elsewhere, since=utc_now()).to_json())
-    with pytest.raises(ClaimError, match="was alive"):
+    Location.of(store_path).create(LOCK_KEY, replace(elsewhere, since=utc_now()).to_json())
+    with pytest.raises(LockError, match="was alive"):
         release(store_path)
     assert release(store_path, force=True) is not None
 
@@ -195,29 +196,29 @@ def test_the_undead_count_as_gone(tmp_path: Path) -> None:
     child.stdout.readline()
     child.kill()
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    left = Claim.read(Location.of(tmp_path / "store"))
+    left = Lock.read(Location.of(tmp_path / "store"))
     assert left is not None
-    assert left.is_of_the_dead
+    assert left.holder_is_gone
     child.communicate()
 
 
 def test_a_full_disk_leaves_no_claim(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path / "store")], check=False)
     assert done.returncode == 0
-    assert Claim.read(Location.of(tmp_path / "store")) is None
+    assert Lock.read(Location.of(tmp_path / "store")) is None
 
 
 FULL = """
 import resource, signal, sys
 from sobolev_batch import StoreError
-from sobolev_batch.batch.storage.lock import Claim, take
+from sobolev_batch.batch.storage.lock import Lock, acquire
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
 try:
-    take(Location.of(sys.argv[1]), Claim.of_this_process())
+    acquire(Location.of(sys.argv[1]), Lock.of_this_process())
 except StoreError:
     sys.exit(0)
 sys.exit(1)
@@ -226,7 +227,7 @@ sys.exit(1)
 
 def test_a_folder_of_the_users_stays(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    with claimed(Location.of(tmp_path / "mine"), Claim.of_this_process()):
+    with locked(Location.of(tmp_path / "mine"), Lock.of_this_process()):
         pass
     assert (tmp_path / "mine").is_dir()
 

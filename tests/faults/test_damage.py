@@ -224,7 +224,7 @@ def load(store: Path) -> None:
 
 def test_a_field_of_zeros_is_one(store: Path, study: Study, client: Client) -> None:
     there = Store.open(store)
-    (place,) = there.places()
+    (place,) = there.block_slices()
     record = there.read_record(1)
     assert record is not None
     zeros = np.zeros([part.stop for part in place], dtype=complex)

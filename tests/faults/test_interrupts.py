@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch.batch.storage.lock import CLAIM
+from sobolev_batch.batch.storage.lock import LOCK_KEY
 from tests.support.commands import command, read_until, started, write_toml
 
 # Generous for a machine that does other things too; alone it takes two.
@@ -46,7 +46,7 @@ def test_a_run_ends_and_goes_on(
     assert process.returncode == status, rest
     assert rest.splitlines()[-1].startswith(words)
     assert "Traceback" not in said + rest
-    assert not (store_path / CLAIM).exists()
+    assert not (store_path / LOCK_KEY).exists()
     again = command("run", study, "--store", store_path, "--workers", "1")
     assert again.returncode == 0, again.stderr
     assert "taken over" not in again.stderr

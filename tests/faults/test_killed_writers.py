@@ -39,7 +39,7 @@ from tests.support.studies import small_table
 path = Path(sys.argv[1])
 plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
 store = prepare_store(path, plan)
-(place,) = store.places()
+(place,) = store.block_slices()
 shape = [part.stop for part in place]
 chunk = path / "fourier/fourier/c/0/0/0/0"
 chunk.parent.mkdir(parents=True)
@@ -72,7 +72,7 @@ for kill in range(%d):
     # The field is never older than its record.
     found["unfounded"] += record is not None and not int(record.key) <= values.flat[0].real
     # What every run does first.
-    store.location.sweep()
+    store.location.remove_partial_files()
     found["swept"] &= not list(path.rglob("*.partial"))
 print(json.dumps(found, default=int))
 """

@@ -1,7 +1,7 @@
-"""Object storage that fails as real ones do: a proxy before a server that speaks S3, of this process.
+"""Object storage that fails as a real one does: a proxy in this process, before a server that speaks S3.
 
-Requests are passed on as they are. Signatures cover the name of the host that the client was told, which
-the server is told too, so they stay valid.
+Requests are passed on unchanged. Signatures cover the host name that the client uses; the server gets it too, so
+they stay valid.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from urllib.parse import urlsplit
 from tests.support.object_storage import Server
 
 Kind = Literal["kept", "truncated", "error", "slow down", "reset before", "reset after"]
-# Those that few requests can meet come first, and are taken first. The request after which a connection is
-# reset has been carried out, which its sender cannot know.
+# Kinds that few requests can meet come first and are drawn first. After "reset after", the request was carried out
+# without its sender knowing.
 KINDS: tuple[Kind, ...] = ("kept", "truncated", "error", "slow down", "reset before", "reset after")
 
 _ANSWERS: dict[str, tuple[int, str]] = {
@@ -37,15 +37,15 @@ _OF_ONE_HOP = ("connection", "expect", "keep-alive", "transfer-encoding")
 
 @dataclass(frozen=True)
 class Rule:
-    """Which requests fail, and how.
+    """Rule by which requests fail.
 
     Attributes:
-        rate: the share of the requests, drawn at random.
-        kinds: how they fail, the rarest first; only what is read can be truncated, and only a key that is to be removed
-            can be kept, in an answer that is otherwise a good one.
-        methods: those that may fail; all if empty.
-        most: after so many failures nothing fails any more.
-        part: of the path and query of those that may fail.
+        rate: Probability of a failure.
+        kinds: Kinds of failures, the rarest first. Only answers to GET can be truncated, and only keys that are to be
+            removed can be kept, in an otherwise good answer.
+        methods: Methods that may fail; all if empty.
+        most: Number of failures after which nothing fails any more.
+        part: Text in the path and query of requests that may fail.
     """
 
     rate: float
@@ -62,7 +62,7 @@ READ_ONLY = Rule(1.0, ("error",), frozenset({"PUT", "POST", "DELETE"}))
 
 @dataclass(frozen=True)
 class Turn:
-    """When the rule changes: with the request of this number of those with a method and a part of the path."""
+    """Change of the rule, at the given number of requests with a method and a text in their path."""
 
     method: str
     part: str
@@ -72,7 +72,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Request:
-    """What came, when, and how it failed; nothing if it did not."""
+    """A request, its time, and its failure, if any."""
 
     method: str
     path: str
@@ -82,10 +82,10 @@ class Request:
 
 @dataclass
 class FailingStorage:
-    """A server of object storage whose requests fail by a rule that may be replaced at any time.
+    """A server of object storage whose requests fail by a rule that may change at any time.
 
     Attributes:
-        url: its endpoint.
+        url: Endpoint of the proxy.
     """
 
     url: str
@@ -100,7 +100,7 @@ class FailingStorage:
 
     @property
     def rule(self) -> Rule:
-        """By what requests fail from now on."""
+        """Rule by which requests fail from now on."""
         return self._rule
 
     @rule.setter
@@ -109,29 +109,29 @@ class FailingStorage:
             self._rule, self._failed = rule, Counter()
 
     def await_turn(self, turn: Turn) -> None:
-        """Have another rule take the place of the present one with a request that is to come."""
+        """Replace the rule at a request to come."""
         with self._lock:
             self._turn = turn
 
     def call(self, listener: Callable[[], None]) -> None:
-        """Have something called with each request, before that is dealt with."""
+        """Call a function at each request, before it is handled."""
         self._listener = listener
 
     def environment(self) -> dict[str, str]:
-        """What a process that uses it has in its environment."""
+        """Return the environment of a process that uses it."""
         return {**self._server.environment(), "AWS_ENDPOINT_URL": self.url}
 
     def requests(self) -> tuple[Request, ...]:
-        """All requests so far, in the order in which they came."""
+        """Return all requests so far, in order."""
         with self._lock:
             return tuple(self._requests)
 
     def failures(self) -> Counter[Kind]:
-        """How many requests failed so far, by kind."""
+        """Return the number of failures so far, by kind."""
         return Counter(request.failure for request in self.requests() if request.failure)
 
     def draw(self, method: str, path: str) -> Kind | None:
-        """Whether and how a request that has just come is to fail."""
+        """Return the kind of failure of a new request, if it is to fail."""
         self._listener()
         with self._lock:
             turn = self._turn
@@ -144,7 +144,7 @@ class FailingStorage:
             return kind
 
     def upstream(self) -> HTTPConnection:
-        """A connection to the server itself."""
+        """Return a connection to the server itself."""
         return HTTPConnection(urlsplit(self._server.url).netloc)
 
     def _drawn(self, method: str, path: str) -> Kind | None:
@@ -161,7 +161,7 @@ class FailingStorage:
 
 @contextmanager
 def failing(server: Server, seed: int = 0) -> Iterator[FailingStorage]:
-    """A proxy before a server, healthy at first."""
+    """Run a proxy before a server, healthy at first."""
     with _Proxy(("127.0.0.1", 0), _Handler) as proxy:
         proxy.storage = FailingStorage(f"http://127.0.0.1:{proxy.server_port}", server, random.Random(seed))
         thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.05})
@@ -181,7 +181,7 @@ class _Proxy(ThreadingHTTPServer):
     request_queue_size = 128
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that is killed leaves its connection behind, which is nobody's fault."""
+        """Do nothing: a client that is killed leaves its connection behind."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -191,7 +191,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Proxy
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - as the base class has it
-        """Nothing: what came is kept."""
+        """Do nothing: requests are recorded."""
 
     def _pass_on(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
@@ -239,7 +239,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body[:sent])
 
     def _reset(self) -> None:
-        """End the connection without a word; the other side sees a reset."""
+        """Reset the connection."""
         self.close_connection = True
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         # The base class would flush and say goodbye first.

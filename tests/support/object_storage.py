@@ -1,4 +1,4 @@
-"""A server on this machine that speaks the S3 protocol, as a process of its own."""
+"""A local server that speaks the S3 protocol, in a process of its own."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from botocore.config import Config
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
-# Has the driver try less often than it would, where it is to find out that nothing helps.
+# Fewer attempts of the driver, for tests in which all of them fail.
 IMPATIENT = {"AWS_MAX_ATTEMPTS": "2"}
 _REQUEST = re.compile(r'"(?:\x1b\[\d+m)*([A-Z]+) (\S+) HTTP')
 
@@ -31,7 +31,7 @@ class Server:
     """A running server.
 
     Attributes:
-        url: its endpoint.
+        url: Endpoint of the server.
     """
 
     url: str
@@ -39,20 +39,20 @@ class Server:
     _log: list[str] = field(default_factory=list)
 
     def environment(self, key: str = "tester", secret: str = SECRET) -> dict[str, str]:
-        """What a process that uses the server has in its environment."""
+        """Return the environment of a process that uses the server."""
         return {
             "AWS_ENDPOINT_URL": self.url,
             "AWS_ACCESS_KEY_ID": key,
             "AWS_SECRET_ACCESS_KEY": secret,
             "AWS_DEFAULT_REGION": "us-east-1",
-            # Nothing but these variables counts, whatever else this machine knows of credentials.
+            # Only these variables count, whatever credentials this machine has.
             "AWS_CONFIG_FILE": "/nonexistent",
             "AWS_SHARED_CREDENTIALS_FILE": "/nonexistent",
             "AWS_EC2_METADATA_DISABLED": "true",
         }
 
     def client(self, service: str = "s3") -> Any:
-        """A client of the server that shares nothing with the code under test."""
+        """Return a client of the server that shares nothing with the code under test."""
         return boto3.client(
             service,
             endpoint_url=self.url,
@@ -63,44 +63,44 @@ class Server:
         )
 
     def keys(self, prefix: str) -> list[str]:
-        """The keys below a prefix."""
+        """Return the keys below a prefix."""
         pages = self.client().get_paginator("list_objects_v2").paginate(Bucket=BUCKET, Prefix=prefix)
         return [entry["Key"] for page in pages for entry in page.get("Contents", ())]
 
     def enforce(self, enforced: bool) -> None:
-        """Have the server check signatures and policies from now on, or no longer."""
+        """Let the server check signatures and policies from now on, or no longer."""
         data = b"0" if enforced else b"inf"
-        # As a form, which is the default, the number would be read as a name.
+        # As a form, the default, the number would be read as a name.
         request = urllib.request.Request(f"{self.url}/moto-api/reset-auth", data, {"Content-Type": "text/plain"})
         urllib.request.urlopen(request).close()
 
     def requests(self) -> list[tuple[str, str]]:
-        """Method and path of every request since the last call."""
+        """Return method and path of every request since the last call."""
         marker = f"/marker-{time.monotonic_ns()}"
-        # There is no such bucket, but when this is in the log, so is everything before.
+        # The bucket does not exist, but once this request is in the log, all earlier ones are.
         with suppress(urllib.error.HTTPError):
             urllib.request.urlopen(self.url + marker).close()
         while not any(marker in line for line in list(self._log)):
             time.sleep(0.01)
         lines, self._log = self._log, []
-        found = [match.groups() for line in lines if (match := _REQUEST.search(line)) and "/marker-" not in line]
-        return [(method, path) for method, path in found]
+        matches = [match.groups() for line in lines if (match := _REQUEST.search(line)) and "/marker-" not in line]
+        return [(method, path) for method, path in matches]
 
     def listen(self) -> None:
-        """Take up what the server logs, so that it never waits for a reader."""
+        """Collect the server's log, so that it never waits for a reader."""
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self._log.append(line)
 
 
 def forget_drivers() -> None:
-    """Have the drivers read their environment again."""
+    """Make the drivers read their environment again."""
     fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
 @contextmanager
 def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
-    """Have this process, and all that it starts meanwhile, take a server for S3."""
+    """Make this process, and all that it starts meanwhile, use a server as S3."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
@@ -111,7 +111,7 @@ def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def serving() -> Iterator[Server]:
-    """A server with one empty bucket, on a port that the system chose."""
+    """Run a server with one empty bucket, on a free port."""
     command = [sys.executable, "-u", "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:

@@ -1,4 +1,4 @@
-"""Stores held against each other."""
+"""Comparison of stores."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TABLES = (("norms", "norm"), ("norms", "error"), ("distances", "distance"), ("co
 
 
 def assert_same_fields(one: Path | str, other: Path | str, besides: Collection[str] = ()) -> None:
-    """The fields of two stores are the same, bit for bit, and none is missing."""
+    """Check that the fields of two stores are equal, bit for bit, and that none is missing."""
     with xr.open_datatree(one, engine="zarr") as left, xr.open_datatree(other, engine="zarr") as right:
         a, b = variable(left, "fourier", "fourier"), variable(right, "fourier", "fourier")
         assert a["mesh"].values.tolist() == b["mesh"].values.tolist()
@@ -25,7 +25,7 @@ def assert_same_fields(one: Path | str, other: Path | str, besides: Collection[s
 
 
 def assert_same_tables(one: Path | str, other: Path | str) -> None:
-    """The tables of two stores agree to rounding."""
+    """Check that the tables of two stores agree to rounding."""
     with xr.open_datatree(one, engine="zarr") as left, xr.open_datatree(other, engine="zarr") as right:
         for group, name in TABLES:
             a, b = variable(left, group, name), variable(right, group, name)
@@ -36,7 +36,7 @@ def assert_same_tables(one: Path | str, other: Path | str) -> None:
 
 
 def assert_same(ours: xr.DataTree, theirs: xr.DataTree) -> None:
-    """All but who computed it, when, and how long that took, is equal to the bit."""
+    """Check that two stores are equal to the bit, except for workers and times."""
     assert set(ours.children) == set(theirs.children)
     for group in ("fourier", "norms", "distances", "convergence", "meshes"):
         one, other = (
@@ -44,12 +44,12 @@ def assert_same(ours: xr.DataTree, theirs: xr.DataTree) -> None:
             for tree in (ours, theirs)
         )
         if group == "fourier":
-            # Its coordinate says how far the field is from exact; the field itself is compared.
+            # This coordinate holds the data for errors; the field itself is compared below.
             assert np.array_equal(one["quality"].values, other["quality"].values)
         xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
 
 
-# What reads a store without this package.
+# A program that reads a store without this package.
 READER = """
 import sys, warnings
 warnings.simplefilter("error")

@@ -1,4 +1,4 @@
-"""A study that takes a second, as a table and as a file, and how its store is read."""
+"""A study that takes a second, and access to its store."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SMALL_LATTICE = Lattice(3.0, 16)
 
 
 def small_table(**changes: Any) -> dict[str, Any]:
-    """A study of four icospheres that takes a second."""
+    """Return a study of four icospheres that takes a second."""
     table: dict[str, Any] = {
         "study": {"name": "small"},
         "lattice": {"xi_max": SMALL_LATTICE.xi_max, "M": SMALL_LATTICE.M},
@@ -24,15 +24,16 @@ def small_table(**changes: Any) -> dict[str, Any]:
 
 
 def variable(tree: xr.DataTree, group: str, name: str) -> xr.DataArray:
-    """A variable of one group of a store."""
+    """Return a variable of one group of a store."""
     return tree[group].to_dataset()[name]
 
 
 def changed(path: str, value: Any) -> dict[str, Any]:
+    """Return the small study with another value for a dotted key."""
     table = small_table()
     *sections, key = path.split(".")
-    place: Any = table
+    node: Any = table
     for section in sections:
-        place = place[int(section)] if section.isdigit() else place.setdefault(section, {})
-    place[key] = value
+        node = node[int(section)] if section.isdigit() else node.setdefault(section, {})
+    node[key] = value
     return table

@@ -20,7 +20,13 @@ from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, Workers
 from sobolev_batch.batch.fields.sizing import LEAST_ROOM_BYTES, MESH_BYTES
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, ComparisonRecords, Kind, shortcomings
+from sobolev_batch.batch.store.comparison_records import (
+    KINDS,
+    ComparisonRecord,
+    ComparisonRecords,
+    Kind,
+    missing_comparisons,
+)
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
@@ -132,12 +138,12 @@ class Comparer:
             notes = found["witness"]
             # A task that outlives the run which submitted it may have written others.
             made = [i for i in self._wanted if (note := notes[i]) and note.completes(self._key("witness", i))]
-            Witnesses(self.store).sweep({i: self.complete[i].facts.vertices for i in made})
-            Witnesses(self.store).list_them()
+            Witnesses(self.store).remove_unused({i: self.complete[i].facts.vertices for i in made})
+            Witnesses(self.store).list_for_readers()
         if "proximity" in found:
             Tables(self.store).write(PROXIMITY, self._proximity_dataset(found["proximity"]))
         self.store.consolidate()
-        return shortcomings([row.label for row in self.rows], found, self._wanted)
+        return missing_comparisons([row.label for row in self.rows], found, self._wanted)
 
     def _left_over(self) -> list[Kind]:
         """What the store has, or has begun to have, and the study does not ask for."""
@@ -157,7 +163,7 @@ class Comparer:
         if kind == "witness" and len(left) < len(self._wanted):
             witnesses = Witnesses(self.store)
             counts = {i: self.complete[i].facts.vertices for i in self._wanted}
-            whole = witnesses.whole_rows(counts) if witnesses.are_there() else set()
+            whole = witnesses.complete_rows(counts) if witnesses.exist() else set()
             left |= set(self._wanted) - whole
         return sorted(left)
 
@@ -175,11 +181,11 @@ class Comparer:
         if kind == "witness":
             labels = [row.label for row in self.rows]
             vertices = max([1, *(self.complete[i].facts.vertices for i in self._wanted)])
-            Witnesses(self.store).lay_out(labels, self.plan.study.witness, self.plan.reference, vertices)
+            Witnesses(self.store).create(labels, self.plan.study.witness, self.plan.reference, vertices)
         elif not self.store.has(PROXIMITY):
             # Before the notes: what is not asked for any more is found by its group.
             Tables(self.store).write(PROXIMITY, self._proximity_dataset([None] * len(self.rows)))
-        ComparisonRecords(self.store, kind).lay_out(len(self.rows))
+        ComparisonRecords(self.store, kind).create(len(self.rows))
 
     def _make(
         self, kind: Kind, left: Sequence[int], client: Client, crew: Workers, conclude: Callable[[int], None]

@@ -151,7 +151,7 @@ def _write_tables(
         plan.study.accuracy,
     )
     tables = Tables(store)
-    replaced = tables.withdraw()
+    replaced = tables.invalidate()
     store.write_qualities([record.quality if record else "" for record in records])
     tables.write("meshes", meshes, instead_of=replaced)
     tables.write("norms", norms_dataset(rows, orders, NormEstimate(*norms)), instead_of=replaced)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import psutil
 
-from sobolev_batch.batch.study.study import Backends
+from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import ClusterError
 
 # Names of what tasks ask of a worker, in Dask's words its resources.

@@ -12,7 +12,7 @@ from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
 from sobolev_batch.batch.fields.large_mesh import add_partials, cut_mesh, store_block, transform_piece
 from sobolev_batch.batch.fields.sizing import Layout
 from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, finish_mesh
-from sobolev_batch.batch.study.study import Backends
+from sobolev_batch.batch.study.schema import Backends
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from sobolev_batch.batch.cluster.worker_plugin import backend_of
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.study import Backends
+from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.a_priori import choose_settings

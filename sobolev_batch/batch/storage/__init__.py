@@ -1,4 +1,4 @@
-"""Storage: where the bytes of a store lie, how they are reached, and who may write them.
+"""Storage: the keys of a store, in a folder or in object storage, and the lock on it.
 
-In: a path or a URL. Out: keys read, written and listed, in a folder or in object storage.
+In: a path or a URL. Out: keys that are read, written and listed, by one run at a time.
 """

@@ -1,124 +1,145 @@
-"""Patience with object storage: what fails for a moment is tried again, and given up after a while.
+"""Stores in object storage, or wherever else a driver of fsspec reaches.
 
-The drivers repeat most requests by themselves, but not all: a part of a key above 50 MB whose transfer
-breaks off is not asked for again, and keys that a server did not remove are not even mentioned. Nor do
-they agree on when to give up. Keys are always written whole, so that writing one again is safe, also
-where the first time had succeeded and nobody was told.
+Credentials are never part of a URL. The drivers take them from the environment of each process.
 """
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Awaitable, Callable
-from functools import partial
-from typing import Any, Self, TypeVar, cast
+from collections.abc import Mapping
+from typing import Any
 
-from distributed.utils_comm import retry
 from fsspec import AbstractFileSystem
-from zarr.abc.store import ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import FsspecStore
+from fsspec.asyn import sync
+from fsspec.core import url_to_fs
 
-T = TypeVar("T")
+from sobolev_batch.batch.storage.retry import RetryingStore, put_all, remove_all
+from sobolev_batch.errors import StoreError
 
-# Who waits for a run that cannot go on wants to know within a minute.
-_SECONDS = 40.0
-_SLOWEST_BYTES_PER_SECOND = 500_000
-# Besides the first time; the drivers have tried several times each time.
-_MORE_TIMES, _LEAST_DELAY, _LARGEST_DELAY, _JITTER = 2, 0.5, 5.0, 1.0
-# Asking again would not change the answer.
-_FINAL = (PermissionError, FileNotFoundError, NotADirectoryError)
+BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
+# Drivers repeat failing requests for minutes. That helps a run, but a question should be answered sooner.
+_ANSWER_SECONDS = 20
+_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+# s3fs asks for the size of every key first, to read ranges of 50 MB of larger ones at once.
+_SIZED_SCHEMES = ("s3", "s3a")
+_RANGE_BYTES = 50 << 20
 
 
-async def patiently(
-    attempt: Callable[[], Awaitable[T]], size_bytes: int = 0, final: tuple[type[Exception], ...] = _FINAL
-) -> T:
-    """What an attempt returns, or raises for the last time.
+class ObjectStorage:
+    """Keys of a store below a URL."""
 
-    Args:
-        attempt: called anew each time.
-        size_bytes: what it transfers at most.
-        final: what it raises if it need not be called again.
+    # The exceptions of drivers have no common base.
+    failures: tuple[type[Exception], ...] = (Exception,)
 
-    Raises:
-        OSError: nothing came of it in the time that any storage in use should need.
-    """
-    failures: list[Exception] = []
+    def __init__(self, url: str, scheme: str) -> None:
+        self._url, self._scheme = url, scheme
 
-    async def outcome() -> tuple[T, None] | tuple[None, Exception]:
+    def zarr_store(self, largest_bytes: int) -> RetryingStore:
+        """Return zarr's store below the URL."""
+        self._filesystem()
+        return RetryingStore.at(self._url, self._options(largest_bytes), largest_bytes)
+
+    def read(self, key: str, most_bytes: int | None) -> bytes:
+        """Return the content of a key, of any size."""
+        files, root = self._filesystem()
+        content: bytes = files.cat_file(f"{root}/{key}", **_timeout(files))
+        return content
+
+    def write(self, documents: Mapping[str, bytes]) -> None:
+        """Write keys, all at once."""
+        files, root = self._filesystem()
+        by_path = {f"{root}/{key}": document for key, document in documents.items()}
+        if files.async_impl:
+            sync(files.loop, put_all, files, by_path)
+        else:
+            files.pipe(by_path)
+
+    def create(self, key: str, document: bytes) -> None:
+        """Write a key by a conditional request."""
+        files, root = self._filesystem()
+        files.pipe_file(f"{root}/{key}", document, mode="create", **_timeout(files))
+
+    def exists(self) -> bool:
+        """Return false: object storage has no folders."""
+        return False
+
+    def delete(self, key: str) -> None:
+        """Remove a key."""
+        files, root = self._filesystem()
+        files.rm_file(f"{root}/{key}")
+
+    def delete_all(self, prefix: str) -> None:
+        """Remove all keys below a prefix."""
+        files, root = self._filesystem()
+        if files.async_impl:
+            sync(files.loop, remove_all, files, f"{root}/{prefix}")
+        else:
+            files.rm(f"{root}/{prefix}", recursive=True)
+
+    def delete_if_empty(self) -> None:
+        """Do nothing: object storage has no folders."""
+
+    def delete_partial_files(self) -> None:
+        """Do nothing: object storage shows a key once it is complete."""
+
+    def sizes(self, prefix: str) -> dict[str, int]:
+        """Return the sizes of all keys below a prefix."""
+        files, root = self._filesystem()
+        entries = files.find(f"{root}/{prefix}", detail=True, **_timeout(files))
+        return {path.removeprefix(f"{root}/"): entry["size"] for path, entry in entries.items()}
+
+    def names(self) -> set[str]:
+        """Return the names of keys at the first level."""
+        files, root = self._filesystem()
+        # The name alone may stand for a folder that was emptied; only existing keys are listed.
+        if not files.exists(root, **_timeout(files)):
+            return set()
+        return {path.rstrip("/").rpartition("/")[2] for path in files.ls(root, detail=False, **_timeout(files))}
+
+    def require_usable(self) -> None:
+        """Do nothing: only a request can tell."""
+
+    def is_absent(self, error: OSError) -> bool:
+        """Return whether the key is missing, and not its bucket."""
+        return not _lacks_bucket(error)
+
+    def explain(self, error: Exception, text: str) -> str:
+        """Return the reason of a failure and its remedy."""
+        if _lacks_bucket(error) or (self._scheme in BUCKET_SCHEMES and isinstance(error, FileNotFoundError)):
+            return f"there is no bucket {self._url.split('/')[2]!r} ({text})"
+        if isinstance(error, TimeoutError):
+            return f"nothing answers there within {_ANSWER_SECONDS} s"
+        if "Credentials" in type(error).__name__:
+            return f"no credentials ({text}); set those of {self._scheme}:// in the environment of every process"
+        if isinstance(error, PermissionError):
+            return f"access is denied ({text}); check the credentials in the environment and what they allow"
+        return text
+
+    def _options(self, largest_bytes: int) -> dict[str, Any]:
+        # fsspec remembers listings, but other processes write to the same store.
+        options: dict[str, Any] = {"use_listings_cache": False}
+        if self._scheme in _SIZED_SCHEMES and largest_bytes <= _RANGE_BYTES:
+            options["max_concurrency"] = 1
+        return options
+
+    def _filesystem(self) -> tuple[AbstractFileSystem, str]:
         try:
-            return await attempt(), None
-        except final as error:
-            return None, error
-        except Exception as error:
-            failures.append(error)
-            raise
-
-    seconds = _SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND
-    try:
-        async with asyncio.timeout(seconds):
-            found, error = await retry(
-                outcome, _MORE_TIMES, _LEAST_DELAY, _LARGEST_DELAY, _JITTER, Exception, "access to object storage"
-            )
-    except TimeoutError as late:
-        # What was said before tells more. Of a TimeoutError, fsspec would not keep the message.
-        silent = OSError(f"no success within {seconds:.0f} s, however often it was tried")
-        raise failures[-1] if failures else silent from late
-    if error is not None:
-        raise error
-    return found  # type: ignore[no-any-return]
+            files, root = url_to_fs(self._url, **self._options(0))
+        except ImportError as error:
+            extra = _EXTRAS.get(self._scheme)
+            remedy = f"pip install 'sobolev-batch[{extra}]'" if extra else "install it"
+            raise StoreError(
+                f"{self._url}: the driver of {self._scheme}:// is missing here ({error}): {remedy}"
+            ) from error
+        except ValueError as error:
+            raise StoreError(f"{self._url}: no store can lie there ({error}); name a folder or an s3:// URL") from error
+        return files, str(root)
 
 
-class PatientKeys(FsspecStore):
-    """Keys that zarr reads and writes through a driver of fsspec.
-
-    Attributes:
-        largest_bytes: what one of them holds at most.
-    """
-
-    largest_bytes: int = 0
-
-    @classmethod
-    def at(cls, url: str, options: dict[str, Any], largest_bytes: int) -> Self:
-        """Those below a URL, with options of its driver."""
-        keys = cast(Self, cls.from_url(url, storage_options=options))
-        keys.largest_bytes = largest_bytes
-        return keys
-
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """The bytes of a key or of a part of it, None where there is none."""
-        return await patiently(partial(super().get, key, prototype, byte_range), self.largest_bytes)
-
-    async def set(self, key: str, value: Buffer, byte_range: tuple[int, int] | None = None) -> None:
-        """Replace a key."""
-        # An upload in parts that has ended unheard is not found any more; the next one is another.
-        await patiently(partial(super().set, key, value, byte_range), len(value), (PermissionError,))
+def _timeout(files: AbstractFileSystem) -> dict[str, Any]:
+    return {"timeout": _ANSWER_SECONDS} if files.async_impl else {}
 
 
-async def put_all(files: AbstractFileSystem, documents: dict[str, bytes]) -> None:
-    """Write keys, all at once."""
-    # All are waited for, since asyncio logs the failures that nobody asked for.
-    puts = (
-        patiently(partial(files._pipe_file, path, document), len(document), (PermissionError,))
-        for path, document in documents.items()
-    )
-    for outcome in await asyncio.gather(*puts, return_exceptions=True):
-        if isinstance(outcome, BaseException):
-            raise outcome
-
-
-async def remove_all(files: AbstractFileSystem, prefix: str) -> None:
-    """Remove all keys below a prefix.
-
-    Raises:
-        FileNotFoundError: there are none.
-    """
-
-    async def remove() -> None:
-        await files._rm(prefix, recursive=True)
-        # A server may remove some of them; s3fs does not look at what became of the others.
-        left = await files._find(prefix)
-        if left:
-            raise OSError(f"{len(left)} keys are still there, such as {left[0]}")
-
-    await patiently(remove)
+def _lacks_bucket(error: Exception) -> bool:
+    """Return whether the bucket is missing, for drivers that report a missing key in the same way."""
+    response: Any = getattr(error.__cause__, "response", None)
+    return isinstance(response, dict) and response.get("Error", {}).get("Code") == "NoSuchBucket"

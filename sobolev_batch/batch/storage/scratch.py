@@ -1,4 +1,4 @@
-"""The scratch space of a store: pieces of huge meshes, there only while they are computed."""
+"""Scratch space of a store: the parts of huge meshes, while they are computed."""
 
 from __future__ import annotations
 
@@ -20,25 +20,21 @@ _FOLDER = "scratch"
 
 @dataclass(frozen=True)
 class Scratch:
-    """Pieces of meshes, by the rows and the cuts that they belong to: each one key, with a checksum."""
+    """Batches of the triangles of meshes, each one key with a checksum, by row, token of the cut, and number."""
 
     location: Location
 
     def write(self, row: int, token: str, number: int, mesh: Mesh) -> None:
-        """Keep a piece of a cut of a row's mesh until the row's pieces are discarded.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
+        """Store a batch of a row's mesh until the row is discarded."""
         archive = io.BytesIO()
         np.savez(archive, vertices=mesh.vertices, triangles=mesh.triangles)
         self.location.write({_key(row, token, number): archive.getvalue()})
 
     def read(self, row: int, token: str, number: int) -> Mesh:
-        """A piece that was written.
+        """Return a batch that was stored.
 
         Raises:
-            StoreError: it is not there, damaged, or cannot be reached.
+            StoreError: It is missing or damaged, or cannot be read.
         """
         archive = self.location.read(_key(row, token, number))
         try:
@@ -48,12 +44,12 @@ class Scratch:
                 return Mesh.from_checked(arrays["vertices"], arrays["triangles"])
         except (ValueError, KeyError, zipfile.BadZipFile) as error:
             raise StoreError(
-                f"{self.location}: piece {number} of the mesh of row {row} cannot be read ({error}); "
+                f"{self.location}: batch {number} of the triangles of row {row} cannot be read ({error}); "
                 "run the study again"
             ) from error
 
     def discard(self, row: int | None = None) -> None:
-        """Remove the pieces of a row, or of all; what cannot be removed is in nobody's way."""
+        """Remove the batches of a row, or of all rows. A failure does no harm and is only reported."""
         try:
             self.location.remove(_FOLDER if row is None else f"{_FOLDER}/{row}")
         except StoreError as error:

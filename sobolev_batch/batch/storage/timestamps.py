@@ -9,10 +9,14 @@ _FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 
 
 def utc_now() -> str:
-    """The time, in UTC."""
+    """Return the time in UTC.
+
+    >>> len(utc_now())
+    20
+    """
     return time.strftime(_FORMAT, time.gmtime())
 
 
 def age_seconds(moment: str) -> float:
-    """The time since a moment that `utc_now` has told, in seconds."""
+    """Return the seconds since a time that `utc_now` returned."""
     return time.time() - calendar.timegm(time.strptime(moment, _FORMAT))

@@ -1,4 +1,4 @@
-"""Preparing a store for a run: laying it out, or taking up what a study has gained."""
+"""Preparation of a store for a run: create it, or add what the study has gained."""
 
 from __future__ import annotations
 
@@ -10,25 +10,15 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-import zarr
-from zarr.abc.buffer import Buffer
-from zarr.codecs import Crc32cCodec
-from zarr.storage import MemoryStore
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import CLAIM_KEYS
+from sobolev_batch.batch.storage.lock import LOCK_KEYS
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords
+from sobolev_batch.batch.store.hierarchy import FIELD, LABELS, QUALITY, RECORD, RECORDS, ROOT
+from sobolev_batch.batch.store.layout import Layout
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import (
-    FIELD,
-    LABELS,
-    QUALITY,
-    RECORD,
-    ROOT,
-    UNFINISHED,
-    Store,
-)
-from sobolev_batch.batch.store.tables import Tables, table_encoding
+from sobolev_batch.batch.store.store import UNFINISHED, Store
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
@@ -39,154 +29,124 @@ _log = logging.getLogger(__name__)
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
-def require_place(location: Location) -> None:
-    """Check, without writing, that a store is or may be laid out at a location.
+def require_usable(location: Location) -> None:
+    """Check, without writing, that a store exists or may be created at a location.
 
     Raises:
-        StoreError: it cannot be reached, or something else is there.
+        StoreError: The location cannot be read, or holds something else.
     """
     store = Store(location)
-    if not store.is_there():
-        location.require_free(besides=CLAIM_KEYS)
+    if not store.exists():
+        location.require_free(besides=LOCK_KEYS)
     elif not store.is_unfinished:
         store.attributes()
 
 
-def prepare_store(place: str | Path | Location, plan: Plan) -> Store:
-    """Create the store of a plan, or open it if it is already there and take up new meshes.
+def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
+    """Create the store of a plan, or open it and add rows for new meshes.
 
     Raises:
-        StoreError: the place cannot be reached or written, holds something else, or a store of
-            another study; nothing is changed then.
+        StoreError: The location cannot be read or written, or holds something else or the store of another study,
+            which then stays as it is.
     """
-    store = Store(place)
-    if not store.is_there():
-        store.location.require_free(besides=CLAIM_KEYS)
-        _lay_out(store, plan)
+    store = Store(location)
+    if not store.exists():
+        store.location.require_free(besides=LOCK_KEYS)
+        _create(store, plan)
         return store
     if store.is_unfinished:
         _replace_everything(store, plan)
         return store
     _check_same_study(store, plan)
-    store.location.sweep()
+    store.location.remove_partial_files()
     with store.location.access("written"):
-        if _lattice(store) != _lattice_entry(plan):
+        study = store.attributes()["study"]
+        if any(study[name] != value for name, value in _lattice_entry(plan).items()):
             done = sum(record is not None for record in store.records())
             _log.warning(
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
             )
             _replace_everything(store, plan)
-        store.mend_labels()
+        store.repair_labels()
         _extend(store, plan)
-        _mend_axes(store, plan)
+        _repair_axes(store, plan)
         if store.attributes().get("similarity") != _similarity_entry(plan.similarity):
-            # In another unit of length, and the run may end before there are others.
-            Tables(store).withdraw()
+            # Tables are in another unit of length, and the run may end before there are others.
+            Tables(store).invalidate()
         store.documents[""]["attributes"].update(_attributes(plan))
-        # Written even if nothing changed: a place that refuses it must do so before tasks start.
+        # Written even if nothing changed: a location that cannot be written must fail before tasks start.
         store.consolidate()
     return store
 
 
 def _replace_everything(store: Store, plan: Plan) -> None:
-    """Remove everything that was computed and lay out the arrays for another lattice."""
+    """Remove everything that was computed and create the arrays for another lattice."""
     _mark_unfinished(store, plan)
-    store.location.sweep()
-    for name in sorted(store.location.names() - {*CLAIM_KEYS, ROOT}):
+    store.location.remove_partial_files()
+    for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT}):
         store.location.remove(name)
-    _lay_out(store, plan)
+    _create(store, plan)
 
 
 def _mark_unfinished(store: Store, plan: Plan) -> None:
-    """Say that nothing of what is there counts until it is laid out: whoever does that may be killed before."""
+    """Declare the content of the store invalid, since this process may be killed before it has created the arrays."""
     attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
-    root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-    store.location.write({ROOT: json.dumps(root).encode()})
+    store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
 
 
-def _lay_out(store: Store, plan: Plan) -> None:
-    labels = [row.label for row in plan.rows]
-    lattice = plan.lattice
-    chunk = plan.blocks[0].shape
-    made: dict[str, Buffer] = {}
-    root = zarr.create_group(MemoryStore(made), zarr_format=3)
-    root.create_array(
+def _create(store: Store, plan: Plan) -> None:
+    labels = np.array([row.label for row in plan.rows], dtype=object)
+    rows = len(labels)
+    layout = Layout()
+    layout.add_array(
         FIELD,
-        shape=(len(labels), *lattice.shape),
-        dtype=plan.choice.dtype,
-        chunks=(1, *chunk),
-        compressors=(Crc32cCodec(),),
-        fill_value=complex(np.nan, np.nan),
-        dimension_names=("mesh", *AXES),
-        # xarray takes what `coordinates` names for coordinates, so it stays with a selected field.
-        attributes={
-            "long_name": "Fourier transform of the area measure, xi_z >= 0 half",
-            "coordinates": "quality",
-        },
+        plan.choice.dtype,
+        (rows, *plan.lattice.shape),
+        (1, *plan.blocks[0].shape),
+        ("mesh", *AXES),
+        long_name="Fourier transform of the area measure, xi_z >= 0 half",
+        # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
+        coordinates="quality",
     )
-    root.create_array(
-        QUALITY,
-        shape=(len(labels),),
-        dtype=str,
-        chunks=(len(labels),),
-        compressors=(Crc32cCodec(),),
-        fill_value="",
-        dimension_names=("mesh",),
-    )
-    axes = _axes(plan).assign_coords(mesh=np.array(labels, dtype=object))
-    axes.to_zarr(
-        MemoryStore(made),
-        group="fourier",
-        mode="a",
-        zarr_format=3,
-        consolidated=False,
-        encoding=table_encoding(axes),
-    )
-    root.create_array(
-        RECORD,
-        shape=(len(labels),),
-        dtype=str,
-        chunks=(1,),
-        compressors=(Crc32cCodec(),),
-        dimension_names=("mesh",),
-        fill_value="",
-    )
+    layout.add_array(QUALITY, str, (rows,), (rows,), ("mesh",))
+    units = {"units": "cycles per unit length"}
+    axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
+    layout.add_dataset("fourier", xr.Dataset(coords={**axes, "mesh": labels}))
+    layout.add_array(RECORD, str, (rows,), (1,), ("mesh",))
     _mark_unfinished(store, plan)
-    store.documents = {"": {**json.loads(made.pop(ROOT).to_bytes()), "attributes": _attributes(plan)}}
-    store.publish(made, last="")
+    store.documents = {"": _root(_attributes(plan))}
+    store.publish({**layout.keys("fourier"), **layout.keys(RECORDS)})
     store.consolidate()
 
 
-def _axes(plan: Plan) -> xr.Dataset:
-    units = {"units": "cycles per unit length"}
-    return xr.Dataset(coords={name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)})
+def _root(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 
-def _mend_axes(store: Store, plan: Plan) -> None:
-    """Write the coordinates of the lattice again where they are damaged: without them nothing can be selected."""
+def _repair_axes(store: Store, plan: Plan) -> None:
+    """Write damaged coordinates of the lattice again: nothing can be selected without them."""
     for name, axis in zip(AXES, plan.lattice.axes, strict=True):
         array = store.array(f"fourier/{name}")
         try:
-            sound = np.array_equal(array[...], axis)
+            is_intact = np.array_equal(array[...], axis)
         except ValueError:
-            sound = False
-        if not sound:
+            is_intact = False
+        if not is_intact:
             array[...] = axis
 
 
 def _check_same_study(store: Store, plan: Plan) -> None:
     study = store.attributes()["study"]
-    # A lattice that was chosen may be chosen anew; one that was given is part of the study.
-    chosen = plan.study.accuracy is not None
-    differences = [
-        f"{what} {old}, not {new}"
-        for what, old, new in (
-            ("the study", repr(study["name"]), repr(plan.study.name)),
-            ("a lattice of", *map(_described, (study["lattice"], _lattice_entry(plan)["lattice"]))),
+    # A chosen lattice may be chosen anew; a given one is part of the study.
+    may_change = plan.study.accuracy is not None and study.get("choice")
+    comparisons = [("the study", repr(study["name"]), repr(plan.study.name))]
+    if not may_change:
+        planned = _lattice_entry(plan)["lattice"]
+        comparisons += [
+            ("a lattice of", _describe(study["lattice"]), _describe(planned)),
             ("dtype", repr(study["dtype"]), repr(plan.choice.dtype)),
-        )
-        if old != new and not (chosen and what != "the study" and study.get("choice"))
-    ]
+        ]
+    differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
     removed = set(store.labels()) - {row.label for row in plan.rows}
     if removed:
         differences.append(f"meshes that this study lacks, such as {min(removed)!r}")
@@ -197,32 +157,27 @@ def _check_same_study(store: Store, plan: Plan) -> None:
         )
 
 
-def _lattice(store: Store) -> dict[str, Any]:
-    study = store.attributes()["study"]
-    return {"lattice": study["lattice"], "dtype": study["dtype"]}
-
-
 def _extend(store: Store, plan: Plan) -> None:
-    """Append rows for meshes that the study has gained; the rows that are there stay."""
-    there = store.labels()
-    known = set(there)
-    added = [row.label for row in plan.rows if row.label not in known]
+    """Append rows for meshes that the study has gained."""
+    labels = store.labels()
+    existing = set(labels)
+    added = [row.label for row in plan.rows if row.label not in existing]
     if not added:
         return
+    rows = len(labels) + len(added)
     for name in (RECORD, FIELD, QUALITY, LABELS):
-        store.resize(name, (len(there) + len(added), *store.array(name).shape[1:]))
-        if name in (LABELS, QUALITY):
-            # Not left out: what is not there counts as lost.
-            texts = added if name == LABELS else [""] * len(added)
-            store.array(name)[len(there) :] = np.array(texts, dtype=object)
-    for notes in (ComparisonRecords(store, kind) for kind in KINDS):
-        # Arrays of one group that differ along `mesh` cannot be read together.
-        if store.has(notes.name):
-            notes.lay_out(len(there) + len(added))
+        store.resize(name, (rows, *store.array(name).shape[1:]))
+    # Empty qualities are written too, since a missing chunk counts as lost.
+    for name, values in ((QUALITY, [""] * len(added)), (LABELS, added)):
+        store.array(name)[len(labels) :] = np.array(values, dtype=object)
+    for records in (ComparisonRecords(store, kind) for kind in KINDS):
+        # xarray cannot read arrays of one group together that differ along `mesh`.
+        if store.has(records.name):
+            records.create(rows)
 
 
 def _attributes(plan: Plan) -> dict[str, Any]:
-    """What the root of the store of a plan says."""
+    """Return the attributes of the root of the store of a plan."""
     study = plan.study
     return {
         "title": study.title,
@@ -241,7 +196,7 @@ def _attributes(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _described(lattice: dict[str, Any]) -> str:
+def _describe(lattice: dict[str, Any]) -> str:
     return f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
 
 

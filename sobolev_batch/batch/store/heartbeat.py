@@ -1,49 +1,52 @@
-"""The record of a run in its store: kept up to date while it runs, closed when it ends."""
+"""Heartbeat of a run: a record in its store that is renewed while it runs and completed when it ends."""
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Self
 
-from sobolev_batch.batch.storage.lock import Claim, this_process
+from sobolev_batch.batch.storage.lock import Lock, this_process
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import RunRecord, RunState
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.errors import ClaimError, StoreError
+from sobolev_batch.errors import LockError, StoreError
 
 _log = logging.getLogger(__name__)
 
-# Who reads the record knows from its age whether the driver still lives.
+# The age of the record tells its readers whether the driver still runs.
 HEARTBEAT_SECONDS = 10.0
-# A driver that was silent for so long is taken for lost.
-PATIENCE_SECONDS = 6 * HEARTBEAT_SECONDS
+# A driver counts as lost after this silence.
+LOST_AFTER_SECONDS = 6 * HEARTBEAT_SECONDS
 
 
 class Heartbeat:
-    """Tells a store that a run is going on, from where, and how it ended.
+    """Record in a store that says where a run goes on, and how it ended.
+
+    Args:
+        store: Store of the run.
+        lock: Lock that the run holds.
 
     Attributes:
-        cluster: the address of the scheduler, once there is one.
-        stage: what is being done.
-        worry: asked at each beat, for what keeps the run from going on; empty while nothing does.
+        cluster: Address of the scheduler, once there is one.
+        stage: Current stage.
+        find_obstacle: Function that is called at each beat and returns what keeps the run from going on, if anything.
     """
 
-    def __init__(self, store: Store, claim: Claim) -> None:
-        """Name the store, and the claim that it is held by."""
+    def __init__(self, store: Store, lock: Lock) -> None:
         self.cluster = ""
         self.stage = ""
-        self.worry: Callable[[], str] = str
+        self.find_obstacle: Callable[[], str] = str
         self._store = store
-        self._claim = claim
+        self._lock = lock
         self._is_lost = False
-        self._lock = Lock()
+        self._writing = threading.Lock()
         self._started = utc_now()
-        self._ended = Event()
-        self._thread = Thread(target=self._beat, name="sobolev-batch-journal", daemon=True)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="sobolev-batch-heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
         self.write("running")
@@ -56,12 +59,12 @@ class Heartbeat:
         self._ended.set()
         self._thread.join()
         if error is None:
-            self._claim.require(self._store.location)
+            self._lock.require(self._store.location)
             self.write("done")
             return
         try:
-            # Another driver may have taken over, as when this one's worker was retired: how that ends counts.
-            if self._claim.is_on(self._store.location):
+            # If another driver took over, as when this one's worker was retired, its own end counts.
+            if self._lock.is_held(self._store.location):
                 ended = isinstance(error, KeyboardInterrupt | SystemExit)
                 self.write("failed", "interrupted" if ended else str(error) or repr(error))
         except StoreError as failure:
@@ -69,46 +72,43 @@ class Heartbeat:
             _log.warning("how the run ended could not be written: %s", failure)
 
     def paused(self) -> AbstractContextManager[object]:
-        """Keep it from writing for a while."""
-        return self._lock
+        """Return a context in which nothing is written."""
+        return self._writing
 
-    def _worry(self) -> str:
-        try:
-            return self.worry()
-        except Exception as error:  # a cluster that is closing does not answer; the run is alive all the same
-            _log.debug("the cluster could not be asked: %r", error)
-            return ""
-
-    def require_claim(self) -> None:
-        """Check that the store was still this run's at the latest beat.
+    def require_lock(self) -> None:
+        """Check that the run still held the store at the latest beat.
 
         Raises:
-            ClaimError: it was released, or somebody else has it.
+            LockError: The store was released, or another run has it.
         """
         if self._is_lost:
-            raise ClaimError(
+            raise LockError(
                 f"{self._store.path}: the store was released while this run was going on, and is no longer its own; "
                 "what was recorded counts"
             )
 
     def write(self, state: RunState, error: str = "") -> None:
-        """Replace the store's record."""
-        self._store.write_run(RunRecord(state, self._driver, self._started, utc_now(), self.stage, error))
-
-    @property
-    def _driver(self) -> str:
-        return f"{this_process()}, cluster {self.cluster}" if self.cluster else this_process()
+        """Replace the record."""
+        driver = f"{this_process()}, cluster {self.cluster}" if self.cluster else this_process()
+        self._store.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
 
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):
             try:
-                if not self._claim.is_on(self._store.location):
+                if not self._lock.is_held(self._store.location):
                     self._is_lost = True
                     return
-                with self._lock:
-                    worry = self._worry()
-                    if worry:
-                        _log.warning("%s: %s", self._store.path, worry)
-                    self.write("running", worry)
+                with self._writing:
+                    obstacle = self._obstacle()
+                    if obstacle:
+                        _log.warning("%s: %s", self._store.path, obstacle)
+                    self.write("running", obstacle)
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)
+
+    def _obstacle(self) -> str:
+        try:
+            return self.find_obstacle()
+        except Exception as error:  # a cluster that is closing does not answer, but the run is alive
+            _log.debug("the cluster could not be asked: %r", error)
+            return ""

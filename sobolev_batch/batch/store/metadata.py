@@ -1,8 +1,8 @@
-"""Metadata documents of a store: only what this package writes is taken from one.
+"""Metadata documents of a store, restricted to what this package writes.
 
-zarr finds codecs, data types and storage transformers by the names in these documents, among them some that
-unpickle what they read, and any that an installed distribution offers. A store may come from somebody else:
-nothing of it is handed to zarr or xarray before its documents were checked here.
+zarr finds codecs, data types and storage transformers by the names in these documents. Some of them unpickle what
+they read, and any installed distribution may offer more. A store may come from somebody else, so nothing of it
+reaches zarr or xarray before its documents were checked here.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any, TypeGuard
 
 from sobolev_batch.errors import StoreError
 
-# Of the layout that docs/store.md describes.
+# Version of the layout that docs/store.md describes.
 SCHEMA_VERSION = 3
 
 Document = dict[str, Any]
 
-# Of one metadata document. That of the root repeats all others, and holds about 1 kB for each.
+# Size of one document. That of the root repeats all others, with about 1 kB for each.
 MOST_BYTES = 64_000_000
 
 _NODE = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)?")  # a group, or an array in one
@@ -30,17 +30,17 @@ _ARRAY_KEYS = {
 }
 _DATA_TYPES = ("bool", "int64", "float32", "float64", "complex64", "complex128", "string")
 _CODECS = ("bytes", "crc32c", "vlen-utf8")
-# An array without a single chunk takes no room in a store, and any amount of memory once it is read. Arrays with
-# one axis are read when a store is opened, tables with two for a report; all others on demand.
+# By the number of axes. An array without a single chunk takes no space in a store, and any amount of memory once it
+# is read. Arrays with one axis are read when a store is opened, tables with two for a report, all others on demand.
 _MOST_ELEMENTS = {0: 1, 1: 10**7, 2: 10**8}
 _LONGEST_AXIS = 2**40
 
 
 def check_documents(store: str, documents: Mapping[str, Any]) -> None:
-    """Check the metadata documents of a store, by the paths of their nodes; the root's path is empty.
+    """Check metadata documents of a store, by the paths of their nodes; the root's path is empty.
 
     Raises:
-        StoreError: one has what this package does not write; the message names the node and what was found.
+        StoreError: A document has what this package does not write; the message names the node and what was found.
     """
     for name, document in documents.items():
         problem = _problem(name, document)
@@ -48,14 +48,8 @@ def check_documents(store: str, documents: Mapping[str, Any]) -> None:
             raise StoreError(f"{store}: the store is not used: {problem}; this program did not write that")
         if document["node_type"] == "group":
             prefix = f"{name}/" if name else ""
-            inner = _consolidated(document)
-            check_documents(store, {f"{prefix}{path}": inner[path] for path in inner})
-
-
-def _consolidated(document: Document) -> Document:
-    """What a group repeats of the nodes in it."""
-    found: Document = (document.get("consolidated_metadata") or {}).get("metadata") or {}
-    return found
+            nodes = (document.get("consolidated_metadata") or {}).get("metadata") or {}
+            check_documents(store, {f"{prefix}{path}": node for path, node in nodes.items()})
 
 
 def _problem(name: str, document: Any) -> str:
@@ -79,8 +73,8 @@ def _problem_of_group(node: str, document: Document) -> str:
     consolidated = document.get("consolidated_metadata")
     if consolidated is None:
         return ""
-    known = isinstance(consolidated, dict) and consolidated.get("kind") == "inline"
-    if not known or not isinstance(consolidated.get("metadata"), dict):
+    is_inline = isinstance(consolidated, dict) and consolidated.get("kind") == "inline"
+    if not is_inline or not isinstance(consolidated.get("metadata"), dict):
         return f"the consolidated metadata of {node} are {_shown(consolidated)}"
     return ""
 
@@ -96,9 +90,9 @@ def _problem_of_array(node: str, document: Document) -> str:
     if document.get("storage_transformers"):
         return f"{node} has the storage transformers {_shown(document['storage_transformers'])}"
     for key, expected in (("chunk_grid", "regular"), ("chunk_key_encoding", "default")):
-        found = document.get(key)
-        if not isinstance(found, dict) or found.get("name") != expected:
-            return f"the {key} of {node} is {_shown(found)}"
+        value = document.get(key)
+        if not isinstance(value, dict) or value.get("name") != expected:
+            return f"the {key} of {node} is {_shown(value)}"
     shape, chunk = document.get("shape"), (document["chunk_grid"].get("configuration") or {}).get("chunk_shape")
     if not _is_shape(shape, 0) or not _is_shape(chunk, 1) or len(shape) != len(chunk):
         return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"

@@ -1,28 +1,66 @@
-"""Completion records: what says that a mesh is done, written after everything else of it."""
+"""Records in a store: of the computation of each surface, and of the latest run."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Hashable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Self
+from functools import cache
+from typing import Any, ClassVar, Literal, Self, cast
 
-from sobolev_batch.errors import StoreError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from sobolev_batch.errors import DamageError, StoreError
 
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
 
 
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors(include_url=False)[0]
+    return ": ".join(filter(None, (".".join(map(str, problem["loc"])), problem["msg"])))
+
+
+class JsonRecord:
+    """A dataclass that is stored as one line of JSON."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    kind: ClassVar[str]
+
+    def to_json(self) -> str:
+        """Return the record as one line of JSON."""
+        return json.dumps(asdict(self))  # type: ignore[call-overload]
+
+    @classmethod
+    def from_json(cls, text: str) -> Self | None:
+        """Return the record that a line holds, or None if the line is empty.
+
+        Raises:
+            DamageError: The line is not a record.
+        """
+        try:
+            return _adapter(cast(Hashable, cls)).validate_json(text) if text else None
+        except ValidationError as error:
+            problem = _first_problem(error)
+            raise DamageError(f"a {cls.kind} is damaged ({problem}): {text[:80]!r}", problem) from error
+
+
 @dataclass(frozen=True)
 class Facts:
-    """What was found out about a surface when it was transformed.
+    """Properties of a surface, found when it was transformed.
 
     Attributes:
-        vertices, triangles: counts; zero for a surface that is no mesh.
-        area: total area in the study's unit of length, squared.
-        edge_length_mean, edge_length_max: over triangle sides, in the study's unit; NaN without.
-        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: see `MeshCounts`.
-        digest: SHA-256 of vertices and triangles in the study's unit; empty without.
-        points: quadrature points; zero without.
+        vertices, triangles: Counts; zero for a surface that is no mesh.
+        area: Total area in the study's unit of length, squared.
+        edge_length_mean, edge_length_max: Lengths of triangle sides, in the study's unit; NaN without triangles.
+        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: See `MeshCounts`.
+        digest: SHA-256 of vertices and triangles in the study's unit; empty without triangles.
+        points: Number of quadrature points; zero for a closed form.
     """
 
     vertices: int = 0
@@ -39,22 +77,24 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Record:
-    """The outcome of one mesh.
+class Record(JsonRecord):
+    """Completion record of one surface, written after everything else of it.
 
     Attributes:
-        key: what went in: the row's key when the mesh was computed.
+        key: Key of the row when the surface was computed: a digest of all that its field depends on.
         status: "complete" or "failed".
-        reason: why it failed; empty otherwise.
-        facts: what came out.
-        quality: what the errors of norms need to know of the field, see `Quality.to_json`.
-        checksums: of the field's blocks, see `Store.write_field`; a field that has others was not written
-            by the tasks that this record is of, or was damaged.
-        seconds: time spent in its tasks.
-        worker: address of the worker that finished it.
-        backend: what computed the transform.
-        finished: when, in UTC.
+        reason: Reason of the failure; empty otherwise.
+        facts: Properties of the surface.
+        quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
+        checksums: Checksums of the field's blocks, see `Store.write_field`. A field with others is damaged, or was
+            written by another task.
+        seconds: Time spent in its tasks.
+        worker: Address of the worker that finished it.
+        backend: Backend of the transform.
+        finished: Time at which it was finished, in UTC.
     """
+
+    kind = "completion record"
 
     key: str
     status: Status
@@ -67,42 +107,22 @@ class Record:
     backend: str = ""
     finished: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> Self | None:
-        """The record that a line holds, or None where nothing was written.
-
-        Raises:
-            StoreError: the line is not a record.
-        """
-        if not text:
-            return None
-        try:
-            values: dict[str, Any] = json.loads(text)
-            parts = {"facts": Facts(**values["facts"]), "checksums": tuple(values["checksums"])}
-            return cls(**{**values, **parts})
-        except (ValueError, TypeError, KeyError) as error:
-            raise StoreError(f"a completion record is damaged ({error}): {text[:80]!r}") from error
-
     def completes(self, key: str) -> bool:
-        """Whether a field with this key need not be computed."""
+        """Return whether the field with this key exists already."""
         return self.status == "complete" and bool(key) and self.key == key
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The latest run of a study, as far as its store knows.
+    """State of the latest run of a study.
 
     Attributes:
-        state: "submitted" until a worker takes it up, "running", "done" or "failed".
-        driver: what drives it: the process and its host, and the cluster it computes on.
-        started: when, in UTC.
-        seen: the latest sign of life of its driver, in UTC.
-        stage: what it is doing.
-        error: why it failed, or what keeps it from going on; empty otherwise.
+        state: "submitted" until a worker starts it, then "running", "done" or "failed".
+        driver: Description of the driver: its process and host, and its cluster.
+        started: Time of the start, in UTC.
+        seen: Time of the driver's latest heartbeat, in UTC.
+        stage: Current stage.
+        error: Reason of the failure, or obstacle to the run; empty otherwise.
     """
 
     state: RunState
@@ -113,15 +133,15 @@ class RunRecord:
     error: str = ""
 
     def to_table(self) -> dict[str, str]:
-        """The record as JSON takes it."""
+        """Return the record as a table."""
         return asdict(self)
 
     @classmethod
     def from_table(cls, table: dict[str, str]) -> Self:
-        """The record that a table holds.
+        """Return the record that a table holds.
 
         Raises:
-            StoreError: it is not one.
+            StoreError: The table is not a record.
         """
         try:
             return cls(**table)  # type: ignore[arg-type]

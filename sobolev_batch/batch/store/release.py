@@ -1,4 +1,4 @@
-"""Releasing a store: taking away the claim of a run that is gone."""
+"""Release of a store from the lock of a run that is gone."""
 
 from __future__ import annotations
 
@@ -7,56 +7,62 @@ from contextlib import suppress
 from pathlib import Path
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Claim, remove_claim
+from sobolev_batch.batch.storage.lock import Lock, break_lock
 from sobolev_batch.batch.storage.timestamps import age_seconds
-from sobolev_batch.batch.store.heartbeat import PATIENCE_SECONDS
+from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.errors import ClaimError, StoreError
+from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.parameters import renamed_parameters
 
 
-def release(place: str | Path | Location, *, force: bool = False) -> Claim | None:
-    """Take away the claim of a run that cannot do so itself, because it or its machine was killed.
+@renamed_parameters(place="store")
+def release(store: str | Path | Location, *, force: bool = False) -> Lock | None:
+    """Remove the lock of a run that cannot do so itself, because it or its machine was killed.
 
-    A run that is still going on ends when it notices, within seconds.
+    A run that is still going on notices within seconds, and ends.
 
     Args:
-        place: path or URL of the store.
-        force: even if there was a sign of life of the run a moment ago.
+        store: Path or URL of the store.
+        force: Whether to remove the lock of a run that was alive a moment ago, too.
 
     Returns:
-        The claim, or None where there was none.
+        The lock, or None if the store had none. Its `driver` names the process that held it since the UTC time `since`.
 
     Raises:
-        ClaimError: the run was alive a moment ago.
-        StoreError: the store cannot be reached or written.
+        LockError: The run was alive a moment ago.
+        StoreError: The store cannot be read or written.
+
+    >>> import sobolev_batch as sb
+    >>> sb.release("memory://new.zarr") is None
+    True
     """
-    location = Location.of(place)
-    claim = Claim.read(location)
-    if claim is None:
+    location = Location.of(store)
+    lock = Lock.read(location)
+    if lock is None:
         return None
-    if not force and claim.is_of_the_living:
-        raise ClaimError(f"{location}: {claim.driver} is alive; stop it, or release the store all the same by --force")
-    silence = math.inf if force or claim.is_of_the_dead else _silence_seconds(location, claim)
-    if silence < PATIENCE_SECONDS:
-        raise ClaimError(
-            f"{location}: {claim.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
-            f"silent for {PATIENCE_SECONDS:.0f} s; --force releases the store all the same"
+    if not force and lock.holder_is_alive:
+        raise LockError(f"{location}: {lock.driver} is alive; stop it, or release the store all the same by --force")
+    silence = math.inf if force or lock.holder_is_gone else _silence_seconds(location, lock)
+    if silence < LOST_AFTER_SECONDS:
+        raise LockError(
+            f"{location}: {lock.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
+            f"silent for {LOST_AFTER_SECONDS:.0f} s; --force releases the store all the same"
         )
-    remove_claim(location)
-    return claim
+    break_lock(location)
+    return lock
 
 
-def _silence_seconds(location: Location, claim: Claim) -> float:
-    """Since the latest sign of life of a claim's holder."""
-    signs = [claim.since]
-    # Of a store that cannot be read, the claim itself is all that is known.
+def _silence_seconds(location: Location, lock: Lock) -> float:
+    """Return the time since the latest heartbeat of a lock's holder."""
+    moments = [lock.since]
+    # If the store cannot be read, only the lock itself is known.
     with suppress(StoreError):
         store = Store(location)
-        run = store.read_run() if store.is_there() else None
-        if run is not None and run.driver.startswith(claim.driver):
-            signs.append(run.seen)
+        run = store.read_run() if store.exists() else None
+        if run is not None and run.driver.startswith(lock.driver):
+            moments.append(run.seen)
     ages = []
-    for moment in signs:
+    for moment in moments:
         with suppress(ValueError):  # not a time that this program writes
             ages.append(age_seconds(moment))
     return min(ages, default=math.inf)

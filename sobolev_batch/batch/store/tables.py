@@ -1,20 +1,24 @@
-"""Tables: the small arrays of a store, each group of which is written, listed and withdrawn as a whole."""
+"""Tables: the small arrays of a store. Each group of them is written, listed and invalidated as a whole."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
-import zarr
-from zarr.abc.buffer import Buffer
-from zarr.codecs import Crc32cCodec
-from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.store.store import CHECKSUM_BYTES, LABELS, QUALITY, RECORDS, ROOT, WITNESS_GROUP, Store
+from sobolev_batch.batch.store.hierarchy import (
+    LABELS,
+    QUALITY,
+    RECORDS,
+    ROOT,
+    WITNESS_GROUP,
+    Hierarchy,
+    StoredChunks,
+)
+from sobolev_batch.batch.store.layout import Layout
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.lattice import AXES
 
@@ -24,75 +28,63 @@ _GROUPS_OF_TASKS = ("fourier", RECORDS, WITNESS_GROUP)
 
 @dataclass(frozen=True)
 class Tables:
-    """The tables of a store."""
+    """Tables of a store."""
 
-    store: Store
+    store: Hierarchy
 
-    def withdraw(self) -> tuple[str, ...]:
-        """Have no reader find the tables until they are listed again: while they are written they do not fit together.
+    def invalidate(self) -> tuple[str, ...]:
+        """Hide the tables from readers until they are written and listed again, and return their names.
 
-        Nor witness functions, which belong to the fields that are replaced.
-
-        Returns:
-            The names of all tables that there were.
+        While they are written they do not fit together. Witness functions are hidden too: they belong to the
+        fields that are replaced.
         """
         names = tuple(self._names())
         hidden = [*names, *(name for name in self.store.documents if name.split("/")[0] == WITNESS_GROUP)]
-        for name in hidden:
-            del self.store.documents[name]
         if hidden:
+            self.store.hide(hidden)
             self.store.consolidate()
         return names
 
     def write(self, group: str, dataset: xr.Dataset, *, instead_of: Sequence[str] = ()) -> None:
-        """Replace a group, each array in one chunk; `Store.consolidate` makes it known to readers.
+        """Replace a group, each array in one chunk. Readers find it after `Store.consolidate`.
 
         Args:
-            group: its name.
-            dataset: what it is to hold.
-            instead_of: tables that were withdrawn; those of the group that it has no longer are removed.
+            group: Name of the group.
+            dataset: New content of the group.
+            instead_of: Names of tables that were invalidated. Those that the group no longer has are removed.
         """
-        made: dict[str, Buffer] = {}
-        # A chunk that is not there is a lost one, and never a table of zeros.
-        with zarr.config.set({"array.write_empty_chunks": True}):
-            dataset.to_zarr(
-                MemoryStore(made),
-                group=group,
-                mode="w",
-                zarr_format=3,
-                consolidated=False,
-                encoding=table_encoding(dataset),
-            )
-        made.pop(ROOT, None)
+        layout = Layout()
+        layout.add_dataset(group, dataset)
+        keys = layout.keys(group)
         for name in instead_of:
-            if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in made:
+            if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in keys:
                 self.store.location.remove(name)
-        self.store.publish(made, last=f"{group}/{ROOT}")
+        self.store.publish(keys, last=f"{group}/{ROOT}")
 
     def attributes(self, group: str) -> dict[str, Any] | None:
-        """The attributes of a group, or None where it was not written yet."""
-        there = self.store.is_there() and group in self.store.documents
-        return self.store.documents[group].get("attributes", {}) if there else None
+        """Return the attributes of a group, or None if it is not listed."""
+        listed = self.store.exists() and group in self.store.documents
+        return self.store.documents[group].get("attributes", {}) if listed else None
 
     def lost(self) -> tuple[str, ...]:
-        """The arrays of tables that are not all there; nothing is read of them."""
-        lost = self._lost(self._names(), self._groups())
-        # Errors of norms hang on the first, and it is written with them; witness functions on the others.
-        besides = [*([QUALITY] if self._names() else ()), *self._axes_of_witness()]
-        return (*lost, *self._lost(besides, besides))
+        """Return the arrays of tables with missing chunks. No chunk is read."""
+        names = self._names()
+        # Errors of norms need the qualities, which are written with them; witness functions need their axes.
+        others = [*([QUALITY] if names else ()), *self._axes_of_witness()]
+        return tuple(self._incomplete(names, self._groups()) + self._incomplete(others, others))
 
     def damaged(self) -> dict[str, str]:
-        """What is wrong with each small array, of tables and coordinates, that cannot be read."""
+        """Return the damage of each small array, of tables and coordinates, that cannot be read."""
         coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *self._axes_of_witness()]
-        lost = {*self.lost(), *self._lost(coordinates, coordinates)}
-        damaged = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
+        lost = {*self.lost(), *self._incomplete(coordinates, coordinates)}
+        damage = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
         for name in [*coordinates, QUALITY, *self._names()]:
-            if name not in damaged and self.store.document(name).get("node_type") == "array":
+            if name not in damage and self._is_array(name):
                 try:
                     self.store.read(name, ...)
                 except DamageError as error:
-                    damaged[name] = error.what
-        return damaged
+                    damage[name] = error.what
+        return damage
 
     def _axes_of_witness(self) -> list[str]:
         names = (f"{WITNESS_GROUP}/{name}" for name in ("mesh", "order"))
@@ -105,30 +97,15 @@ class Tables:
         groups = self._groups()
         return [name for name in self.store.documents if name.split("/")[0] in groups]
 
-    def _lost(self, names: Sequence[str], prefixes: Sequence[str]) -> tuple[str, ...]:
-        """Which of some arrays are not there as long as they should be, by the sizes of keys."""
+    def _is_array(self, name: str) -> bool:
+        return self.store.document(name).get("node_type") == "array"
+
+    def _incomplete(self, names: Iterable[str], prefixes: Iterable[str]) -> list[str]:
+        """Return the arrays that have missing or short chunks, given prefixes of their keys."""
         sizes = {key: size for prefix in prefixes for key, size in self.store.location.sizes(prefix).items()}
-        lost = []
-        for name in names:
-            if self.store.document(name).get("node_type") != "array":
-                continue
-            array = self.store.array(name)
-            # Texts have no size that could be foretold.
-            fixed = array.dtype.kind in "biufc"
-            expected = math.prod(array.chunks) * array.dtype.itemsize + CHECKSUM_BYTES * bool(array.ndim)
-            counts = (-(-n // m) for n, m in zip(array.shape, array.chunks, strict=True))
-            for number in np.ndindex(*counts):
-                found = sizes.get(f"{name}/{array.metadata.encode_chunk_key(number)}", 0)
-                if found != expected if fixed else not found:
-                    lost.append(name)
-                    break
-        return tuple(lost)
-
-
-def table_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """One chunk per array, with a checksum."""
-    return {
-        str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}
-        for name, variable in dataset.variables.items()
-        if variable.ndim
-    }
+        incomplete = []
+        for name in filter(self._is_array, names):
+            chunks = StoredChunks(self.store, name, sizes)
+            if not chunks.are_complete(np.ndindex(*chunks.counts)):
+                incomplete.append(name)
+        return incomplete

@@ -1,4 +1,4 @@
-"""Study: a study file, validated once, and the plan that follows from it.
+"""Study: a validated study file, and the plan that follows from it.
 
 In: TOML or a table. Out: a frozen `Study`, its lattice, and a `Plan` with one row for each surface.
 """

@@ -1,4 +1,4 @@
-"""The lattice and precision of a study's fields: given, or chosen for an accuracy from a few pilot pairs."""
+"""Lattice and dtype of a study's fields: given, or chosen for an accuracy from a few pilot pairs."""
 
 from __future__ import annotations
 
@@ -28,25 +28,27 @@ from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
 
-# Pilots: the coarsest and the finest member of each family, of so many families.
+# Family and member of each surface, by label.
+Members = Mapping[str, tuple[str, Member]]
+
+# Pilots are the coarsest and the finest member of this many families.
 _MOST_FAMILIES = 6
 # Surfaces that are no pilots may reach a little further than those that are.
 _REACH_MARGIN = 1.03
-# A lattice grows by no more than this at a time.
+# Largest factor by which a lattice grows at a time.
 _LARGEST_GROWTH = 2.0
 
 
 @dataclass(frozen=True)
 class LatticeChoice:
-    """What all fields of a study have in common.
+    """Lattice and dtype of all fields of a study.
 
     Attributes:
-        lattice: of all fields.
-        dtype: of all fields.
-        closest: for each order the smallest distance to the reference that a pilot showed; empty
-            where the lattice was given.
-        reasons: one line each, for people.
-        basis: identifies what the choice was made from; empty where the lattice was given.
+        lattice: Lattice of all fields.
+        dtype: Dtype of all fields.
+        closest: Smallest distance to the reference among the pilots, for each order; empty if the lattice was given.
+        reasons: Reasons of the choice, one line each.
+        basis: Digest of the data that the choice was made from; empty if the lattice was given.
     """
 
     lattice: Lattice
@@ -56,7 +58,7 @@ class LatticeChoice:
     basis: str = ""
 
     def to_table(self) -> dict[str, Any]:
-        """The choice as JSON takes it."""
+        """Return the choice as a table."""
         return {
             "xi_max": self.lattice.xi_max,
             "M": self.lattice.M,
@@ -68,24 +70,23 @@ class LatticeChoice:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """The choice that a table holds."""
+        """Return the choice that a table holds."""
         lattice = Lattice(table["xi_max"], table["M"])
         return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"])
 
-    def grown(self, found: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
-        """A larger or finer lattice where distances (orders, meshes) fall short of an accuracy.
+    def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
+        """Return a larger or finer lattice for distances (orders, meshes) that fall short of an accuracy.
 
-        None where they do not, where the lattice is not what limits them, or where no larger one fits
-        into the memory.
+        Return None if none of them does, if the lattice does not limit them, or if no larger one fits into the memory.
         """
         highest, period = self.lattice.xi_max, 1 / self.lattice.spacing
-        short = ~accuracy.met(found) & (found.values > 0)
+        short = ~accuracy.met(distances) & (distances.values > 0)
         for k, order in enumerate(orders):
             if not short[k].any():
                 continue
-            values = found.values[k][short[k]]
-            tail = float(np.max(found.truncation[k][short[k]] / values)) / accuracy.truncation_part(order)
-            images = float(np.max(found.aliasing[k][short[k]] / values)) / accuracy.aliasing_part
+            values = distances.values[k][short[k]]
+            tail = float(np.max(distances.truncation[k][short[k]] / values)) / accuracy.truncation_part(order)
+            images = float(np.max(distances.aliasing[k][short[k]] / values)) / accuracy.aliasing_part
             if tail > 1 and order < -1.5:
                 # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
                 growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)
@@ -101,38 +102,39 @@ class LatticeChoice:
         return LatticeChoice(lattice, self.dtype, self.closest, (*self.reasons, reason), self.basis)
 
 
-def basis_of(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
-    """Identifies what the choice for a study rests on. Its families do not count: they may gain meshes."""
+def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
+    """Return a digest of the data that the choice for a study is made from, except families, which may gain meshes."""
     if study.accuracy is None:
         return ""
-    parts = {
-        "accuracy": [study.accuracy.rtol, study.accuracy.allowed_bytes],
+    data = {
+        # A float in stores written before, too.
+        "accuracy": [study.accuracy.rtol, float(study.accuracy.allowed_bytes)],
         "orders": study.orders,
         "dtype": study.dtype,
         "similarity": [similarity.scale, *similarity.origin],
         "reference": dict(reference),
     }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def choose(
-    study: Study, similarity: Similarity, reference: Surface, members: Mapping[str, tuple[str, Member]], basis: str
+def choose_lattice(
+    study: Study, similarity: Similarity, reference: Surface, members: Members, basis: str
 ) -> LatticeChoice:
-    """The lattice and precision for the accuracy that a study asks for.
+    """Choose lattice and dtype for the accuracy that a study asks for.
 
-    The coarsest and the finest member of each family are compared with the reference on a small
-    lattice; the choice is what the most demanding of these pairs needs.
+    The coarsest and the finest member of each family are compared with the reference on a small lattice. The most
+    demanding of these pairs determines the choice.
 
     Args:
-        study: with an accuracy.
-        similarity: of the study.
-        reference: in the study's unit.
-        members: label -> (family, member), without the reference.
-        basis: see `basis_of`.
+        study: Study with an accuracy.
+        similarity: Similarity transform of the study.
+        reference: Reference in the study's unit.
+        members: Other surfaces of the study.
+        basis: Digest from `choice_basis`.
 
     Raises:
-        AccuracyError: a pilot shows that the accuracy cannot be met within the memory.
-        StudyError: no pilot could be made.
+        AccuracyError: A pilot shows that the accuracy cannot be met within the memory.
+        StudyError: No pilot could be made.
     """
     accuracy = study.accuracy
     if accuracy is None:
@@ -152,7 +154,7 @@ def choose(
     highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)
     finest = max(pilots, key=lambda label: 1 / pilots[label].lattice.spacing)
     xi_max, period = pilots[highest].lattice.xi_max, 1 / pilots[finest].lattice.spacing
-    # Each pair alone fits into the memory, or it would have been refused.
+    # A pair that does not fit into the memory by itself was refused above.
     lattice = lattice_of(xi_max, period, accuracy.largest_intervals)
     single = study.dtype is None and all(pilot.single for pilot in pilots.values())
     dtype: ComplexDtype = "complex64" if single else study.dtype or "complex128"
@@ -165,7 +167,7 @@ def choose(
     return LatticeChoice(lattice, dtype, tuple(closest.tolist()), reasons, basis)
 
 
-def _pilots(members: Mapping[str, tuple[str, Member]], similarity: Similarity) -> dict[str, Surface]:
+def _pilots(members: Members, similarity: Similarity) -> dict[str, Surface]:
     families: dict[str, list[str]] = {}
     for label, (family, _) in members.items():
         families.setdefault(family, []).append(label)

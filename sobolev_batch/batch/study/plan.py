@@ -1,15 +1,15 @@
-"""A plan: a study's surfaces as rows of the store, with what each costs and what identifies it."""
+"""A plan: the surfaces of a study as rows of the store, with a digest of all that each field depends on."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-from sobolev_batch.batch.study.lattice_choice import LatticeChoice, basis_of, choose
+import numpy as np
+
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
@@ -27,21 +27,17 @@ from sobolev_batch.surfaces.sources.registry import Member, single_member
 
 _log = logging.getLogger(__name__)
 
-# A chunk of the store holds one field, or one block of it above this size.
-_LARGEST_CHUNK_BYTES = 256 << 20
-
 
 @dataclass(frozen=True)
 class Row:
     """One surface of a study.
 
     Attributes:
-        label: family/name, or "reference"; unique in the study.
-        family: name of the family, or "reference".
-        member: the surface to be made.
-        fingerprint: of the member, see `Member.fingerprint_digest`; empty where that cannot be told because a
-            file of it cannot be read.
-        key: SHA-256 of all that its field depends on; empty likewise.
+        label: Family/name, or "reference"; unique in the study.
+        family: Name of the family, or "reference".
+        member: Surface to be made.
+        fingerprint: Digest of the member, see `Member.fingerprint_digest`; empty if one of its files cannot be read.
+        key: SHA-256 of all that its field depends on; empty if the fingerprint is.
     """
 
     label: str
@@ -53,16 +49,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run of a study would do.
+    """Plan of a run.
 
     Attributes:
-        study: the study.
-        similarity: its one similarity transform.
-        rows: every surface, the reference among them, in the order of the study.
-        reference: the label of the reference's row.
-        blocks: the blocks of the lattice, one chunk of the store each.
-        choice: the lattice and precision of all fields.
-        sample: of the reference, where an accuracy is asked for.
+        study: Study to carry out.
+        similarity: Similarity transform of all surfaces.
+        rows: All surfaces, the reference among them, in the order of the study.
+        reference: Label of the reference's row.
+        blocks: Blocks of the lattice, one chunk of the store each.
+        choice: Lattice and dtype of all fields.
+        sample: Sample of the reference, if an accuracy is asked for.
     """
 
     study: Study
@@ -75,66 +71,66 @@ class Plan:
 
     @property
     def lattice(self) -> Lattice:
-        """The lattice of all fields."""
+        """Lattice of all fields."""
         return self.choice.lattice
 
     @property
     def transform(self) -> TransformSettings:
-        """How fields are computed; where an accuracy is asked for, eps and tolerance follow for each."""
+        """Settings of the transforms. If an accuracy is asked for, eps and tolerance are chosen for each field."""
         given = self.study.transform
         return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
 
-    def aim(self, row: Row) -> DistanceTarget | None:
-        """What the field of a row is computed for, where an accuracy is asked for."""
-        if self.study.accuracy is None:
-            return None
-        sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
-        return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
-
-    def on(self, choice: LatticeChoice) -> Plan:
-        """The same study with its fields on another lattice."""
-        rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
-        return replace(self, rows=rows, choice=choice, blocks=_blocks(choice))
-
-    @cached_property
+    @property
     def item_bytes(self) -> int:
         """Bytes of one sample of a field."""
-        return 16 if self.choice.dtype == "complex128" else 8
+        return np.dtype(self.choice.dtype).itemsize
 
     @property
     def field_bytes(self) -> int:
         """Bytes of one stored field."""
         return self.lattice.half.size * self.item_bytes
 
+    def aim(self, row: Row) -> DistanceTarget | None:
+        """Return the aim of the field of a row, if an accuracy is asked for."""
+        if self.study.accuracy is None:
+            return None
+        sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
+        return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
 
-def make_plan(study: Study, known: LatticeChoice | None = None) -> Plan:
-    """Resolve a study: list its surfaces, choose its similarity and lattice, identify every field.
+    def with_choice(self, choice: LatticeChoice) -> Plan:
+        """Return the plan of the same study on another lattice."""
+        rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
+        return replace(self, rows=rows, choice=choice, blocks=_blocks(self.study, choice))
 
-    The reference is loaded, since the similarity depends on it, and a few pilots where an accuracy is
-    asked for; no other surface is.
+
+def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
+    """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
+
+    The reference is loaded, since the similarity depends on it, and a few pilots if an accuracy is asked for. No
+    other surface is loaded.
 
     Args:
-        study: what to compute.
-        known: an earlier choice for it, which is kept as long as it was made from the same.
+        study: Study to carry out.
+        earlier_choice: Choice of an earlier plan. It is kept if it was made from the same data.
 
     Raises:
-        StudyError: labels that collide, or sources that make no surface.
-        MeshError: the reference cannot be read.
-        LatticeError: the reference does not fit into the lattice's period.
-        AccuracyError: the accuracy is out of reach within the memory.
+        StudyError: Labels are not unique, or sources make no surface.
+        MeshError: The reference cannot be read.
+        LatticeError: The reference does not fit into the lattice's period.
+        AccuracyError: The accuracy cannot be reached within the memory.
     """
     members = members_of(study)
     reference = _reference_label(study, members)
-    surface = _load_reference(members[reference][1])
-    similarity = Similarity.to_unit_ball(surface) if study.scaling.mode == "reference" else study.scaling.fixed
-    scaled = similarity.apply(surface)
-    choice = _choice(study, similarity, members, reference, scaled, known)
-    if not isinstance(scaled, Sphere):
-        require_inside(scaled, choice.lattice)
-    if study.proximity is not None and not isinstance(scaled, Mesh):
+    own = _load_reference(members[reference][1])
+    similarity = Similarity.to_unit_ball(own) if study.scaling.mode == "reference" else study.scaling.fixed
+    surface = similarity.apply(own)
+    choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
+    if not isinstance(surface, Sphere):
+        require_inside(surface, choice.lattice)
+    if study.proximity is not None and not isinstance(surface, Mesh):
         raise StudyError(
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
-            f"but a {type(scaled).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
+            f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
         )
     rows = []
     for label, (family, member) in members.items():
@@ -142,46 +138,44 @@ def make_plan(study: Study, known: LatticeChoice | None = None) -> Plan:
         rows.append(Row(label, family, member, fingerprint, _key(study, similarity, choice, fingerprint)))
     sample = None
     if study.accuracy is not None:
-        draws = draws_for([scaled], choice.lattice, study.orders, USUAL_DEGREE)
-        sample = Sample.of(scaled, draws)
-    return Plan(study, similarity, tuple(rows), reference, _blocks(choice), choice, sample)
+        sample = Sample.of(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
+    return Plan(study, similarity, tuple(rows), reference, _blocks(study, choice), choice, sample)
 
 
-def _choice(
+def _lattice_choice(
     study: Study,
     similarity: Similarity,
-    members: Mapping[str, tuple[str, Member]],
+    members: Members,
     reference: str,
     surface: Surface,
-    known: LatticeChoice | None,
+    earlier: LatticeChoice | None,
 ) -> LatticeChoice:
     if study.lattice is not None:
         return LatticeChoice(study.lattice, study.transform.dtype)
-    basis = basis_of(study, similarity, members[reference][1].fingerprint())
-    if known is not None and known.basis == basis:
-        return known
+    basis = choice_basis(study, similarity, members[reference][1].fingerprint())
+    if earlier is not None and earlier.basis == basis:
+        return earlier
     others = {label: member for label, member in members.items() if label != reference}
-    return choose(study, similarity, surface, others, basis)
+    return choose_lattice(study, similarity, surface, others, basis)
 
 
-def _blocks(choice: LatticeChoice) -> tuple[Block, ...]:
-    item_bytes = 16 if choice.dtype == "complex128" else 8
-    return choice.lattice.split(_LARGEST_CHUNK_BYTES // item_bytes)
+def _blocks(study: Study, choice: LatticeChoice) -> tuple[Block, ...]:
+    return choice.lattice.split(study.largest_chunk_bytes // np.dtype(choice.dtype).itemsize)
 
 
 def members_of(study: Study) -> dict[str, tuple[str, Member]]:
-    """Family and member of each surface of a study, by label; none is made.
+    """Return family and member of each surface of a study, by label. No surface is made.
 
     Raises:
-        StudyError: labels that collide, or sources that make no surface.
+        StudyError: Labels are not unique, or sources make no surface.
     """
     members: dict[str, tuple[str, Member]] = {}
     for family in study.families:
         try:
-            found = family.source.members(study.folder)
+            listed = family.source.members(study.folder)
         except StudyError as error:
             raise StudyError(f"family {family.name!r}: {error}") from error
-        for member in found:
+        for member in listed:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
@@ -194,24 +188,22 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
     return members
 
 
-def _reference_label(study: Study, members: Mapping[str, tuple[str, Member]]) -> str:
+def _reference_label(study: Study, members: Members) -> str:
     if not isinstance(study.reference, FamilyReference):
         return REFERENCE_LABEL
-    family = [member for name, member in members.values() if name == study.reference.family]
-    if study.reference.member is None:
-        finest = max(family, key=lambda member: member.level)
-        if sum(member.level == finest.level for member in family) > 1:
+    family, name = study.reference.family, study.reference.member
+    if name is None:
+        candidates = [member for family_name, member in members.values() if family_name == family]
+        finest = max(candidates, key=lambda member: member.level)
+        if sum(member.level == finest.level for member in candidates) > 1:
             raise StudyError(
-                f"reference: the family {study.reference.family!r} has no finest level; name one of its members: "
-                + ", ".join(member.name for member in family[:5])
+                f"reference: the family {family!r} has no finest level; name one of its members: "
+                + ", ".join(member.name for member in candidates[:5])
             )
-        return f"{study.reference.family}/{finest.name}"
-    label = f"{study.reference.family}/{study.reference.member}"
-    if label not in members:
-        raise StudyError(
-            f"reference: the family {study.reference.family!r} has no member {quoted(study.reference.member)}"
-        )
-    return label
+        name = finest.name
+    if f"{family}/{name}" not in members:
+        raise StudyError(f"reference: the family {family!r} has no member {quoted(name)}")
+    return f"{family}/{name}"
 
 
 def _load_reference(member: Member) -> Surface:
@@ -232,13 +224,13 @@ def _fingerprint(label: str, member: Member) -> str:
 def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprint: str) -> str:
     if not fingerprint:
         return ""
-    parts = {
+    dependencies = {
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
         "transform": [study.transform.eps, choice.dtype, study.transform.quadrature.method],
         "numerics": NUMERICS_VERSION,
-        # What is asked of a field follows from its distance to the reference.
+        # The aim of a field follows from its distance to the reference.
         "accuracy": choice.basis,
     }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()

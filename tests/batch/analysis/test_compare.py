@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -173,11 +174,11 @@ def test_another_reference_makes_all_anew(store: Path, client: Client) -> None:
 
 
 def test_what_is_not_asked_for_any_more_goes(store: Path, client: Client) -> None:
-    fields = Store(store).rows_with_whole_fields()
+    fields = Store(store).rows_with_complete_fields()
     sb.run(sb.Study.from_table(small_table(**TO_A_MESH)), store, client)
     assert not {"witness", "proximity"} & set(sb.open_store(store).children)
     assert not (store / "witness").exists()
-    assert Store(store).rows_with_whole_fields() == fields
+    assert Store(store).rows_with_complete_fields() == fields
     _, made = run_and_count(asking(), store, client)
     assert len(made) == 8
     assert_right(store, asking())
@@ -352,9 +353,8 @@ def test_vertices_that_no_triangle_uses(store_path: Path, tmp_path: Path, client
 def test_blocks_and_parts_of_the_lattice_add_up(
     store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = asking(proximity=None)
     # Fields of 40 kB in chunks of a few.
-    monkeypatch.setattr("sobolev_batch.batch.study.plan._LARGEST_CHUNK_BYTES", 16 << 10)
+    study = replace(asking(proximity=None), largest_chunk_bytes=16 << 10)
     sb.run(study, store_path, client)
     here, plan = Store.open(store_path), make_plan(study)
     assert len(plan.blocks) > 2

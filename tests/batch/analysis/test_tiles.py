@@ -14,7 +14,6 @@ from sobolev_batch import Sphere, Study, fourier_transform, proportion
 from sobolev_batch.batch.analysis import tiles as reduction
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
@@ -37,9 +36,8 @@ def fields() -> NDArray[np.complex128]:
 @pytest.fixture
 def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytest.MonkeyPatch) -> Reducer:
     """Of fields in several chunks, with room for three rows, one that meets them, and one that is read."""
-    monkeypatch.setattr(planning, "_LARGEST_CHUNK_BYTES", 16_000)
     family = {"name": "ico", "source": "icosphere", "levels": list(range(ROWS - 1))}
-    study = Study.from_table(small_table(family=[family]))
+    study = replace(Study.from_table(small_table(family=[family])), largest_chunk_bytes=16_000)
     plan = make_plan(study)
     assert len(plan.blocks) > 2
     store = prepare_store(store_path, plan)

@@ -105,7 +105,7 @@ def test_a_piece_that_is_gone_is_no_failure_of_its_mesh(plan: Plan, store_path: 
     cut = cut_mesh(job, 3)
     assert cut.there == {0, 1, 2}
     job.store.scratch.discard(0)
-    with pytest.raises(StoreError, match="piece 1 of the mesh of row 0 cannot be read"):
+    with pytest.raises(StoreError, match="batch 1 of the triangles of row 0 cannot be read"):
         transform_piece(job, cut, 1, plan.blocks[0])
 
 

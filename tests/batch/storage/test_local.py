@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch.storage.local import place_of
+from sobolev_batch.batch.storage.local import path_in
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
@@ -71,8 +71,8 @@ def test_nothing_is_written_or_removed_elsewhere(copy: Path, tmp_path: Path) -> 
 def test_keys_that_climb(tmp_path: Path) -> None:
     for key in ("../other", "/etc/passwd", "a/../../b"):
         with pytest.raises(StoreError, match="leads out of the store"):
-            place_of(tmp_path / "store.zarr", key)
-    assert place_of(tmp_path, "a/b") == tmp_path / "a" / "b"
+            path_in(tmp_path / "store.zarr", key)
+    assert path_in(tmp_path, "a/b") == tmp_path / "a" / "b"
 
 
 def test_a_pipe_is_not_waited_for(copy: Path) -> None:

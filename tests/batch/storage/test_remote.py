@@ -18,7 +18,7 @@ from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.storage import remote as patience
+from sobolev_batch.batch.storage import retry
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
@@ -63,7 +63,7 @@ def location(request: pytest.FixtureRequest) -> Location:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_fails_once_is_done_again(storage: FailingStorage, location: Location, kind: Kind) -> None:
-    keys = location.keys()
+    keys = location.zarr_store()
     location.write({"a/b": b"old", "a/c": b"2", "d": DOCUMENT})
     before = storage.failures()[kind]
 
@@ -91,7 +91,7 @@ def test_what_fails_once_is_done_again(storage: FailingStorage, location: Locati
 
 def got(location: Location, key: str, largest_bytes: int = 0) -> bytes | None:
     """A key as zarr reads it."""
-    found = sync(location.keys(largest_bytes).get(key, default_buffer_prototype()))
+    found = sync(location.zarr_store(largest_bytes).get(key, default_buffer_prototype()))
     return None if found is None else found.to_bytes()
 
 
@@ -133,7 +133,7 @@ def test_a_store_that_fails_for_good_is_given_up(
     storage: FailingStorage, location: Location, kind: Kind, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The driver's own attempts take some eight seconds.
-    monkeypatch.setattr(patience, "_SECONDS", 5.0)
+    monkeypatch.setattr(retry, "LONGEST_SECONDS", 5.0)
     location.write({"a": b"1"})
     storage.rule = Rule(1.0, (kind,))
     started = time.monotonic()

@@ -21,16 +21,17 @@ import xarray as xr
 from distributed import Client
 from zarr.storage import FsspecStore
 
-from sobolev_batch import ClaimError, Lattice, StoreError, Study, open_store, run, verify
+from sobolev_batch import Lattice, StoreError, Study, open_store, run, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import CLAIM, Claim, take
+from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.errors import LockError
 from tests.support.commands import STUDY, call
 from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.support.stores import READER, assert_same
@@ -166,7 +167,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     Tables(store).write("norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
     store.consolidate()
     assert len(server.keys(prefix)) == len(empty) + 5
-    finer = plan.on(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
+    finer = plan.with_choice(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
     again = prepare_store(url, finer)
     assert server.keys(prefix) == empty
     assert again.records() == (None,) * 5
@@ -244,7 +245,7 @@ def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
     assert sum("partNumber=" in path for _, path in server.requests()) > 1
     assert np.array_equal(store.read_fields([0], place)[0], values)
     # Small keys are read without a look at their size, large ones in parts at once.
-    readers = [store.location.keys(size) for size in (1 << 20, 100 << 20)]
+    readers = [store.location.zarr_store(size) for size in (1 << 20, 100 << 20)]
     assert [reader.fs.max_concurrency > 1 for reader in readers if isinstance(reader, FsspecStore)] == [False, True]
 
 
@@ -434,15 +435,15 @@ def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> 
     def attempt(number: int) -> bool:
         together.wait()
         try:
-            take(location, Claim.of_this_process())
-        except ClaimError:
+            acquire(location, Lock.of_this_process())
+        except LockError:
             return False
         return True
 
     with ThreadPoolExecutor(6) as pool:
         for _ in range(5):
             assert sum(pool.map(attempt, range(6))) == 1
-            location.discard(CLAIM)
+            location.discard(LOCK_KEY)
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "gone"])

@@ -116,7 +116,7 @@ def test_what_falls_short_in_the_end_is_marked(
 
 
 def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client, store_path: Path) -> None:
-    table = small_table(accuracy={"rtol": 1e-7, "memory_gb": 0.7}, norm={"orders": [-2.0]})
+    table = small_table(accuracy={"rtol": 1e-7, "memory": "700MB"}, norm={"orders": [-2.0]})
     del table["lattice"]
     with pytest.raises(AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2: .* can be reached"):
         run(Study.from_table(table), store_path, client)
@@ -156,7 +156,9 @@ def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Pat
         ({"lattice": {"xi_max": 1.0, "M": 8}}, "either a .lattice. or an .accuracy. is needed"),
         ({"accuracy": {"rtol": 2.0}}, "rtol must lie between 0 and 1, found 2.0"),
         ({"accuracy": {"rtol": "small"}}, "accuracy.rtol: .*number"),
-        ({"accuracy": {"rtol": 1e-3, "memory_gb": 0}}, "memory must be a positive number"),
+        ({"accuracy": {"rtol": 1e-3, "memory": 0}}, "accuracy.memory: memory must be a positive number of bytes"),
+        ({"accuracy": {"rtol": 1e-3, "memory": "much"}}, "accuracy.memory: memory must be .*, found 'much'"),
+        ({"accuracy": {"rtol": 1e-3, "memory": 1, "memory_gb": 1}}, "memory_gb is the old name of memory"),
         ({"accuracy": {"rtol": 1e-3, "atol": 1}}, "unknown key accuracy.atol"),
         ({"transform": {"eps": 1e-9}}, "an .accuracy. chooses eps and quadrature"),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from sobolev_batch import (
     run,
 )
 from sobolev_batch.batch.cluster.clients import thread_client
-from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.surfaces.sources.registry import Member, SurfaceMember
@@ -120,13 +119,11 @@ def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     assert found["distance"].values[0] / found["distance"].values[1] == pytest.approx(4.0, rel=0.05)
 
 
-def test_blocks_of_a_smooth_surface_make_the_same_store(
-    threads: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_path: Path) -> None:
     family = [{"name": "grid", "source": "torus-grid", **RING, "levels": [1]}]
     study = Study.from_table(torus_table(family=family))
     run(study, tmp_path / "whole.zarr", threads)
-    monkeypatch.setattr(plan_module, "_LARGEST_CHUNK_BYTES", 20_000)
+    study = replace(study, largest_chunk_bytes=20_000)
     assert len(make_plan(study).blocks) > 3
     run(study, tmp_path / "blocks.zarr", threads)
     whole, blocks = (open_store(tmp_path / f"{name}.zarr") for name in ("whole", "blocks"))

@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel
 
 from sobolev_batch import Lattice, Study, StudyError
-from sobolev_batch.batch.study.study import _Document, _FamilyName, _FamilyReferenceSection
+from sobolev_batch.batch.study.schema import FamilyName, FamilyReferenceSection, StudyDocument
 from sobolev_batch.surfaces.sources.registry import Source
 from tests.support.repository import blocks
 from tests.support.studies import changed, small_table
@@ -78,7 +78,7 @@ def keys_of(model: type[BaseModel]) -> set[str]:
 
 def test_the_reference_of_study_files_names_every_key_and_source() -> None:
     text = (WORKFLOWS.parent / "docs" / "studies.md").read_text(encoding="utf-8")
-    keys = keys_of(_Document) | keys_of(_FamilyReferenceSection) | keys_of(_FamilyName)
+    keys = keys_of(StudyDocument) | keys_of(FamilyReferenceSection) | keys_of(FamilyName)
     assert {"rtol", "backend", "origin", "member"} < keys
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
@@ -185,3 +185,23 @@ def test_files_that_are_not_toml(tmp_path: Path, content: bytes) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"no\.toml: cannot be read: No such file"):
         Study.from_toml(tmp_path / "no.toml")
+
+
+def asking(**accuracy: Any) -> Study:
+    table = small_table(accuracy=accuracy)
+    del table["lattice"]
+    return Study.from_table(table)
+
+
+@pytest.mark.parametrize("memory", ["4GB", 4_000_000_000, 4e9])
+def test_memory_is_a_size(memory: str | float) -> None:
+    study = asking(rtol=0.1, memory=memory)
+    assert study.accuracy is not None
+    assert study.accuracy.allowed_bytes == 4e9
+
+
+def test_the_old_name_of_memory_goes_on_working() -> None:
+    with pytest.warns(DeprecationWarning, match=r'is now called memory, as in memory = "4GB"') as caught:
+        old = asking(rtol=0.1, memory_gb=4)
+    assert caught[0].filename == __file__
+    assert old.accuracy == asking(rtol=0.1, memory="4GB").accuracy

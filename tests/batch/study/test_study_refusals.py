@@ -422,7 +422,7 @@ _KEYS = [
 _KEYS += [
     "M",
     "rtol",
-    "memory_gb",
+    "memory",
     "orders",
     "pairs",
     "eps",
