@@ -14,7 +14,7 @@ from distributed import Client, Future
 
 from sobolev_batch import ClusterError, Study, run
 from sobolev_batch.batch.cluster.versions import require_same_versions
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.store.store import Store
 from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.studies import small_table
@@ -91,7 +91,7 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
     cluster: str, other: Path, lacking: Path, tmp_path: Path
 ) -> None:
     with Client(cluster) as client:
-        enlist(client)
+        prepare_workers(client)
         right = client.submit(lambda: os.environ.get("PYTHONPATH"), pure=False).result()
         tasks: list[Future] = client.map(wait_for, [str(tmp_path / "go")] * 40, pure=False)
         wrong = [
@@ -112,18 +112,18 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
         assert client.run_on_scheduler(
             lambda dask_scheduler: {t.suspicious for t in dask_scheduler.tasks.values()}
         ) == {0}
-        assert len(enlist(client).members) == 1
+        assert len(prepare_workers(client).members) == 1
 
 
 CLIENT = """
 import sys
 from distributed import Client
 from sobolev_batch import ClusterError
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 
 with Client(sys.argv[1]) as client:
     try:
-        enlist(client)
+        prepare_workers(client)
     except ClusterError as error:
         print(error)
 """
@@ -132,7 +132,7 @@ with Client(sys.argv[1]) as client:
 def test_a_client_that_differs_is_refused_and_leaves_the_cluster_as_it_is(cluster: str, other: Path) -> None:
     paths = os.pathsep.join([str(other), str(Path(__file__).parents[3])])
     with Client(cluster) as client:
-        enlist(client)
+        prepare_workers(client)
         before = plugins(client)
         done = subprocess.run(
             [sys.executable, "-c", CLIENT, cluster],
