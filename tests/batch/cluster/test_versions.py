@@ -16,7 +16,7 @@ from sobolev_batch import ClusterError, Study, run
 from sobolev_batch.batch.cluster.versions import require_same_versions
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.store.store import Store
-from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.studies import small_table
 
 _POLL_SECONDS = 0.02
@@ -63,7 +63,7 @@ def test_workers_that_differ_are_named_before_anything_is_computed(
     wrong = [dask("worker", cluster, *WORKER, "--name", folder.name, found_first=folder) for folder in (other, lacking)]
     try:
         with Client(cluster) as client:
-            client.wait_for_workers(3, timeout=60)
+            client.wait_for_workers(3, timeout=PATIENCE_SECONDS)
             addresses = {
                 worker["id"]: address for address, worker in client.scheduler_info(n_workers=-1)["workers"].items()
             }
@@ -99,7 +99,7 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
             dask("worker", cluster, *WORKER, "--nanny", found_first=lacking),
         ]
         try:
-            said = [process.communicate(timeout=60)[1] for process in wrong]
+            said = [process.communicate(timeout=PATIENCE_SECONDS)[1] for process in wrong]
         finally:
             (tmp_path / "go").touch()
             for process in wrong:
@@ -140,7 +140,7 @@ def test_a_client_that_differs_is_refused_and_leaves_the_cluster_as_it_is(cluste
             cwd=other,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE_SECONDS,
             check=True,
         )
         assert "9.9 here" in done.stdout

@@ -13,7 +13,7 @@ from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers, waiting_reason
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY
-from tests.support.processes import tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
 
 
@@ -63,7 +63,7 @@ def test_workers_that_join_later_are_equipped_too() -> None:
     with local_client(1) as client:
         prepare_workers(client)
         client.cluster.scale(2)
-        client.wait_for_workers(2, timeout=60)
+        client.wait_for_workers(2, timeout=PATIENCE_SECONDS)
         assert len(prepare_workers(client).members) == 2
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         assert all(worker["resources"][MEMORY] > 0 for worker in workers)
@@ -104,7 +104,7 @@ def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tm
     with local_client(1, "1GB") as client:
         prepare_workers(client)
         task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
-        assert task.result(timeout=120) == "alive"
+        assert task.result(timeout=PATIENCE_SECONDS) == "alive"
 
 
 def test_workers_are_described_as_they_are_after_their_setup() -> None:
