@@ -30,4 +30,4 @@ def wait_and_load(job: Job) -> Surface:
     return surface
 
 
-Job.load = wait_and_load  # type: ignore[method-assign]
+Job.load = wait_and_load  # type: ignore[method-assign, assignment]
