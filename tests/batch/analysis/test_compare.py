@@ -477,7 +477,7 @@ def test_nothing_is_left_of_a_mesh_whose_comparison_fails_later(
         forbid_the_first(patched)
         summary = sb.run(of_files(files), place, client)
     assert [*summary.not_compared] == ["f/a"]
-    assert summary.not_compared["f/a"].startswith("no witness: it takes about 1000.0TB")
+    assert summary.not_compared["f/a"].startswith("no witness: it takes about 1.0PB")
     assert "; no proximity: it takes" in summary.not_compared["f/a"]
     tree = sb.open_store(place)
     assert np.isnan(variable(tree, "witness", "witness").sel(mesh="f/a")).all()
