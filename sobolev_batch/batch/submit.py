@@ -1,4 +1,4 @@
-"""Handing a study over to a cluster, which then needs nobody to wait for it."""
+"""A study handed over to a cluster, which goes on with it alone."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
-from sobolev_batch.batch.cluster.store_access import require_reach
-from sobolev_batch.batch.cluster.worker_plugin import enlist
-from sobolev_batch.batch.run import carry_out, rows_of, rows_without_field
+from sobolev_batch.batch.cluster.store_access import require_store_access
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
+from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.create import prepare_store, require_usable
+from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import ClusterError, StoreError
 
 _log = logging.getLogger(__name__)
 
-_ACCEPT_SECONDS = 30.0
 _POLL_SECONDS = 0.05
 
 
@@ -36,9 +36,14 @@ class Submission:
     """A study that a cluster has taken over.
 
     Attributes:
-        store: where to follow it and where its results come.
-        surfaces: of the study.
-        missing: those whose fields are to be computed.
+        store: Path or URL of the store.
+        surfaces: Number of surfaces of the study.
+        missing: Number of surfaces whose fields are to be computed.
+
+    >>> import sobolev_batch as sb
+    >>> submission = sb.Submission("s3://bucket/results.zarr", surfaces=6, missing=4)
+    >>> f"{submission.missing} of {submission.surfaces} to compute"
+    '4 of 6 to compute'
     """
 
     store: str
@@ -46,61 +51,80 @@ class Submission:
     missing: int
 
 
-def submit(study: Study, store: str | Path | Location, client: Client) -> Submission:
+def submit(study: Study, store: str | Path | Location, client: Client, *, timeout_seconds: float = 60.0) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
-    another one takes over from what is stored. ``sobolev-batch status`` tells how far it is.
+    another one takes over from what is stored. ``sobolev-batch status`` shows the progress.
 
     Args:
-        study: what to compute.
-        store: path or URL of a new or existing store, that this process and all workers reach alike.
-        client: of the cluster; it may be closed afterwards.
+        study: Study to carry out.
+        store: Path or URL of a new or existing store, which this process and all workers reach under this name.
+        client: Client of the cluster; it may be closed afterwards.
+        timeout_seconds: Time within which the scheduler has to take the study.
 
     Raises:
-        StudyError, MeshError, LatticeError, AccuracyError, StoreError: see `run`; nothing was handed over.
-        ClusterError: no worker has the GPU that the study asks for, or the scheduler did not take it.
+        StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
+        ClusterError: No worker has the GPU that the study asks for, or the scheduler did not take the study in time.
+
+    >>> import tempfile
+    >>> from distributed import Client, wait
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "balls"},
+    ...     "lattice": {"xi_max": 3.0, "M": 16},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "ball", "source": "sphere", "radius": 0.5}],
+    ... })
+    >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     with Client("tls://scheduler:8786") as client:
+    ...         sb.submit(study, f"{folder}/results.zarr", client).missing
+    2
     """
     location = Location.of(store).absolute()
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
     try:
-        return _hand_over(study, location, lock, client)
+        require_store_access(client, location, lock)
+        plan = make_plan(study, stored_choice(location))
+        prepare_workers(client, study.libraries).with_backend(study.backend)
+        workspace = Workspace.prepared(location, plan)
+        heartbeat = Heartbeat(workspace.store, lock)
+        heartbeat.cluster = client.scheduler.address
+        heartbeat.write("submitted")
+        _hand_over(study, workspace.store, lock, client, timeout_seconds)
     except BaseException:
         release(location, lock)
         raise
+    return Submission(workspace.store.path, len(plan.rows), len(workspace.missing))
 
 
-def _hand_over(study: Study, location: Location, lock: Lock, client: Client) -> Submission:
-    require_reach(client, location, lock)
-    plan = make_plan(study, stored_choice(location))
-    enlist(client, study.libraries).with_backend(study.backend)
-    place = prepare_store(location, plan)
-    missing = rows_without_field(place.records(), rows_of(place, plan))
-    journal = Heartbeat(place, lock)
-    journal.cluster = client.scheduler.address
-    journal.write("submitted")
-    key = f"sobolev-batch-drive-{uuid4().hex}"
-    # Before all tasks of other studies, which it takes no thread from: it leaves its own at once.
-    future = client.submit(
-        drive, dict(study.table), str(study.folder.absolute()), place.path, lock.run, key=key, pure=False, priority=1
-    )
+def _hand_over(study: Study, store: Store, lock: Lock, client: Client, timeout_seconds: float) -> None:
+    folder, key = str(study.folder.absolute()), f"sobolev-batch-drive-{uuid4().hex}"
+    # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
+    future = client.submit(drive, dict(study.table), folder, store.path, lock.run, key=key, pure=False, priority=1)
     fire_and_forget(future)
-    _await_acceptance(client, future)
-    return Submission(place.path, len(plan.rows), len(missing))
+    _await_acceptance(client, future, timeout_seconds)
 
 
 def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
-    """Run a study from a worker of the cluster that computes it, with the claim of its submission.
+    """Run a study from a worker of the cluster that computes it, with the lock of its submission.
 
-    It does not fail: what goes wrong is in the store, and running into it again would not help.
+    This does not raise: the store says what went wrong, and trying again would not help.
+
+    Args:
+        table: Study as a table.
+        folder: Folder that paths in the study are relative to.
+        store: Path or URL of the store.
+        run: Run that the store is locked for.
     """
     location = Location.of(store)
     lock = Lock.of_this_process(run, outlives_process=True)
     try:
-        there = Lock.read(location)
-        if there is None or there.run != run:
+        present = Lock.read(location)
+        if present is None or present.run != run:
             _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
             return
         acquire(location, lock)
@@ -109,21 +133,21 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
             carry_out(study, location, lock, nullcontext(client), lambda progress: None)
     except Exception as error:
         if get_worker().status != Status.running:
-            # Dask has another worker drive, which takes the claim over.
+            # Dask has another worker drive, which takes the lock over.
             _log.warning("%s: this worker leaves before the end of the study it drove", store)
             return
         _log.error("%s: the study could not be carried out: %s", store, error)
-        # Most of what goes wrong is known by now to the run's own journal, but not that a file of the
-        # study is missing on this machine.
+        # The run's own heartbeat has written most errors by now, but not that a file of the study is missing
+        # on this machine.
         with suppress(StoreError):  # it may be what failed
             if lock.is_held(location):
                 Heartbeat(Store(store), lock).write("failed", f"{error} (on the worker that drove the study)")
     release(location, lock)
 
 
-def _await_acceptance(client: Client, future: Future) -> None:
+def _await_acceptance(client: Client, future: Future, timeout_seconds: float) -> None:
     """Return when the scheduler itself wants the task: the client may be killed from then on."""
-    deadline = time.monotonic() + _ACCEPT_SECONDS
+    deadline = time.monotonic() + timeout_seconds
     while not future.done():
         # A lambda travels by value, so the scheduler need not have this package.
         if client.run_on_scheduler(
@@ -136,7 +160,7 @@ def _await_acceptance(client: Client, future: Future) -> None:
             return
         if time.monotonic() > deadline:
             raise ClusterError(
-                f"the scheduler at {client.scheduler.address} did not take the study within {_ACCEPT_SECONDS:g} s; "
+                f"the scheduler at {client.scheduler.address} did not take the study within {timeout_seconds:g} s; "
                 "see its log"
             )
         time.sleep(_POLL_SECONDS)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from distributed import Client, wait
-
 from sobolev_batch.batch.cluster.clients import available_cores
-from sobolev_batch.batch.cluster.outcomes import outcomes
+from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
@@ -19,7 +17,9 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.store.witness_array import Witnesses
+from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
+from sobolev_batch.parameters import renamed_parameters
 
 _log = logging.getLogger(__name__)
 
@@ -29,18 +29,21 @@ _THREADS_PER_CORE = 2
 
 @dataclass(frozen=True)
 class Verification:
-    """What was found of a store.
+    """The result of a verification.
 
     Attributes:
-        store: its path or URL.
-        complete: surfaces with a completion record; their fields were read.
-        total: surfaces of the study.
-        fields: what is wrong with the field or the record of each surface that is damaged.
-        comparisons: likewise for the witness function, or the note of it or of Hausdorff and Chamfer distances, of
-            each surface where it is damaged.
-        tables: likewise for arrays of tables and coordinates.
-        withdrawn: whether the records of these fields, the notes of these comparisons, and the tables if anything
-            is damaged, were taken away, so that the next run makes them anew.
+        store: Path or URL of the store.
+        complete: Number of surfaces with a completion record; their fields were read.
+        total: Number of surfaces of the study.
+        fields: Damage of fields and their records, by the label of the surface.
+        comparisons: Damage of witness functions and of records of comparisons, likewise.
+        tables: Damage of tables and coordinates, by the name of the array.
+        withdrawn: True if the damaged records, and the tables if anything is damaged, were withdrawn, so that the
+            next run computes them again.
+
+    >>> import sobolev_batch as sb
+    >>> sb.Verification("results.zarr", 5, 5, {}, {}, {}, withdrawn=False).is_sound
+    True
     """
 
     store: str
@@ -53,52 +56,59 @@ class Verification:
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing is damaged."""
+        """True where nothing is damaged."""
         return not self.fields and not self.comparisons and not self.tables
 
 
-def verify(place: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
+@renamed_parameters(place="store")
+def verify(store: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
     """Read everything that a store holds, and withdraw what is damaged so that a run computes it again.
 
     Args:
-        place: path or URL of the store. If it cannot be written, nothing is withdrawn.
-        on_progress: called with the number of fields that were read, and of all.
+        store: Path or URL of the store. If it cannot be written, nothing is withdrawn.
+        on_progress: Callback with the number of fields that were read, and the number of all.
 
     Raises:
-        StoreError: no store is there, or it cannot be read at all.
-        LockError: a run is going on in it.
+        StoreError: The store does not exist, or cannot be read at all.
+        LockError: A run is going on in it.
+
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "balls"},
+    ...     "lattice": {"xi_max": 3.0, "M": 16},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "ball", "source": "sphere", "radius": 0.5}],
+    ... })
+    >>> _ = sb.run(study, "memory://verify-example.zarr", workers=1)
+    >>> found = sb.verify("memory://verify-example.zarr")
+    >>> found.is_sound, found.complete, found.total
+    (True, 2, 2)
     """
-    store = Store.open(place)
+    opened = Store.open(store)
     lock = Lock.of_this_process()
     try:
-        acquire(store.location, lock)
+        acquire(opened.location, lock)
     except LockError:
         raise
     except StoreError as error:
-        _log.info("%s: read without the right to write (%s)", store.path, error)
-        return _verify(store, on_progress, None)
+        _log.info("%s: read without the right to write (%s)", opened.path, error)
+        return _verify(opened, on_progress, None)
     try:
-        # Anew: the last run may have ended since.
-        return _verify(Store.open(place), on_progress, lock)
+        # Opened again: the last run may have ended since.
+        return _verify(Store.open(store), on_progress, lock)
     finally:
-        release(store.location, lock)
+        release(opened.location, lock)
 
 
-def damaged_rows(client: Client, store: Store, records: Sequence[Record | None]) -> list[int]:
-    """The rows whose fields are not what their records say, found by the workers of a cluster."""
-    rows = _complete(records)
-    futures = [client.submit(_damage_of, store, row, record, pure=False) for row, record in rows.items()]
-    wait(futures)
-    found = outcomes(client, futures)
-    for outcome in found:
-        if isinstance(outcome, BaseException):
-            raise outcome
-    return [row for row, what in zip(rows, found, strict=True) if what]
+def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
+    """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
+    tasks = (Task(_damage_of, (workspace.store, i, record), row=i) for i, record in workspace.complete.items())
+    return sorted(task.row for task, damage in cluster.results(tasks) if damage)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
-    labels, records = store.labels(), store.records()
-    complete = _complete(records)
+    labels, complete = store.labels(), complete_records(store.records())
     damaged = {row: f"its completion record is damaged ({what})" for row, what in store.record_table.damaged().items()}
     whole = store.rows_with_complete_fields() if complete else set()
 
@@ -106,15 +116,14 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         return _damage_of(store, row, complete[row]) if row in whole else "it is not there, or of another length"
 
     with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
-        found = pool.map(damage_of, complete)
-        for done, (row, what) in enumerate(zip(complete, found, strict=True), 1):
-            if what:
-                damaged[row] = what
+        for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
+            if damage:
+                damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
     tables = Tables(store).damaged()
-    notes = {kind: _damaged_notes(store, kind, complete) for kind in KINDS}
-    withdraw = lock is not None and bool(damaged or tables or any(notes.values()))
+    comparisons = {kind: _damaged_comparisons(store, kind, complete) for kind in KINDS}
+    withdraw = lock is not None and bool(damaged or tables or any(comparisons.values()))
     if lock is not None and withdraw:
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
@@ -123,35 +132,37 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         Tables(store).invalidate()
         for row in damaged:
             store.write_record(row, None)
-        for kind, rows in notes.items():
+        for kind, rows in comparisons.items():
             for row in rows:
                 ComparisonRecords(store, kind).write(row, None)
-    fields = {labels[row]: damaged[row] for row in sorted(damaged)}
-    comparisons = {labels[row]: what for rows in notes.values() for row, what in sorted(rows.items())}
-    return Verification(store.path, len(complete), len(labels), fields, comparisons, tables, withdraw)
+    return Verification(
+        store.path,
+        len(complete),
+        len(labels),
+        {labels[row]: damaged[row] for row in sorted(damaged)},
+        {labels[row]: damage for rows in comparisons.values() for row, damage in sorted(rows.items())},
+        tables,
+        withdraw,
+    )
 
 
-def _complete(records: Sequence[Record | None]) -> dict[int, Record]:
-    return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
-
-
-def _damaged_notes(store: Store, kind: Kind, complete: Mapping[int, Record]) -> dict[int, str]:
-    """What is wrong with the comparison of each row, of one kind."""
-    found = ComparisonRecords(store, kind)
-    damaged = {row: f"the note of its {kind} is damaged ({what})" for row, what in found.damaged().items()}
+def _damaged_comparisons(store: Store, kind: Kind, complete: Mapping[int, Record]) -> dict[int, str]:
+    """Return the damage of the comparisons of one kind, by their rows."""
+    records = ComparisonRecords(store, kind)
+    damaged = {row: f"the record of its {kind} is damaged ({what})" for row, what in records.damaged().items()}
     # Those that readers do not find are still to be made.
     if kind == "witness" and Witnesses(store).are_listed():
-        for row, note in enumerate(found.read()):
-            if note is not None and note.status == "complete" and row in complete:
+        for row, record in enumerate(records.read()):
+            if record is not None and record.status == "complete" and row in complete:
                 try:
-                    Witnesses(store).read(row, complete[row].facts.vertices, note.checksum)
+                    Witnesses(store).read(row, complete[row].facts.vertices, record.checksum)
                 except DamageError as error:
                     damaged[row] = f"its witness function is damaged ({error.what})"
     return damaged
 
 
 def _damage_of(store: Store, row: int, record: Record) -> str:
-    """What is wrong with the field of a row; empty if nothing is."""
+    """Return the damage of the field of a row; empty where it is sound."""
     places = store.block_slices()
     if len(record.checksums) != len(places):
         return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"

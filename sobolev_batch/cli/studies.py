@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 
 from sobolev_batch.batch.cluster.clients import available_cores, remote_client
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.fields.sizing import lay_out_rows
+from sobolev_batch.batch.fields.sizing import size_rows
 from sobolev_batch.batch.run import Summary, run
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store, stored_choice
@@ -99,7 +99,7 @@ def plan_command(study: Path, store: Location | None, scheduler: str | None, tru
     plan = make_plan(parsed, stored_choice(place))
     if scheduler:
         with remote_client(scheduler, trust_network) as client:
-            crew = enlist(client, parsed.libraries)
+            crew = prepare_workers(client, parsed.libraries)
     else:
         crew = Workers.of_this_machine(available_cores())
     for name, value in _plan_lines(plan, place, crew):
@@ -156,17 +156,17 @@ def _task_lines(plan: Plan, crew: Workers) -> Iterator[tuple[str, str]]:
     yield (
         "workers",
         f"{len(crew.members)}, with {crew.threads} threads and {gpus} GPUs together; for tasks, "
-        f"{_size(crew.share_bytes)} or more of memory a thread",
+        f"{_size(crew.allowed_bytes_per_task)} or more of memory a thread",
     )
-    layouts, refused = lay_out_rows(plan, plan.rows, crew.with_backend(plan.study.backend))
+    layouts, refused = size_rows(plan, plan.rows, crew.with_backend(plan.study.backend))
     tasks = sum(layout.task_count for layout in layouts.values())
     yield "tasks", f"{tasks} for {len(layouts)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     for label, layout in layouts.items():
-        if layout.parts > 1:
-            yield "cut", f"{label} into {layout.parts} parts"
+        if layout.batches > 1:
+            yield "split", f"{label} into {layout.batches} batches of triangles"
     if layouts:
-        largest = max(layouts, key=lambda label: layouts[label].largest_bytes)
-        yield "memory", f"up to {_size(layouts[largest].largest_bytes)} in a task, of {largest}"
+        largest = max(layouts, key=lambda label: layouts[label].projected_bytes)
+        yield "memory", f"up to {_size(layouts[largest].projected_bytes)} in a task, of {largest}"
     for label, reason in refused.items():
         yield "refused", f"{label}: {reason}"
 

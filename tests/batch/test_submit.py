@@ -13,7 +13,7 @@ from sobolev_batch import ClusterError, Study, StudyError, submit
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
-from tests.support.processes import tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.recipes import write_study
 from tests.support.studies import small_table
 
@@ -39,7 +39,7 @@ def study_path(tmp_path: Path) -> Path:
 
 def cli(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
 
 
 def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: 
             [sys.executable, "-c", CLIENT, address, str(study_path), str(store_path)],
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=PATIENCE_SECONDS,
             check=False,
         )
         assert client.returncode == -9, client.stderr

@@ -22,9 +22,11 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import LockError
 from tests.support.commands import command, write_toml
 
-# Stops in the middle of a study until it is told to go on; beats often.
+# Stops in the middle of a study until it is told to go on; beats often. Told that its store was released, it
+# goes on when its heartbeat has ended.
 DRIVER = """
 import sys
+import threading
 import sobolev_batch as sb
 from sobolev_batch.batch.store import heartbeat as journal
 
@@ -33,7 +35,10 @@ journal.HEARTBEAT_SECONDS = 0.05
 def pause(progress):
     if progress.done == 2:
         print("paused", flush=True)
-        sys.stdin.readline()
+        if sys.stdin.readline() == "released\\n":
+            for thread in threading.enumerate():
+                if thread.name.startswith("sobolev-batch"):
+                    thread.join()
 
 if __name__ == "__main__":
     sb.run(sb.Study.from_toml(sys.argv[1]), sys.argv[2], workers=1, on_progress=pause)
@@ -79,8 +84,7 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
     released = command("release", "--force", store_path)
     assert released.returncode == 0
     assert f"released from process {first.pid} on" in released.stdout
-    # It notices at a beat, and beats while it is paused.
-    _, said = first.communicate("\n" * 9)
+    _, said = first.communicate("released\n")
     assert first.returncode != 0
     assert "LockError" in said
     assert "is no longer its own" in said

@@ -11,6 +11,7 @@ from typing import Any
 from sobolev_batch import Study
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
+from tests.support.commands import PATIENCE_SECONDS
 from tests.support.studies import small_table
 
 KILLS = 60
@@ -19,7 +20,11 @@ KILLS = 60
 def outcome(script: str, store: Path) -> Any:
     """What a script prints that kills children of its own: they start within milliseconds, without imports."""
     done = subprocess.run(
-        [sys.executable, "-c", script, str(store)], capture_output=True, text=True, timeout=200, check=False
+        [sys.executable, "-c", script, str(store)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_SECONDS,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -13,7 +13,7 @@ def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_pat
     arguments = "--store", tmp_path / "large.zarr", "--workers", "1", "--worker-memory", "700MB"
     done = command("run", study, *arguments)
     assert done.returncode == 1
-    assert "it takes about 0.79 GB in one task, and no worker has more than 0.29 GB" in done.stderr.replace("\n", " ")
+    assert "it takes about 786.4MB in one task, and no worker has more than 295.0MB" in done.stderr.replace("\n", " ")
     assert "[1/5]" not in done.stderr
     # Where they are, too large a lattice is a matter of how many blocks.
     planned = command("plan", study, "--store", tmp_path / "large.zarr")

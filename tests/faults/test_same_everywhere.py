@@ -29,20 +29,19 @@ TWICE = """
 import os, sys
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.run import rows_of
+from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.fields.tasks import Job, compute_mesh
+from sobolev_batch.batch.fields.tasks import FieldSettings, Job, compute_mesh
 from tests.support.studies import small_table
 
 plan = make_plan(Study.from_table(small_table()))
 store = Store.open(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()
-for i, row in enumerate(rows_of(store, plan)):
+for i, row in enumerate(Workspace.of(store, plan).rows):
     if row.label == "reference":
         continue
-    settings = plan.similarity, plan.lattice, plan.transform, plan.study.orders
-    job = Job(store, i, row.label, row.key, row.member, *settings)
+    job = Job(store, i, row, FieldSettings.of(plan))
     for _ in range(5):
         store.write_record(i, None)
         assert compute_mesh(job, plan.blocks).status == "complete"

@@ -21,24 +21,28 @@ source = "icosphere"
 levels = [0, 1, 2, 3]
 """
 
+# Limit of every command, for a machine that does much else.
+PATIENCE_SECONDS = 200
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 
 def write_toml(folder: Path) -> Path:
-    """The small study as a file."""
+    """Write the small study to a file."""
     path = folder / "study.toml"
     path.write_text(TOML)
     return path
 
 
 def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """A command, run to its end."""
-    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=200, check=False)
+    """Run a command to its end."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False
+    )
 
 
 @contextmanager
 def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """A command that runs in a session of its own, as in a terminal of its own."""
+    """Run a command in a session of its own, as in a terminal of its own."""
     process = subprocess.Popen(
         [*COMMAND, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -55,23 +59,24 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def read_until(process: subprocess.Popen[str], text: str) -> str:
-    """What a command says on standard error, up to the line that holds a text."""
+    """Return the standard error of a command, up to the line that holds a text."""
     assert process.stderr is not None
-    said = ""
+    output = ""
     for line in process.stderr:
-        said += line
+        output += line
         if text in line:
-            return said
-    raise AssertionError(f"never said {text!r}: {said}")
+            return output
+    raise AssertionError(f"{text!r} did not appear: {output}")
 
 
 def call(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder, with further variables in its environment."""
     return subprocess.run(
         [*COMMAND, *arguments],
         capture_output=True,
         text=True,
         cwd=folder,
-        timeout=120,
+        timeout=PATIENCE_SECONDS,
         check=False,
         env={**os.environ, **environment},
     )

@@ -7,26 +7,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sobolev_batch.batch.fields import tasks
 from sobolev_batch.batch.fields.tasks import Job
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.files import FileMember
 
 # Dask may load this twice.
-_LOAD = vars(tasks).setdefault("_load_surface_without_gate", tasks.load_surface)
+if not hasattr(Job, "load_without_gate"):
+    setattr(Job, "load_without_gate", Job.load)  # noqa: B010
 
 
 def gate_of(path: Path) -> Path:
-    """Where the gate of a mesh file is."""
+    """Return the gate of a mesh file."""
     return path.with_suffix(".gate")
 
 
 def wait_and_load(job: Job) -> Surface:
-    """The surface of a job, once its gate is open."""
-    if isinstance(job.member, FileMember) and gate_of(job.member.path).exists():
-        gate_of(job.member.path).read_bytes()
-    surface: Surface = _LOAD(job)
+    """Load the surface of a job, once its gate is open."""
+    member = job.row.member
+    if isinstance(member, FileMember) and gate_of(member.path).exists():
+        gate_of(member.path).read_bytes()
+    surface: Surface = job.load_without_gate()  # type: ignore[attr-defined]
     return surface
 
 
-vars(tasks)["load_surface"] = wait_and_load
+Job.load = wait_and_load  # type: ignore[method-assign, assignment]

@@ -1,4 +1,4 @@
-"""Schedulers and workers as users start them."""
+"""Schedulers and workers, started as users start them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from pathlib import Path
 from distributed import Client
 
 SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+# Limit of every wait for another process, for a machine that does much else: nothing is to depend on it.
+PATIENCE_SECONDS = 200
 # A worker's own HTTP server listens on every interface unless told otherwise, --no-dashboard or not.
 WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
 
 
 def dask(*arguments: str, found_first: Path | None = None) -> subprocess.Popen[str]:
-    """Start one; it imports what lies in a folder before what is installed."""
+    """Start a process of Dask, which imports modules of a folder before installed ones."""
     environment = {**os.environ}
     if found_first is not None:
         environment["PYTHONPATH"] = os.pathsep.join([str(found_first), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -27,7 +29,7 @@ def dask(*arguments: str, found_first: Path | None = None) -> subprocess.Popen[s
 
 
 def stop(process: subprocess.Popen[str]) -> None:
-    """End a process, by force if it does not go of itself: a worker may wait for a peer that is gone."""
+    """End a process, by force if need be: a worker may wait for a peer that is gone."""
     process.terminate()
     try:
         process.communicate(timeout=20)
@@ -37,14 +39,14 @@ def stop(process: subprocess.Popen[str]) -> None:
 
 
 def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
-    """Where a scheduler that was just started listens."""
+    """Return the address of a scheduler that was just started."""
     assert scheduler.stderr is not None
-    return next(found[0] for line in scheduler.stderr if (found := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
+    return next(match[0] for line in scheduler.stderr if (match := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
 
 
 @contextmanager
 def tcp_cluster(*workers: list[str]) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """The address of a scheduler, and its workers, each with further options."""
+    """Give the address of a scheduler, and its workers, each with further options."""
     scheduler = dask(*SCHEDULER)
     processes: list[subprocess.Popen[str]] = []
     try:
@@ -52,7 +54,7 @@ def tcp_cluster(*workers: list[str]) -> Iterator[tuple[str, list[subprocess.Pope
         processes += [dask("worker", address, *WORKER, *options) for options in workers]
         if workers:
             with Client(address) as client:
-                client.wait_for_workers(len(workers), timeout=60)
+                client.wait_for_workers(len(workers), timeout=PATIENCE_SECONDS)
         yield address, processes
     finally:
         for process in reversed([scheduler, *processes]):

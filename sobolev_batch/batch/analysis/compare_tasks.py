@@ -1,6 +1,6 @@
-"""What runs on a worker once fields are stored: a mesh, made again, is compared with the reference itself.
+"""The tasks of comparisons: they run on a worker, load a mesh again, and compare it with the reference.
 
-Like tasks of fields, each is a pure function of its arguments that writes whole chunks and its note last.
+Like the tasks of fields, each is a pure function of its arguments that writes whole chunks and its record last.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Stored:
-    """A surface whose field is stored.
+class StoredMesh:
+    """A mesh whose field is stored.
 
     Attributes:
-        row: of the store.
-        label: for people.
-        member: what makes it.
-        digest: of the mesh whose field is stored, in the study's unit.
-        checksums: of its field's blocks.
+        row: Row of the store.
+        label: Label of the row.
+        member: Source of the mesh.
+        digest: Digest of the mesh whose field is stored, in the study's unit.
+        checksums: Checksums of the blocks of its field.
     """
 
     row: int
@@ -47,11 +47,11 @@ class Stored:
     digest: str
     checksums: tuple[int, ...]
 
-    def made_again(self, similarity: Similarity) -> Mesh:
-        """The mesh, in the study's unit.
+    def load(self, similarity: Similarity) -> Mesh:
+        """Load the mesh, in the study's unit.
 
         Raises:
-            MeshError: it cannot be made, or is not the one whose field is stored.
+            MeshError: It cannot be loaded, or is not the mesh whose field is stored.
         """
         surface = similarity.apply(self.member.load())
         if not isinstance(surface, Mesh) or surface.digest != self.digest:
@@ -67,100 +67,102 @@ class Comparison:
     """A mesh that is to be compared with the reference.
 
     Attributes:
-        store: where both are, and where the outcome goes.
-        key: of its note.
-        mesh, reference: the two.
-        similarity: of the study.
+        store: Store of both fields and of the outcome.
+        key: Key of the record.
+        mesh, reference: The two meshes.
+        similarity: Similarity of the study.
     """
 
     store: Store
     key: str
-    mesh: Stored
-    reference: Stored
+    mesh: StoredMesh
+    reference: StoredMesh
     similarity: Similarity
 
+    def record(self, kind: Kind, compare: Callable[[], ComparisonRecord]) -> ComparisonRecord:
+        """Compare and write the record; a mesh that cannot be compared does not raise."""
+        started = time.perf_counter()
+        try:
+            record = compare()
+        except StoreError:
+            raise
+        except Exception as error:
+            if not isinstance(error, InputError):
+                _log.error("%s: %s failed for a reason that is not its mesh's", self.mesh.label, kind, exc_info=error)
+            record = ComparisonRecord(self.key, "failed", " ".join(str(error).split()) or type(error).__name__)
+        record = replace(record, seconds=time.perf_counter() - started)
+        ComparisonRecords(self.store, kind).write(self.mesh.row, record)
+        return record
 
-def compare_by_witness(
-    comparison: Comparison,
-    lattice: Lattice,
-    blocks: tuple[Block, ...],
-    orders: tuple[float, ...],
-    memory: float,
-) -> ComparisonRecord:
-    """Store the witness function of a mesh against the reference, at its vertices, then a note.
 
-    It is NaN at vertices that no triangle uses.
+@dataclass(frozen=True)
+class WitnessSettings:
+    """The settings of witness functions.
 
-    Args:
-        comparison: what to compare.
-        lattice: of both fields.
-        blocks: of the fields, as they are stored.
-        orders: s, each.
-        memory: bytes that the NUFFT may take.
+    Attributes:
+        lattice: Lattice of the fields.
+        blocks: Blocks of the fields, as they are stored.
+        orders: Sobolev orders s.
+        allowed_bytes: Memory that the NUFFT may take.
     """
 
-    def outcome() -> ComparisonRecord:
-        mesh = comparison.mesh.made_again(comparison.similarity)
+    lattice: Lattice
+    blocks: tuple[Block, ...]
+    orders: tuple[float, ...]
+    allowed_bytes: float
+
+
+def compare_by_witness(comparison: Comparison, settings: WitnessSettings) -> ComparisonRecord:
+    """Store the witness function of a mesh against the reference, at its vertices, then a record.
+
+    It is NaN at vertices that no triangle uses.
+    """
+    lattice, orders = settings.lattice, settings.orders
+
+    def compare() -> ComparisonRecord:
+        mesh = comparison.mesh.load(comparison.similarity)
         evaluation = Evaluation(
-            # Others may lie anywhere, beyond the lattice's period too.
+            # Other vertices may lie anywhere, beyond the lattice's period too.
             mesh.used_coordinates,
             SobolevWeights(lattice, orders),
             TransformSettings(),
             threads=1,
-            allowed_bytes=memory,
+            allowed_bytes=settings.allowed_bytes,
         )
-        found = np.zeros((len(orders), len(mesh.used_vertices)))
-        for number, block in enumerate(blocks):
+        sums = np.zeros((len(orders), len(mesh.used_vertices)))
+        for number, block in enumerate(settings.blocks):
             difference = _difference(comparison, lattice, block, number)
-            for part in block.split(evaluation.largest):
-                found += evaluation.of_block(part, difference[part.place_in(block)])
+            for inner in block.split(evaluation.largest):
+                sums += evaluation.of_block(inner, difference[inner.place_in(block)])
         values = np.full((len(orders), len(mesh.vertices)), np.nan)
-        values[:, mesh.used_vertices] = found
+        values[:, mesh.used_vertices] = sums
         checksum = Witnesses(comparison.store).write(comparison.mesh.row, values)
         return ComparisonRecord(comparison.key, "complete", checksum=checksum)
 
-    return _noted(comparison, "witness", outcome)
+    return comparison.record("witness", compare)
 
 
 def compare_by_proximity(comparison: Comparison, points: int) -> ComparisonRecord:
-    """Measure Hausdorff and Chamfer distances of a mesh from the reference, and store them as a note.
+    """Measure Hausdorff and Chamfer distances of a mesh from the reference, and store them as a record.
 
     Args:
-        comparison: what to compare.
-        points: drawn on each of the two.
+        comparison: Meshes to compare.
+        points: Number of points that are drawn on each of the two.
     """
 
-    def outcome() -> ComparisonRecord:
-        mesh, reference = (
-            stored.made_again(comparison.similarity) for stored in (comparison.mesh, comparison.reference)
-        )
+    def compare() -> ComparisonRecord:
+        mesh, reference = (stored.load(comparison.similarity) for stored in (comparison.mesh, comparison.reference))
         return ComparisonRecord(comparison.key, "complete", numbers=asdict(proximity(mesh, reference, points=points)))
 
-    return _noted(comparison, "proximity", outcome)
+    return comparison.record("proximity", compare)
 
 
 def _difference(comparison: Comparison, lattice: Lattice, block: Block, number: int) -> NDArray[np.complex128]:
-    """One block of the difference of both fields, complex128."""
+    """Return one block of the difference of both fields, complex128."""
     stored = comparison.mesh, comparison.reference
-    checksums = [each.checksums[number] for each in stored]
-    fields = comparison.store.read_fields([each.row for each in stored], lattice.place(block), checksums)
+    rows, checksums = [mesh.row for mesh in stored], [mesh.checksums[number] for mesh in stored]
+    fields = comparison.store.read_fields(rows, lattice.place(block), checksums)
     # In place: of a large lattice another copy might not fit.
     difference: NDArray[np.complex128] = fields[0].astype(np.complex128, copy=False)
     difference -= fields[1]
     return difference
-
-
-def _noted(comparison: Comparison, kind: Kind, outcome: Callable[[], ComparisonRecord]) -> ComparisonRecord:
-    """Have a comparison made and its note written; a mesh that cannot be compared does not raise."""
-    started = time.perf_counter()
-    try:
-        note = outcome()
-    except StoreError:
-        raise
-    except Exception as error:
-        if not isinstance(error, InputError):
-            _log.error("%s: %s failed for a reason that is not its mesh's", comparison.mesh.label, kind, exc_info=error)
-        note = ComparisonRecord(comparison.key, "failed", " ".join(str(error).split()) or type(error).__name__)
-    note = replace(note, seconds=time.perf_counter() - started)
-    ComparisonRecords(comparison.store, kind).write(comparison.mesh.row, note)
-    return note

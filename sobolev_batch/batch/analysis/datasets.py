@@ -1,9 +1,9 @@
-"""The small arrays of a store, put together from records and reduced distances."""
+"""The tables of a store as datasets, from records and reduced distances."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -28,21 +28,21 @@ _UNITS = {
 
 
 def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.Dataset:
-    """Per mesh: family, level, status, reason, counts, sizes, digests, seconds, worker, backend."""
-    known = [record or Record(key="", status="failed", reason="not computed") for record in records]
+    """Return for each mesh family, level, status, reason, counts, sizes, digests, seconds, worker, backend."""
+    filled = [record or Record(key="", status="failed", reason="not computed") for record in records]
     columns: dict[str, NDArray[np.generic]] = {
         "family": _strings([row.family for row in rows]),
         "name": _strings([row.member.name for row in rows]),
         "level": np.array([row.member.level for row in rows], dtype=np.int64),
         "status": _strings(["missing" if record is None else record.status for record in records]),
-        "reason": _strings([record.reason for record in known]),
+        "reason": _strings([record.reason for record in filled]),
     }
     for item in fields(Facts):
-        values = [getattr(record.facts, item.name) for record in known]
+        values = [getattr(record.facts, item.name) for record in filled]
         columns[item.name] = _strings(values) if isinstance(item.default, str) else np.array(values)
-    columns["seconds"] = np.array([record.seconds for record in known])
+    columns["seconds"] = np.array([record.seconds for record in filled])
     for name in ("worker", "backend", "finished", "key"):
-        columns[name] = _strings([getattr(record, name) for record in known])
+        columns[name] = _strings([getattr(record, name) for record in filled])
     return xr.Dataset(
         {name: ("mesh", values, {"units": _UNITS[name]} if name in _UNITS else {}) for name, values in columns.items()},
         coords={"mesh": _labels(rows)},
@@ -50,43 +50,55 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
 
 
 def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
-    """`norm` (mesh, order) with its error, from values over (orders, meshes)."""
+    """Return `norm` (mesh, order) with its error, from values over (orders, meshes)."""
     return xr.Dataset(_with_errors("norm", ("mesh", "order"), norms), coords=_coordinates(rows, orders))
 
 
 def distances_dataset(
     rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: NormEstimate
 ) -> xr.Dataset:
-    """`distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
+    """Return `distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
     return xr.Dataset(
         _with_errors("distance", ("mesh", "other", "order"), distances),
         coords={**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))},
     )
 
 
+@dataclass(frozen=True, eq=False)
+class DistancesToReference:
+    """The distances of meshes to the reference.
+
+    Attributes:
+        reference: Label of the reference.
+        distances: Distances over (orders, meshes), NaN where missing.
+        proportion: Decomposition of these distances.
+        norms: Norms of the reference over (orders,).
+    """
+
+    reference: str
+    distances: NormEstimate
+    proportion: Proportion
+    norms: NormEstimate
+
+
 def convergence_dataset(
     rows: Sequence[Row],
     orders: Sequence[float],
-    to_reference: NormEstimate,
-    proportion: Proportion,
-    reference_norms: NormEstimate,
+    to_reference: DistancesToReference,
     sizes: Reals,
-    reference: str,
     accuracy: Accuracy | None,
 ) -> xr.Dataset:
-    """Distances to the reference, relative ones, and observed rates within each family, all with errors; their parts.
+    """Return distances to the reference, relative ones and their decomposition, and observed orders of convergence.
 
     Args:
-        rows: the meshes.
-        orders: s, each.
-        to_reference: over (orders, meshes), NaN where missing.
-        proportion: of these distances, likewise.
-        reference_norms: over (orders,).
-        sizes: (meshes,) mean edge lengths.
-        reference: label of the reference's row.
-        accuracy: that was asked for, if any.
+        rows: Rows of the meshes.
+        orders: Sobolev orders s.
+        to_reference: Distances to the reference.
+        sizes: Mean edge lengths (meshes,).
+        accuracy: Accuracy that the study asks for, if any.
     """
-    distances, errors = to_reference.values, to_reference.errors
+    reference, proportion = to_reference.reference, to_reference.proportion
+    distances, errors = to_reference.distances.values, to_reference.distances.errors
     rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
     for family in dict.fromkeys(row.family for row in rows):
         # Only levels form a sequence; files of one family may be unrelated shapes.
@@ -97,12 +109,12 @@ def convergence_dataset(
             rates[k, members], rate_errors[k, members] = observed_rates(
                 distances[k, members], errors[k, members], sizes[members]
             )
-    norms, norm_errors = reference_norms.values[:, None], reference_norms.errors[:, None]
+    norms, norm_errors = to_reference.norms.values[:, None], to_reference.norms.errors[:, None]
     relative = distances / norms
-    within = np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference)
+    within = np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference.distances)
     return xr.Dataset(
         {
-            **_with_errors("distance", ("mesh", "order"), to_reference),
+            **_with_errors("distance", ("mesh", "order"), to_reference.distances),
             "relative": (("mesh", "order"), relative.T),
             "relative_error": (("mesh", "order"), (errors / norms + relative * norm_errors / norms).T),
             "area_part": (("mesh", "order"), proportion.area.T, {"description": "a pure change of total area"}),
@@ -118,24 +130,24 @@ def convergence_dataset(
     )
 
 
-def _with_errors(name: str, dimensions: tuple[str, ...], found: NormEstimate) -> dict[str, Any]:
-    """A number, its error and the parts of that; the axis of orders comes last."""
-    parts = {
-        name: found.values,
-        "error": found.errors,
-        "truncation": found.truncation,
-        "aliasing": found.aliasing,
-        "discretisation": found.discretisation,
+def _with_errors(name: str, dimensions: tuple[str, ...], estimate: NormEstimate) -> dict[str, Any]:
+    """Return a number, its error and the terms of the error; the axis of orders comes last."""
+    columns = {
+        name: estimate.values,
+        "error": estimate.errors,
+        "truncation": estimate.truncation,
+        "aliasing": estimate.aliasing,
+        "discretisation": estimate.discretisation,
     }
-    notes = {
+    descriptions = {
         "error": f"the true {name} lies within this of the given one",
         "truncation": f"part of the error: frequencies beyond xi_max, which can only add to the {name}",
         "aliasing": "part of the error: spacing of the lattice",
         "discretisation": "part of the error: quadrature and NUFFT",
     }
     return {
-        key: (dimensions, np.moveaxis(values, 0, -1), {"description": notes[key]} if key in notes else {})
-        for key, values in parts.items()
+        key: (dimensions, np.moveaxis(values, 0, -1), {"description": descriptions[key]} if key in descriptions else {})
+        for key, values in columns.items()
     }
 
 

@@ -1,190 +1,174 @@
-"""Tables from stored fields: the reduction dealt out to the cluster, and what it finds written down."""
+"""Tables from stored fields: the reduction as tasks of the cluster, and its results in the store."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
-from distributed import Client, Future
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.analysis.datasets import convergence_dataset, distances_dataset, meshes_dataset, norms_dataset
+from sobolev_batch.batch.analysis.datasets import (
+    DistancesToReference,
+    convergence_dataset,
+    distances_dataset,
+    meshes_dataset,
+    norms_dataset,
+)
 from sobolev_batch.batch.analysis.tiles import Reducer
-from sobolev_batch.batch.cluster.execution import deal
-from sobolev_batch.batch.cluster.outcomes import is_suspect
-from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.workers import MEMORY, Workers
-from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.cluster.execution import Cluster, Task
+from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
-# Raise it whenever tables hold something that those of older versions lack: they are then made anew.
+# Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 2
 
 Reals = NDArray[np.float64]
-_Call = tuple[Callable[..., Any], tuple[Sequence[int], ...]]
 
 
-def tabulate_fields(
-    client: Client,
-    crew: Workers,
-    store: Store,
-    plan: Plan,
-    rows: Sequence[Row],
-    records: Sequence[Record | None],
-    notify: Notify,
-) -> NormEstimate | None:
-    """Make the tables; the distances to the reference, or None where the tables were there.
+def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | None:
+    """Write the tables, and return the distances to the reference, or None where the tables were there.
 
     Raises:
-        DamageError: a field is not what was stored; it names its row.
-        StoreError: the store cannot be read or written.
-        ClusterError: the scheduler was lost, or no worker survives a task.
+        DamageError: A field is not what was stored; it names its row.
+        StoreError: The store cannot be read or written.
+        ClusterError: The scheduler was lost, or no worker survives a task.
     """
-    if are_tabulated(store, plan, rows, records):
+    if are_tabulated(workspace):
         return None
-    complete = [i for i, record in enumerate(records) if record is not None and record.status == "complete"]
-    reference = next(i for i, row in enumerate(rows) if row.label == plan.reference)
-    orders = plan.study.orders
-    center = reference if reference in complete else None
-    reducer = _reducer(store, plan, records, center)
-    norms, to_reference = (np.full((4, len(orders), len(rows)), np.nan) for _ in range(2))
-    proportions = np.full((3, len(orders), len(rows)), np.nan)
-    every_pair = plan.study.pairs == "all"
-    others = range(len(rows)) if every_pair else [reference]
-    distances = np.full((4, len(orders), len(rows), len(others)), np.nan)
-
-    calls: list[_Call] = [(reducer.norms, (strip,)) for strip in reducer.strips(complete, crew.threads)]
+    complete, every_pair = list(workspace.complete), workspace.plan.study.pairs == "all"
+    reducer, threads = make_reducer(workspace), cluster.workers.threads
+    # A larger task is tried all the same, with nothing beside it.
+    projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
+    tasks = [Task(reducer.norms, (rows,), projected_bytes) for rows in reducer.row_batches(complete, threads)]
     if every_pair:
-        calls += [(reducer.tile, tile) for tile in reducer.tiles(complete, crew.threads)]
-    notify(Progress("reduction", 0, len(calls)))
-    claims = reducer.task_bytes > crew.share_bytes
-    resources = {MEMORY: min(reducer.task_bytes, crew.largest_bytes)} if claims else None
-    done = 0
-
-    def enter(call: _Call, outcome: Any) -> None:
-        nonlocal done
-        done += 1
-        if isinstance(outcome, BaseException):
-            raise outcome
-        tile, *other = call[1]
-        if not other:
-            for table, found in zip((norms, to_reference, proportions), outcome, strict=True):
-                table[..., tile] = np.stack(list(found))
-        else:
-            pairs = np.stack(list(outcome))
-            distances[..., np.array(tile)[:, None], np.array(other[0])] = pairs
-            distances[..., np.array(other[0])[:, None], np.array(tile)] = np.swapaxes(pairs, -1, -2)
-        notify(Progress("reduction", done, len(calls)))
-
-    def submit(number: int, rank: int) -> Future:
-        task, arguments = calls[number]
-        return client.submit(task, *arguments, pure=False, resources=resources)
-
-    for number, outcome in deal(client, submit, range(len(calls)), len(calls)):
-        if is_suspect(outcome):
-            raise ClusterError(
-                "a task of the reduction ended the worker that it ran on again and again, at last with nothing else "
-                "beside it, as happens for want of memory; start workers with more memory"
-            )
-        enter(calls[number], outcome)
+        tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(complete, threads)]
+    steps = Steps(cluster.notify, "reduction", len(tasks))
+    results = _Results.empty(workspace)
+    for task, outcome in cluster.results(tasks, projected_bytes):
+        results.enter(outcome, *task.arguments)
+        steps.advance()
+    reference = workspace.reference
     if every_pair:
         # The direct sums are the more exact ones, and the same numbers in both tables.
-        distances[..., reference] = distances[..., reference, :] = to_reference
+        results.distances[..., reference] = results.distances[..., reference, :] = results.to_reference
     else:
-        distances[..., 0] = to_reference
-    _write_tables(store, plan, rows, records, norms, to_reference, proportions, distances, [rows[j] for j in others])
-    return NormEstimate(*to_reference)
+        results.distances[..., 0] = results.to_reference
+    _write_tables(workspace, results)
+    return NormEstimate(*results.to_reference)
 
 
-def _reducer(store: Store, plan: Plan, records: Sequence[Record | None], center: int | None) -> Reducer:
-    """The reducer of a store, with what the records say of its fields."""
-    lattice, orders = plan.lattice, plan.study.orders
-    weights = SobolevWeights(lattice, orders)
-    qualities = {
-        i: Quality.from_json(record.quality)
-        for i, record in enumerate(records)
-        if record is not None and record.status == "complete"
-    }
+@dataclass(frozen=True, eq=False)
+class _Results:
+    """The results of a reduction, NaN where there are none.
+
+    Attributes:
+        norms: (4, orders, rows), norms and their errors; see `NormEstimate`.
+        to_reference: (4, orders, rows), distances to the reference.
+        proportions: (3, orders, rows), decomposition of these distances.
+        distances: (4, orders, rows, others), distances of all pairs, or to the reference alone.
+    """
+
+    norms: Reals
+    to_reference: Reals
+    proportions: Reals
+    distances: Reals
+
+    @classmethod
+    def empty(cls, workspace: Workspace) -> Self:
+        """Return the results before any task."""
+        orders, rows = len(workspace.plan.study.orders), len(workspace.rows)
+        others = rows if workspace.plan.study.pairs == "all" else 1
+        shapes = (4, orders, rows), (4, orders, rows), (3, orders, rows), (4, orders, rows, others)
+        return cls(*(np.full(shape, np.nan) for shape in shapes))
+
+    def enter(self, outcome: Any, rows: Any, others: Any = None) -> None:
+        """Enter the outcome of a task for some rows, or for pairs of rows and others."""
+        if others is None:
+            for table, values in zip((self.norms, self.to_reference, self.proportions), outcome, strict=True):
+                table[..., rows] = np.stack(list(values))
+        else:
+            pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
+            self.distances[..., i[:, None], j] = pairs
+            self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
+
+
+def make_reducer(workspace: Workspace) -> Reducer:
+    """Return the reducer of a workspace, with the qualities in its records."""
+    plan, records, complete = workspace.plan, workspace.records, workspace.complete
+    orders, reference = plan.study.orders, workspace.reference
     areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
-    for i, quality in qualities.items():
+    weights, extents = SobolevWeights(plan.lattice, orders), []
+    for i, record in complete.items():
+        quality = Quality.from_json(record.quality)
         areas[i], errors[:, i] = quality.area, quality.probe.norms(weights)
-    extents = [quality.extent for quality in qualities.values()]
-    widths = Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS))
-    checksums = {i: record.checksums for i, record in enumerate(records) if record is not None}
-    return Reducer(store, lattice, plan.blocks, orders, center, areas, errors, widths, checksums)
-
-
-def _write_tables(
-    store: Store,
-    plan: Plan,
-    rows: Sequence[Row],
-    records: Sequence[Record | None],
-    norms: Reals,
-    to_reference: Reals,
-    proportions: Reals,
-    distances: Reals,
-    others: Sequence[Row],
-) -> None:
-    orders = plan.study.orders
-    reference = [row.label for row in rows].index(plan.reference)
-    meshes = meshes_dataset(rows, records)
-    sizes = meshes["edge_length_mean"].to_numpy()
-    convergence = convergence_dataset(
-        rows,
-        orders,
-        NormEstimate(*to_reference),
-        Proportion(*proportions),
-        NormEstimate(*norms[..., reference]),
-        sizes,
-        plan.reference,
-        plan.study.accuracy,
+        extents.append(quality.extent)
+    return Reducer(
+        store=workspace.store,
+        lattice=plan.lattice,
+        blocks=plan.blocks,
+        orders=orders,
+        center=reference if reference in complete else None,
+        areas=areas,
+        errors=errors,
+        widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
+        checksums={i: record.checksums for i, record in complete.items()},
     )
+
+
+def _write_tables(workspace: Workspace, results: _Results) -> None:
+    plan, rows, store = workspace.plan, workspace.rows, workspace.store
+    orders, reference = plan.study.orders, workspace.reference
+    others = rows if plan.study.pairs == "all" else (rows[reference],)
+    meshes = meshes_dataset(rows, workspace.records)
+    to_reference = DistancesToReference(
+        plan.reference,
+        NormEstimate(*results.to_reference),
+        Proportion(*results.proportions),
+        NormEstimate(*results.norms[..., reference]),
+    )
+    sizes = meshes["edge_length_mean"].to_numpy()
+    convergence = convergence_dataset(rows, orders, to_reference, sizes, plan.study.accuracy)
     tables = Tables(store)
     replaced = tables.invalidate()
-    store.write_qualities([record.quality if record else "" for record in records])
+    store.write_qualities([record.quality if record else "" for record in workspace.records])
     tables.write("meshes", meshes, instead_of=replaced)
-    tables.write("norms", norms_dataset(rows, orders, NormEstimate(*norms)), instead_of=replaced)
-    pairs = distances_dataset(rows, others, orders, NormEstimate(*distances))
+    tables.write("norms", norms_dataset(rows, orders, NormEstimate(*results.norms)), instead_of=replaced)
+    pairs = distances_dataset(rows, others, orders, NormEstimate(*results.distances))
     tables.write("distances", pairs, instead_of=replaced)
-    # Written last: its digest says that all tables belong to the fields that are there.
-    digest = _reduction_digest(plan, rows, records)
-    tables.write("convergence", convergence.assign_attrs(digest=digest), instead_of=replaced)
+    # Written last: its digest says that all tables belong to the fields that are stored.
+    tables.write("convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)
     store.consolidate()
 
 
-def are_tabulated(store: Store, plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> bool:
-    """Whether the tables of a store are there, and belong to its fields and to the plan."""
-    attributes = Tables(store).attributes("convergence")
-    current = attributes is not None and attributes.get("digest") == _reduction_digest(plan, rows, records)
-    return current and not Tables(store).lost()
+def are_tabulated(workspace: Workspace) -> bool:
+    """Return True where the tables of a store belong to its fields and to the plan."""
+    tables = Tables(workspace.store)
+    attributes = tables.attributes("convergence")
+    current = attributes is not None and attributes.get("digest") == _digest(workspace)
+    return current and not tables.lost()
 
 
-def _reduction_digest(plan: Plan, rows: Sequence[Row], records: Sequence[Record | None]) -> str:
-    parts = {
+def _digest(workspace: Workspace) -> str:
+    """Return the SHA-256 of all that the tables depend on."""
+    plan = workspace.plan
+    rows = [
+        [row.label, row.family, *((record.key, record.status, record.reason) if record else ("", "", ""))]
+        for row, record in zip(workspace.rows, workspace.records, strict=True)
+    ]
+    inputs = {
         "version": TABLES_VERSION,
-        "rows": [
-            [
-                row.label,
-                row.family,
-                record.key if record else "",
-                record.status if record else "",
-                record.reason if record else "",
-            ]
-            for row, record in zip(rows, records, strict=True)
-        ],
+        "rows": rows,
         "orders": plan.study.orders,
         "pairs": plan.study.pairs,
         "reference": plan.reference,
     }
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()

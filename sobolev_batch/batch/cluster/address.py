@@ -1,4 +1,4 @@
-"""The address of a scheduler or worker, and whether others than its user can reach it."""
+"""The address of a scheduler or worker, and a check that only its user can reach it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _WITHIN_A_PROCESS = "inproc"
 
 @dataclass(frozen=True)
 class Address:
-    """Where a process of a cluster listens.
+    """An address at which a process of a cluster listens.
 
     Attributes:
-        name: as it was given.
-        scheme: how it speaks, such as tls.
-        host, port: where; empty and 0 within a process.
+        name: Address as it was given.
+        scheme: Protocol, such as tls.
+        host, port: Host and port; empty and 0 within a process.
     """
 
     name: str
@@ -33,10 +33,10 @@ class Address:
 
     @classmethod
     def of(cls, name: str) -> Self:
-        """The address with this name; without a scheme, Dask's default is meant.
+        """Return the address with this name; without a scheme, Dask's default is meant.
 
         Raises:
-            AddressError: it is malformed.
+            AddressError: The name is malformed.
         """
         scheme, rest = parse_address(name)
         if scheme == _WITHIN_A_PROCESS:
@@ -54,22 +54,23 @@ class Address:
         return cls(name, scheme, host, port)
 
     def require_private(self, who: str) -> None:
-        """Check that nobody else reaches what listens here: it asks for certificates, or is on loopback.
+        """Check that nobody else reaches this address: it asks for certificates, or is on loopback.
 
         Args:
-            who: listens, for the message.
+            who: Process that listens, for the message.
 
         Raises:
-            AddressError: others may reach it.
-            ClusterError: there is no such host.
+            AddressError: Others may reach it.
+            ClusterError: The host does not exist.
         """
         if self.scheme in (*_ENCRYPTED, _WITHIN_A_PROCESS):
             return
         try:
-            found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
+            infos = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError) as error:
             raise ClusterError(f"no Dask scheduler answers at {self.name!r}: there is no host {self.host!r}") from error
-        beyond = [str(place[0]) for *_, place in found if not _is_loopback(str(place[0]))]
+        hosts = [str(socket_address[0]) for *_, socket_address in infos]
+        beyond = [host for host in hosts if not _is_loopback(host)]
         if beyond:
             raise AddressError(
                 f"{who} at {self.name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
@@ -78,10 +79,10 @@ class Address:
             )
 
 
-def _is_loopback(place: str) -> bool:
-    found = ip_address(place)
-    mapped = found.ipv4_mapped if isinstance(found, IPv6Address) else None
-    return (mapped or found).is_loopback
+def _is_loopback(host: str) -> bool:
+    address = ip_address(host)
+    mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
+    return (mapped or address).is_loopback
 
 
 def _malformed(name: str, reason: str) -> AddressError:

@@ -1,4 +1,4 @@
-"""The cluster a study runs on: one of processes on this machine, or any Dask scheduler."""
+"""Clients of the clusters that studies run on: processes or threads of this machine, or any Dask scheduler."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 
 import dask
-from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
 from sobolev_batch.batch.cluster import worker_preload
 from sobolev_batch.batch.cluster.address import Address
 from sobolev_batch.batch.cluster.connection import check_connection
 from sobolev_batch.errors import ClusterError, InputError
+from sobolev_batch.parameters import byte_count, format_bytes
 
 _CONNECT_SECONDS = 15
-# In less, a worker with all its libraries has no room for any transform.
+# In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
 # for each took a third of a reduction's time. What glibc may keep is bounded.
@@ -30,15 +30,15 @@ _LOST_WORKER_SECONDS = 10**7
 
 
 @contextmanager
-def local_client(workers: int | None = None, memory: str | None = None) -> Iterator[Client]:
-    """A client of a new cluster of single-threaded worker processes, reachable from this machine only.
+def local_client(workers: int | None = None, memory: float | str | None = None) -> Iterator[Client]:
+    """Give a client of a new cluster of single-threaded worker processes, reachable from this machine only.
 
     Args:
-        workers: how many; default one per core that this process may use.
-        memory: of each, such as "4GB"; default an equal part of the machine's.
+        workers: Number of workers; by default one for each core that this process may use.
+        memory: Memory of each, in bytes or as a text such as "4GB"; by default the machine's, divided equally.
 
     Raises:
-        InputError: the memory is not a size that a worker can live in.
+        InputError: The memory is not a size, or too little for a worker.
     """
     limit = "auto" if memory is None else _memory_limit(memory)
     count = workers or available_cores()
@@ -78,7 +78,7 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
 
     A terminal sends it to all processes at once. It is the driver that ends, and its cluster with it;
     workers that are interrupted themselves only print where they were. What the signal mask of a thread
-    blocks is blocked in everything that it starts; the caller's own is restored by what is yielded.
+    blocks is blocked in everything that it starts. Calling the yielded function restores the caller's own.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield lambda: None
@@ -98,10 +98,10 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def thread_client(workers: int | None = None) -> Iterator[Client]:
-    """A client of a new cluster of threads of this process, for a store that no other process can see.
+    """Give a client of a new cluster of threads of this process, for a store that no other process can see.
 
     Args:
-        workers: how many threads; default one per core that this process may use.
+        workers: Number of threads; by default one for each core that this process may use.
     """
     # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
     # and the link would name one of them.
@@ -127,20 +127,20 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 @contextmanager
 def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
-    """A client of the scheduler at an address such as tls://host:8786.
+    """Give a client of the scheduler at an address.
 
     Args:
-        address: of the scheduler.
-        trust_network: go on where scheduler or workers are neither encrypted nor on loopback: whoever reaches
-            their ports can run programs there and read the meshes.
+        address: Address of the scheduler, such as tls://host:8786.
+        trust_network: True to go on where scheduler or workers are neither encrypted nor on loopback: whoever
+            reaches their ports can run programs there and read the meshes.
 
     Raises:
-        AddressError: it is malformed, or its network would have to be trusted.
-        ClusterError: nothing answers there, or it is not to be reached with Dask's configuration.
+        AddressError: The address is malformed, or its network would have to be trusted.
+        ClusterError: Nothing answers there, or Dask's configuration does not fit.
     """
-    place = Address.of(address)
+    scheduler = Address.of(address)
     if not trust_network:
-        place.require_private("the scheduler")
+        scheduler.require_private("the scheduler")
     check_connection(address, _CONNECT_SECONDS)
     try:
         client = Client(address, timeout=_CONNECT_SECONDS)
@@ -154,24 +154,23 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         if not workers:
             raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
         if not trust_network:
-            # What is reached on loopback may be one end of a tunnel.
+            # An address on loopback may be one end of a tunnel.
             for worker in workers:
                 Address.of(worker).require_private("a worker")
         yield client
 
 
-def _memory_limit(memory: str) -> int:
-    try:
-        limit = int(parse_bytes(memory))
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"a worker's memory must be a size such as 4GB or 800MiB, found {memory!r}") from error
+def _memory_limit(memory: float | str) -> int:
+    limit = byte_count(memory)
     if limit < _LEAST_BYTES:
-        raise InputError(f"a worker's memory must be at least {_LEAST_BYTES / 1e6:g} MB, found {memory!r}")
+        raise InputError(
+            f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}; give it more"
+        )
     return limit
 
 
 def available_cores() -> int:
-    """The cores that this process may run on."""
+    """Return the number of cores that this process may run on."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows

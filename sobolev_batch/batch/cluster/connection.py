@@ -1,4 +1,4 @@
-"""Reaching a scheduler: what stands between a client and it, in words that say what to do."""
+"""The connection to a scheduler: why it fails, in words that say what to do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_connection(address: str, seconds: float) -> None:
     Dask's client says little of certificates, and waits for ever where something listens that is no scheduler.
 
     Raises:
-        ClusterError: nothing answers within some seconds, or certificates and configuration do not fit.
+        ClusterError: Nothing answers in time, or certificates and configuration do not fit.
     """
     security = Security()
     try:

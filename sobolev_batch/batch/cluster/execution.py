@@ -1,72 +1,187 @@
-"""Dealing out tasks, so many at a time, and taking back what became of each."""
+"""Tasks on a cluster: handed out so many at a time, in the memory that there is, and their outcomes taken back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
-from distributed import Client, Future, as_completed
+from distributed import CancelledError, Client, Future, as_completed
+from distributed.comm import CommClosedError
+from distributed.scheduler import KilledWorker
 
-from sobolev_batch.batch.cluster.outcomes import is_suspect, outcomes
-from sobolev_batch.batch.cluster.workers import Workers
-
-# Tasks that the scheduler knows of at a time: enough to deal out well, while each costs it memory.
-_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
-
-
-def many_in_flight(crew: Workers) -> int:
-    """How many tasks the scheduler may know of at a time where each is small."""
-    return max(_LEAST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * crew.threads)
+from sobolev_batch.batch.cluster.progress import Notify
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
+from sobolev_batch.errors import ClusterError, StoreError
 
 
-def deal(
-    client: Client, submit: Callable[[int, int], Future], numbers: Sequence[int], in_flight: int
-) -> Iterator[tuple[int, object]]:
-    """Have tasks done; those that were on workers which died are tried again alone, at the end.
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A call of a function on a worker.
 
-    Args:
-        client: of the cluster.
-        submit: hands the task of a number over, given the number and its rank among all that are dealt.
-        numbers: of the tasks.
-        in_flight: how many the scheduler may know of at a time.
-
-    Yields:
-        The number of a task with its result, or with what it raised; that is a `KilledWorker` where the task
-        has ended its workers with nothing else beside it.
-
-    Raises:
-        ClusterError: the scheduler was lost.
+    Attributes:
+        function: Function to call.
+        arguments: Arguments of the call. Results take the place of tasks among them, also within a list.
+        projected_bytes: Memory that the call takes at most.
+        needs_gpu: True where the call has to run on a worker with a GPU.
+        priority: Tasks of higher priority run first.
+        row: Row of the store that the task works for, for the caller.
     """
-    suspects = []
-    for number, outcome in _deal_once(client, submit, numbers, in_flight):
-        if is_suspect(outcome):
-            suspects.append(number)
-        else:
-            yield number, outcome
-    yield from _deal_once(client, submit, sorted(suspects), 1)
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    projected_bytes: float = 0.0
+    needs_gpu: bool = False
+    priority: int = 0
+    row: int = -1
 
 
-def _deal_once(
-    client: Client, submit: Callable[[int, int], Future], numbers: Sequence[int], in_flight: int
-) -> Iterator[tuple[int, object]]:
-    futures: dict[Future, int] = {}
-    remaining = enumerate(numbers)
-    completed = as_completed(loop=client.loop)
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """A cluster that computes a study.
 
-    def hand_over(count: int) -> None:
-        for rank, number in islice(remaining, count):
-            future = submit(number, rank)
-            futures[future] = number
-            completed.add(future)
+    Attributes:
+        client: Client of the cluster.
+        workers: Workers that the cluster had when the study began.
+        notify: Callback for each step of progress.
+        in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers
+            busy, while each costs the scheduler memory.
+        in_flight_per_thread: The same for each thread of the workers.
+    """
 
-    try:
-        hand_over(in_flight)
-        for batch in completed.batches():
-            found = outcomes(client, batch)
-            yield from zip([futures.pop(future) for future in batch], found, strict=True)
-            # Only now: what is dealt with nothing beside it has to be alone.
-            hand_over(len(batch))
-    finally:
-        # A client may outlive this run, and the cluster would go on for it.
-        for future in futures:
-            future.release()
+    client: Client
+    workers: Workers
+    notify: Notify = lambda progress: None
+    in_flight: int = 2000
+    in_flight_per_thread: int = 20
+
+    @classmethod
+    def of(cls, client: Client, libraries: Iterable[str] = (), notify: Notify = lambda progress: None) -> Self:
+        """Prepare the workers of a cluster for a study; see `prepare_workers`."""
+        return cls(client, prepare_workers(client, libraries), notify)
+
+    def run(
+        self, tasks: Iterable[Task], projected_bytes: float = 0.0, in_flight: int | None = None
+    ) -> Iterator[tuple[Task, Any]]:
+        """Have tasks done. Those whose workers died are tried again alone, after all others.
+
+        Args:
+            tasks: Tasks, read as they are handed out.
+            projected_bytes: Most memory that any of them takes. Where as many tasks as a worker has threads fit
+                beside each other, none has to claim its memory, and the scheduler is free to place them.
+            in_flight: Number of tasks that the scheduler may know of at a time.
+
+        Yields:
+            Each task with its result, or with the exception that ended it: a `ClusterError` where no worker has
+            the memory, or where every worker died of it.
+
+        Raises:
+            StoreError: A task could not read or write the store, which is not the fault of its mesh.
+            ClusterError: The scheduler was lost.
+        """
+        claims_memory = projected_bytes > self.workers.allowed_bytes_per_task
+        most = in_flight or max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
+        suspects: list[Task] = []
+        for task, outcome in self._run_once(tasks, claims_memory, most):
+            # It need not be what killed them: another task beside it may have been. Alone, it shows.
+            if isinstance(outcome, KilledWorker):
+                suspects.append(task)
+            else:
+                yield task, outcome
+        suspects.sort(key=lambda task: task.row)
+        for task, outcome in self._run_once(suspects, claims_memory, 1):
+            yield task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome
+
+    def results(self, tasks: Iterable[Task], projected_bytes: float = 0.0) -> Iterator[tuple[Task, Any]]:
+        """Have tasks done that must not fail; see `run`. The first exception is raised."""
+        for task, outcome in self.run(tasks, projected_bytes):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            yield task, outcome
+
+    def _run_once(self, tasks: Iterable[Task], claims_memory: bool, in_flight: int) -> Iterator[tuple[Task, Any]]:
+        running: dict[Future, Task] = {}
+        remaining = iter(tasks)
+        completed = as_completed(loop=self.client.loop)
+
+        def hand_out(count: int) -> list[tuple[Task, ClusterError]]:
+            """Submit so many tasks, and return those before them that fit into no worker."""
+            refused = []
+            for task in remaining:
+                try:
+                    self.workers.require_memory(task.projected_bytes)
+                except ClusterError as error:
+                    refused.append((task, error))
+                    continue
+                future = self._submit(task, claims_memory, {})
+                running[future] = task
+                completed.add(future)
+                count -= 1
+                if not count:
+                    break
+            return refused
+
+        try:
+            yield from hand_out(in_flight)
+            for batch in completed.batches():
+                outcomes = self._outcomes(batch)
+                yield from zip([running.pop(future) for future in batch], outcomes, strict=True)
+                # Only now: a task that is tried alone has to be alone.
+                yield from hand_out(len(batch))
+        finally:
+            # The client may outlive this run, and the cluster would go on for it.
+            for future in running:
+                future.release()
+
+    def _submit(self, task: Task, claims_memory: bool, futures: dict[int, Future]) -> Future:
+        """Submit a task after those among its arguments, each of these once."""
+
+        def submitted(argument: Any) -> Any:
+            if isinstance(argument, list):
+                return [submitted(item) for item in argument]
+            return self._submit(argument, claims_memory, futures) if isinstance(argument, Task) else argument
+
+        if id(task) not in futures:
+            resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
+            if task.needs_gpu:
+                resources[GPU] = 1.0
+            futures[id(task)] = self.client.submit(
+                task.function,
+                *map(submitted, task.arguments),
+                pure=False,
+                priority=task.priority,
+                resources=resources or None,
+            )
+        return futures[id(task)]
+
+    def _outcomes(self, futures: Sequence[Future]) -> list[Any]:
+        """Fetch the results of futures that have ended, or their exceptions, all at once."""
+        lost = (
+            f"the scheduler at {self.client.scheduler.address} was lost; the same command goes on from what is stored"
+        )
+        if self.client.status != "running" or any(future.cancelled() for future in futures):
+            raise ClusterError(lost)
+        try:
+            results = iter(self.client.gather([future for future in futures if future.status == "finished"]))
+            outcomes = [next(results) if future.status == "finished" else future.exception() for future in futures]
+        except (CommClosedError, CancelledError) as error:
+            raise ClusterError(lost) from error
+        for outcome in outcomes:
+            if type(outcome) is StoreError:
+                raise StoreError(f"{outcome}; then the same command goes on from what is stored") from outcome
+            if isinstance(outcome, StoreError):
+                raise outcome
+        return outcomes
+
+
+def failure_reason(error: BaseException) -> str:
+    """Return why a task failed, in one line."""
+    return str(error) if isinstance(error, ClusterError) else f"{type(error).__name__}: {error}"
+
+
+def _deadly(error: KilledWorker) -> ClusterError:
+    return ClusterError(
+        "its tasks ended the worker that they ran on again and again, at last with nothing else beside them, as "
+        f"happens for want of memory ({error}); start workers with more memory, or take it out of the study"
+    )

@@ -1,4 +1,4 @@
-"""Which GPU of its host a worker process has for itself."""
+"""The GPU of its host that a worker process has for itself."""
 
 from __future__ import annotations
 
@@ -13,35 +13,60 @@ from sobolev_batch.errors import BackendError
 from sobolev_batch.spectral.backends.cuda import INSTALL
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
-# What this process has: one device at most, since CUDA settles on what it sees at its start.
-_held: set[str] = set()
-_claiming = Lock()
+# The device of this process. It has one at most, since CUDA settles on the devices that it sees at its start.
+_own_devices: set[str] = set()
+_locking = Lock()
 
 
 @dataclass(frozen=True, eq=False)
-class Claim:
-    """A device that belongs to this process until it ends or lets go.
+class GpuLock:
+    """A GPU that belongs to this process until it ends or releases it.
+
+    The lock is a socket bound to a name that Linux keeps in memory: it is exclusive, needs no permissions,
+    leaves no file, and ends with the process however that ends.
 
     Attributes:
-        device: the UUID.
+        device: UUID of the GPU.
     """
 
     device: str
-    _hold: socket.socket
+    _socket: socket.socket
+
+    @classmethod
+    def acquire(cls, devices: Sequence[str]) -> GpuLock | None:
+        """Lock the first device that no other process of this host has, and make it the only visible one.
+
+        Returns:
+            The lock, or None where all devices are locked or this process has one already.
+        """
+        if not sys.platform.startswith("linux"):
+            return None
+        with _locking:
+            for device in () if _own_devices else devices:
+                name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+                try:
+                    name.bind(f"\0sobolev-batch/{device}")
+                except OSError:
+                    name.close()
+                    continue
+                _own_devices.add(device)
+                os.environ[_VISIBLE] = device
+                return cls(device, name)
+        return None
 
     def release(self) -> None:
         """Let another process have the device."""
-        self._hold.close()
-        _held.discard(self.device)
+        self._socket.close()
+        _own_devices.discard(self.device)
 
 
 def visible_devices() -> tuple[str, ...]:
-    """The UUIDs of the GPUs that this process may use: those of CUDA_VISIBLE_DEVICES, or all of the host.
+    """Return the UUIDs of the GPUs that this process may use: those of CUDA_VISIBLE_DEVICES, or all of the host.
 
     CUDA itself is not started: it would settle on its devices for good.
 
     Raises:
-        BackendError: there are none, or nobody can tell.
+        BackendError: The host has none, or they cannot be listed.
     """
     try:
         import pynvml
@@ -55,54 +80,30 @@ def visible_devices() -> tuple[str, ...]:
         raise BackendError("no GPU: the NVIDIA driver is not installed on this machine") from error
     except pynvml.NVMLError as error:
         raise BackendError(f"no GPU: the NVIDIA driver says: {error}") from error
-    wanted = os.environ.get(_VISIBLE)
-    found = tuple(uuids) if wanted is None else chosen_devices(wanted, uuids)
-    if not found:
-        hidden = f"CUDA_VISIBLE_DEVICES={wanted} hides all {count}" if count else "the NVIDIA driver sees none"
-        raise BackendError(f"no GPU: {hidden}")
-    return found
+    visible = os.environ.get(_VISIBLE)
+    devices = tuple(uuids) if visible is None else chosen_devices(visible, uuids)
+    if not devices:
+        reason = f"CUDA_VISIBLE_DEVICES={visible} hides all {count}" if count else "the NVIDIA driver sees none"
+        raise BackendError(f"no GPU: {reason}")
+    return devices
 
 
-def chosen_devices(wanted: str, uuids: Sequence[str]) -> tuple[str, ...]:
-    """What a value of CUDA_VISIBLE_DEVICES stands for: as CUDA does, it ends at the first entry that is no device.
+def chosen_devices(visible: str, uuids: Sequence[str]) -> tuple[str, ...]:
+    """Return the devices that a value of CUDA_VISIBLE_DEVICES names, up to the first entry that is no device.
 
     Args:
-        wanted: indices, UUIDs or unique beginnings of them, or names of MIG instances, with commas in between.
-        uuids: of the host's devices, in the order of their indices.
+        visible: Indices, UUIDs or unique beginnings of them, or names of MIG instances, separated by commas.
+        uuids: UUIDs of the host's devices, in the order of their indices.
     """
     chosen: list[str] = []
-    for entry in (part.strip() for part in wanted.split(",")):
+    for entry in map(str.strip, visible.split(",")):
         if entry.isdecimal() and int(entry) < len(uuids):
-            found = uuids[int(entry)]
+            chosen.append(uuids[int(entry)])
         elif entry.startswith("MIG-"):
-            found = entry
+            chosen.append(entry)
         else:
             matching = [uuid for uuid in uuids if entry and uuid.startswith(entry)]
             if len(matching) != 1:
                 break
-            found = matching[0]
-        chosen.append(found)
+            chosen += matching
     return tuple(dict.fromkeys(chosen))
-
-
-def claim_device(devices: Sequence[str]) -> Claim | None:
-    """Take the first device that no other process of this host has taken, and make it the only visible one.
-
-    None where all are taken, or this process has one already. A claim is a socket bound to a name that
-    Linux keeps in memory: it is exclusive, needs no permissions, leaves no file, and ends with the
-    process however that ends.
-    """
-    if not sys.platform.startswith("linux"):
-        return None
-    with _claiming:
-        for device in () if _held else devices:
-            hold = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            try:
-                hold.bind(f"\0sobolev-batch/{device}")
-            except OSError:
-                hold.close()
-                continue
-            _held.add(device)
-            os.environ[_VISIBLE] = device
-            return Claim(device, hold)
-    return None

@@ -8,20 +8,22 @@ from typing import Literal
 
 from sobolev_batch.batch.store.records import Record
 
+Stage = Literal["cluster", "fields", "reduction", "comparisons"]
+
 
 @dataclass(frozen=True)
 class Progress:
-    """One step forward.
+    """One step of a run.
 
     Attributes:
         stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
-            tables are made, "comparisons" while meshes are compared with the reference.
-        done, total: steps of the stage.
-        label: of the mesh that was finished, or the address of the cluster's dashboard; else empty.
-        record: of that mesh.
+            tables are computed, "comparisons" while meshes are compared with the reference.
+        done, total: Steps of the stage.
+        label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
+        record: Completion record of that mesh.
     """
 
-    stage: Literal["cluster", "fields", "reduction", "comparisons"]
+    stage: Stage
     done: int
     total: int
     label: str = ""
@@ -29,3 +31,17 @@ class Progress:
 
 
 Notify = Callable[[Progress], None]
+
+
+class Steps:
+    """The steps of one stage, counted and reported."""
+
+    def __init__(self, notify: Notify, stage: Stage, total: int) -> None:
+        """Report that the stage begins."""
+        self._notify, self._stage, self._total, self._done = notify, stage, total, 0
+        notify(Progress(stage, 0, total))
+
+    def advance(self, label: str = "", record: Record | None = None) -> None:
+        """Report one more step."""
+        self._done += 1
+        self._notify(Progress(self._stage, self._done, self._total, label, record))

@@ -1,4 +1,4 @@
-"""What each worker computes with: found out once when it starts, reported, and used by all its tasks."""
+"""The backend and memory of each worker: found once when it starts, declared, and used by all its tasks."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
-from sobolev_batch.batch.cluster.gpus import Claim, claim_device, visible_devices
-from sobolev_batch.batch.cluster.versions import guarded, require_same_versions
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, spare_bytes
+from sobolev_batch.batch.cluster.gpus import GpuLock, visible_devices
+from sobolev_batch.batch.cluster.versions import require_same_versions
+from sobolev_batch.batch.cluster.worker_versions import VersionGuard
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, allowed_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
 
@@ -23,15 +24,15 @@ _GUARD = "sobolev-batch-versions"
 _SETUP_SECONDS = 0.05
 
 
-class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
-    """Finds a worker's backend when it starts, and declares its memory and its GPU to the scheduler.
+class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
+    """Plugin that finds a worker's backend when it starts, and declares its memory and its GPU to the scheduler.
 
     A worker takes at most one GPU, and only one that no other worker of its host has.
 
     Attributes:
-        backend: what the worker's tasks compute with.
-        note: the GPU's name, or why there is none.
-        spare_bytes: of memory, for all its tasks together.
+        backend: Backend that the worker's tasks compute with.
+        note: Name of the GPU, or the reason why there is none.
+        allowed_bytes: Memory for all its tasks together.
     """
 
     idempotent = True
@@ -39,79 +40,79 @@ class Equipment(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
     def __init__(self) -> None:
         self.backend: Backend = CPU
         self.note = ""
-        self.spare_bytes = 0.0
-        self._claim: Claim | None = None
+        self.allowed_bytes = 0.0
+        self._lock: GpuLock | None = None
         self._ready: asyncio.Event | None = None
 
-    def __reduce__(self) -> tuple[type[Equipment], tuple[()]]:
+    def __reduce__(self) -> tuple[type[BackendPlugin], tuple[()]]:
         # It travels to workers before it has found anything.
-        return Equipment, ()
+        return BackendPlugin, ()
 
     async def setup(self, worker: Worker) -> None:
-        """Find out what is there; in a thread, since loading CUDA takes seconds."""
+        """Find the backend; in a thread, since loading CUDA takes seconds."""
         self._ready = asyncio.Event()
-        self.spare_bytes = spare_bytes(worker.memory_manager.memory_limit)
+        self.allowed_bytes = allowed_bytes(worker.memory_manager.memory_limit)
         await asyncio.to_thread(self._find_backend)
-        declared = [name for name in worker.state.total_resources if name.upper() == "GPU"]
-        if declared and self.backend.name != "gpu":
+        has_gpu = self.backend.name == "gpu"
+        if _declares_gpu(worker) and not has_gpu:
             _log.warning("%s declares a GPU but computes on its CPU: %s", worker.address, self.note)
-        resources = {MEMORY: self.spare_bytes} | ({GPU: 1} if self.backend.name == "gpu" else {})
-        await worker.set_resources(**resources)
+        await worker.set_resources(**{MEMORY: self.allowed_bytes}, **({GPU: 1} if has_gpu else {}))
         if worker.status == Status.running:
             # The scheduler looks for tasks that wait for resources only when a worker begins to run.
             worker.status = Status.paused
             worker.status = Status.running
         self._ready.set()
 
-    async def found(self) -> tuple[float, str, str]:
-        """Spare memory, backend and note, once they are known."""
+    async def describe(self, worker: Worker) -> WorkerInfo:
+        """Return what the worker offers, once that is known."""
         while self._ready is None:
             await asyncio.sleep(_SETUP_SECONDS)
         await self._ready.wait()
-        return self.spare_bytes, self.backend.name, self.note
+        threads, backend = worker.state.nthreads, self.backend.name
+        return WorkerInfo(worker.address, threads, self.allowed_bytes, backend, self.note, _declares_gpu(worker))
 
     def teardown(self, worker: Worker) -> None:
-        """Let go of the GPU."""
-        if self._claim is not None:
-            self._claim.release()
+        """Release the GPU."""
+        if self._lock is not None:
+            self._lock.release()
 
     def _find_backend(self) -> None:
-        claim = None
+        lock = None
         try:
             devices = visible_devices()
-            claim = claim_device(devices)
-            if claim is None:
+            lock = GpuLock.acquire(devices)
+            if lock is None:
                 raise BackendError(f"no GPU left: other workers have all of the {len(devices)} that it may use")
             backend = gpu_backend()
-            self.backend, self.note, self._claim = backend, backend.description, claim
+            self.backend, self.note, self._lock = backend, backend.description, lock
         except BackendError as error:
             self.note = str(error)
-            if claim is not None:
-                claim.release()
+            if lock is not None:
+                lock.release()
 
 
-def enlist(client: Client, needed: Iterable[str] = ()) -> Workers:
-    """Equip the workers of a cluster, those that join later too, and tell what they offer.
+def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
+    """Install the plugin on the workers of a cluster, also on those that join later, and return what they offer.
 
     Args:
-        client: of the cluster.
-        needed: names of distributions that the study takes besides what this package requires.
+        client: Client of the cluster.
+        libraries: Names of distributions that the study takes besides what this package requires.
 
     Raises:
-        ClusterError: there are no workers, or versions there and here differ.
+        ClusterError: The cluster has no workers, or their versions differ from those here.
     """
-    require_same_versions(client, needed)
-    client.register_plugin(guarded(Equipment(), _NAME), name=_GUARD)
+    require_same_versions(client, libraries)
+    client.register_plugin(VersionGuard(BackendPlugin(), _NAME), name=_GUARD)
     answers = client.run(_describe, on_error="return")
-    # One that is just leaving, or joining, counts as not there.
-    found = {address: parts for address, parts in answers.items() if isinstance(parts, tuple)}
-    if not found:
+    # A worker that is just leaving, or joining, does not count.
+    members = tuple(answers[address] for address in sorted(answers) if isinstance(answers[address], WorkerInfo))
+    if not members:
         raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
-    return Workers(tuple(WorkerInfo(address, *parts) for address, parts in sorted(found.items())))
+    return Workers(members)
 
 
-def worry_about(client: Client, backend: str) -> str:
-    """What a study is waiting for that its cluster does not have any more; empty while it has."""
+def waiting_reason(client: Client, backend: str) -> str:
+    """Return what a study waits for that its cluster has lost; empty where it has all that it takes."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
     if not workers:
         return "no worker is left; waiting for one to start"
@@ -120,20 +121,21 @@ def worry_about(client: Client, backend: str) -> str:
     return ""
 
 
-async def _describe(dask_worker: Worker) -> tuple[int, float, str, str, bool] | None:
-    equipment = dask_worker.plugins.get(_NAME)
-    if equipment is None:
-        return None
-    declares = any(name.upper() == "GPU" for name in dask_worker.state.total_resources)
-    return dask_worker.state.nthreads, *await equipment.found(), declares
-
-
-def backend_of(wanted: str) -> Backend:
-    """The backend of the worker that this task runs on; the CPU where a study wants that."""
-    if wanted == "cpu":
+def worker_backend(choice: str) -> Backend:
+    """Return the backend of the worker that runs this task; the CPU where the study chose that."""
+    if choice == "cpu":
         return CPU
     try:
         plugins: dict[str, Any] = get_worker().plugins
     except ValueError:  # called outside a cluster
         return CPU
     return plugins[_NAME].backend if _NAME in plugins else CPU
+
+
+async def _describe(dask_worker: Worker) -> WorkerInfo | None:
+    plugin = dask_worker.plugins.get(_NAME)
+    return None if plugin is None else await plugin.describe(dask_worker)
+
+
+def _declares_gpu(worker: Worker) -> bool:
+    return any(name.upper() == "GPU" for name in worker.state.total_resources)

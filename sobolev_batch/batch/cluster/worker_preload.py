@@ -1,7 +1,4 @@
-"""Loaded into the workers of a local cluster: they leave it to the driver to say what went wrong.
-
-What goes wrong in a task is told by its record; of the end of a cluster workers log much that helps nobody.
-"""
+"""Preload of workers of a local cluster: the driver tells what went wrong, so that they need not log it."""
 
 from __future__ import annotations
 
@@ -11,5 +8,5 @@ from distributed import Worker
 
 
 def dask_setup(worker: Worker) -> None:
-    """What Dask calls when a worker starts."""
+    """Silence Dask's logs of this worker. Dask calls this when the worker starts."""
     logging.getLogger("distributed").setLevel(logging.CRITICAL)

@@ -1,4 +1,4 @@
-"""The workers of a cluster: how many tasks they take at once, in how much memory, with which backend."""
+"""The workers of a cluster: how many tasks they run at once, in how much memory, with which backend."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ import psutil
 
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import ClusterError
+from sobolev_batch.parameters import format_bytes
 
-# Names of what tasks ask of a worker, in Dask's words its resources.
+# Dask resources that tasks claim of a worker.
 MEMORY = "sobolev-batch-memory"
 GPU = "sobolev-batch-gpu"
+
+# Dask pauses a worker near its memory limit and ends it at the limit; an idle process with its libraries takes
+# the constant.
+_ALLOWED_FRACTION, _IDLE_BYTES = 0.85, 300e6
+_MOST_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -20,30 +26,29 @@ class WorkerInfo:
     """One worker.
 
     Attributes:
-        address: where it is.
-        threads: tasks that it runs at once.
-        spare_bytes: memory for all its tasks together.
+        address: Address of the worker.
+        threads: Number of tasks that it runs at once.
+        allowed_bytes: Memory that all its tasks together may take.
         backend: "cpu" or "gpu".
-        note: the GPU's name, or why it computes on the CPU.
-        declares_gpu: whether it was started with a resource GPU.
+        note: Name of the GPU, or the reason why the worker computes on the CPU.
+        declares_gpu: True where the worker was started with a resource GPU.
     """
 
     address: str
     threads: int
-    spare_bytes: float
+    allowed_bytes: float
     backend: str
     note: str
     declares_gpu: bool = False
 
 
-# Of a worker's memory limit, what tasks may take together: Dask pauses a worker near its limit and
-# ends it at it, and an idle process with its libraries takes the constant part.
-_USABLE, _IDLE_BYTES = 0.85, 300e6
+def allowed_bytes(limit: float | None) -> float:
+    """Return the memory that tasks of a worker may take together.
 
-
-def spare_bytes(limit: float | None) -> float:
-    """What tasks of a worker with a memory limit may take together; without one, the machine's memory is the limit."""
-    return _USABLE * (limit or psutil.virtual_memory().total) - _IDLE_BYTES
+    Args:
+        limit: Memory limit of the worker; without one, the machine's memory.
+    """
+    return _ALLOWED_FRACTION * (limit or psutil.virtual_memory().total) - _IDLE_BYTES
 
 
 @dataclass(frozen=True)
@@ -54,42 +59,55 @@ class Workers:
 
     @classmethod
     def of_this_machine(cls, count: int) -> Workers:
-        """The workers of a cluster that a run without a scheduler would start here."""
-        spare = spare_bytes(psutil.virtual_memory().total / count)
-        return cls(tuple(WorkerInfo("this machine", 1, spare, "cpu", "") for _ in range(count)))
+        """Return the workers of a cluster that a run without a scheduler would start here."""
+        allowed = allowed_bytes(psutil.virtual_memory().total / count)
+        return cls((WorkerInfo("this machine", 1, allowed, "cpu", ""),) * count)
 
     @property
     def threads(self) -> int:
-        """Tasks that run at once."""
+        """Number of tasks that run at once."""
         return sum(member.threads for member in self.members)
 
     @cached_property
-    def share_bytes(self) -> float:
-        """Memory that every task can have while all threads of every worker are busy."""
-        return min(member.spare_bytes / member.threads for member in self.members)
+    def allowed_bytes_per_task(self) -> float:
+        """Memory that every task may take while all threads of every worker are busy."""
+        return min(member.allowed_bytes / member.threads for member in self.members)
 
     @cached_property
-    def largest_bytes(self) -> float:
-        """Memory that the best equipped worker has for a task alone."""
-        return max(member.spare_bytes for member in self.members)
+    def largest_allowed_bytes(self) -> float:
+        """Memory that a task may take alone on the worker with the most."""
+        return max(member.allowed_bytes for member in self.members)
 
-    def with_backend(self, wanted: Backends) -> Workers:
-        """The workers that can serve a study with this backend.
+    def require_memory(self, projected_bytes: float) -> None:
+        """Check that a task fits into a worker.
 
         Raises:
-            ClusterError: a GPU is asked for, and none of them has one.
+            ClusterError: No worker has the memory.
         """
-        if wanted != "gpu":
+        if projected_bytes > self.largest_allowed_bytes:
+            raise ClusterError(
+                f"it takes about {format_bytes(projected_bytes)} in one task, and no worker has more than "
+                f"{format_bytes(self.largest_allowed_bytes)} for tasks (of its limit it keeps 15 % and 0.3 GB for "
+                "itself); start workers with more memory"
+            )
+
+    def with_backend(self, backend: Backends) -> Workers:
+        """Return the workers that can serve a study with this backend.
+
+        Raises:
+            ClusterError: The study asks for a GPU, and no worker has one.
+        """
+        if backend != "gpu":
             return self
-        equipped = tuple(member for member in self.members if member.backend == "gpu")
-        if not equipped:
+        members = tuple(member for member in self.members if member.backend == "gpu")
+        if not members:
             reasons = "; ".join(
                 f"{member.address}{' (declares a GPU)' if member.declares_gpu else ''}: {member.note}"
-                for member in self.members[:4]
+                for member in self.members[:_MOST_NAMED]
             )
             raise ClusterError(
                 f"the study asks for backend 'gpu', and none of the {len(self.members)} workers can compute on one. "
-                f"{reasons}{'; ...' if len(self.members) > 4 else ''}. "
+                f"{reasons}{'; ...' if len(self.members) > _MOST_NAMED else ''}. "
                 "Start a worker on a machine with an NVIDIA GPU and the extra gpu, or ask for backend 'auto'"
             )
-        return Workers(equipped)
+        return Workers(members)

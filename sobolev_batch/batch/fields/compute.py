@@ -1,99 +1,65 @@
-"""Computing the fields that a store lacks: rows handed to the cluster, records taken back."""
+"""The fields that a store lacks: handed to the cluster as tasks, and their records taken back."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from distributed import Client, Future
-
-from sobolev_batch.batch.cluster.execution import deal, many_in_flight
-from sobolev_batch.batch.cluster.outcomes import DEADLY, is_suspect
-from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.fields.graph import Submitter
-from sobolev_batch.batch.fields.sizing import Layout, lay_out_rows
-from sobolev_batch.batch.fields.tasks import Job
+from sobolev_batch.batch.cluster.execution import Cluster, Task, failure_reason
+from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.fields.graph import field_task
+from sobolev_batch.batch.fields.sizing import size_rows
+from sobolev_batch.batch.fields.tasks import FieldSettings, Job
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.errors import StoreError
+from sobolev_batch.batch.workspace import Workspace
 
 _log = logging.getLogger(__name__)
 
 
-def compute_fields(
-    client: Client,
-    crew: Workers,
-    store: Store,
-    plan: Plan,
-    rows: Sequence[Row],
-    missing: Sequence[int],
-    records: list[Record | None],
-    notify: Notify,
-) -> None:
-    """Compute the fields of rows; their records, as they are stored, take their places in the list.
+def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int]) -> None:
+    """Compute the fields of rows, and take their records into the workspace.
 
     Raises:
-        StoreError: the store could not be written, which is no failure of a mesh; what is not recorded can be
-            computed again.
-        ClusterError: the scheduler was lost, or the lattice fits into no worker.
+        StoreError: The store could not be written, which is no failure of a mesh.
+        ClusterError: The scheduler was lost, or the lattice fits into no worker.
     """
-    notify(Progress("fields", 0, len(missing)))
-    layouts, refused = lay_out_rows(plan, [rows[i] for i in missing], crew.with_backend(plan.study.backend))
-    submitter = Submitter.of(client, crew, plan.study.backend, layouts.values(), len(plan.blocks))
-    done = 0
+    plan, store, rows = workspace.plan, workspace.store, workspace.rows
+    steps = Steps(cluster.notify, "fields", len(missing))
+    workers = cluster.workers.with_backend(plan.study.backend)
+    sizes, refused = size_rows(plan, [rows[i] for i in missing], workers)
 
-    def conclude(i: int, record: Record) -> None:
-        nonlocal done
-        done += 1
-        records[i] = record
-        notify(Progress("fields", done, len(missing), rows[i].label, record))
+    def take(i: int, record: Record) -> None:
+        workspace.records[i] = record
+        steps.advance(rows[i].label, record)
 
     def give_up(i: int, reason: str) -> None:
         record = Record(key=rows[i].key, status="failed", reason=reason, finished=utc_now())
         _log.error("%s: %s", rows[i].label, reason)
         store.write_record(i, record)
-        conclude(i, record)
+        take(i, record)
 
     for i in missing:
         if rows[i].label in refused:
             give_up(i, refused[rows[i].label])
-    todo = [i for i in missing if rows[i].label in layouts]
-    # A mesh in pieces occupies all workers by itself, and its pieces the scratch space.
-    cut = any(layout.parts > 1 for layout in layouts.values())
+    settings = FieldSettings.of(plan)
 
-    def submit(i: int, rank: int) -> Future:
-        layout = layouts[rows[i].label]
-        return submitter.field(_job(store, plan, rows[i], i, layout), layout, rank)
+    def tasks() -> Iterator[Task]:
+        for rank, i in enumerate(i for i in missing if rows[i].label in sizes):
+            row = rows[i]
+            job = Job(store, i, row, settings, plan.aim(row), sizes[row.label].allowed_bytes)
+            yield field_task(job, sizes[row.label], rank)
 
-    for i, outcome in deal(client, submit, todo, crew.threads + 1 if cut else many_in_flight(crew)):
-        if isinstance(outcome, StoreError):
-            raise StoreError(f"{outcome}; then the same command goes on from what is stored") from outcome
-        if layouts[rows[i].label].parts > 1:
-            store.scratch.discard(i)
+    # A mesh in batches occupies all workers by itself, and its batches the scratch space.
+    is_split = any(size.batches > 1 for size in sizes.values())
+    projected_bytes = max((size.projected_bytes for size in sizes.values()), default=0.0)
+    in_flight = cluster.workers.threads + 1 if is_split else None
+    for task, outcome in cluster.run(tasks(), projected_bytes, in_flight):
+        if sizes[rows[task.row].label].batches > 1:
+            store.scratch.discard(task.row)
         if isinstance(outcome, Record):
-            conclude(i, outcome)
+            take(task.row, outcome)
         else:
-            give_up(i, DEADLY.format(outcome) if is_suspect(outcome) else f"{type(outcome).__name__}: {outcome}")
-    if cut:
+            give_up(task.row, failure_reason(outcome))
+    if is_split:
         store.scratch.discard()
-
-
-def _job(store: Store, plan: Plan, row: Row, number: int, layout: Layout) -> Job:
-    return Job(
-        store,
-        number,
-        row.label,
-        row.key,
-        row.member,
-        plan.similarity,
-        plan.lattice,
-        plan.transform,
-        plan.study.orders,
-        plan.aim(row),
-        layout.transform_bytes,
-        plan.study.backend,
-        row.fingerprint,
-    )

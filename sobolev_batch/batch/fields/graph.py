@@ -1,100 +1,72 @@
-"""Fields as graphs of Dask tasks, each of which claims the memory and the device that it needs."""
+"""The field of a row as a graph of tasks, each with the memory and the device that it takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from distributed import Client, Future
-
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
-from sobolev_batch.batch.fields.large_mesh import add_partials, cut_mesh, store_block, transform_piece
-from sobolev_batch.batch.fields.sizing import Layout
+from sobolev_batch.batch.cluster.execution import Task
+from sobolev_batch.batch.fields.large_mesh import add_sums, split_mesh, store_block, transform_batch
+from sobolev_batch.batch.fields.sizing import TaskSizes
 from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, finish_mesh
-from sobolev_batch.batch.study.schema import Backends
 
 
-@dataclass(frozen=True, eq=False)
-class Submitter:
-    """Hands tasks to a cluster.
+def field_task(job: Job, sizes: TaskSizes, rank: int = 0) -> Task:
+    """Return the task that computes and stores a field, after those that it depends on.
 
-    Attributes:
-        client: of the cluster.
-        claims_memory: whether tasks have to claim their memory; where each fits beside as many as a worker
-            has threads, none needs to, and the scheduler is free to deal them out as it likes.
-        claims_gpu: whether transforms have to run where a GPU is.
-        blocks: of the lattice.
+    The result is the completion record of the field.
+
+    Args:
+        job: Field to compute.
+        sizes: Tasks to compute it by.
+        rank: Fields of lower rank come first.
     """
+    if sizes.batches > 1:
+        return _Batches(job, sizes, rank).field_task()
+    needs_gpu = job.settings.backend == "gpu"
+    if len(sizes.block_groups) == 1:
+        (blocks,) = sizes.block_groups
+        return Task(compute_mesh, (job, blocks), sizes.loading_bytes, needs_gpu, row=job.index)
+    groups = [Task(compute_blocks, (job, blocks), sizes.loading_bytes, needs_gpu) for blocks in sizes.block_groups]
+    return Task(finish_mesh, (job, groups), row=job.index)
 
-    client: Client
-    claims_memory: bool
-    claims_gpu: bool
-    blocks: int
 
-    @classmethod
-    def of(cls, client: Client, crew: Workers, backend: Backends, layouts: Iterable[Layout], blocks: int) -> Submitter:
-        """The submitter for fields with these layouts."""
-        largest = max((layout.largest_bytes for layout in layouts), default=0.0)
-        return cls(client, largest > crew.share_bytes, backend == "gpu", blocks)
+@dataclass(frozen=True)
+class _Batches:
+    """The tasks of a field whose mesh is split into batches."""
 
-    def field(self, job: Job, layout: Layout, rank: int) -> Future:
-        """Compute and store a field; the result is its completion record.
+    job: Job
+    sizes: TaskSizes
+    rank: int
 
-        Args:
-            job: what to compute.
-            layout: as which tasks.
-            rank: fields of lower rank come first.
-        """
-        groups = layout.groups
-        if layout.parts > 1:
-            return self._field_of_pieces(job, layout, rank)
-        if len(groups) == 1:
-            return self._submit(compute_mesh, job, groups[0], claim=layout.making_bytes, transforms=True)
-        parts = [
-            self._submit(compute_blocks, job, group, claim=layout.making_bytes, transforms=True) for group in groups
-        ]
-        return self._submit(finish_mesh, job, parts)
-
-    def _field_of_pieces(self, job: Job, layout: Layout, rank: int) -> Future:
-        # Mesh after mesh and block after block, and sums before further pieces: what waits to be added
+    def field_task(self) -> Task:
+        # Mesh after mesh and block after block, and sums before further batches: what waits to be added
         # up waits in memory.
-        first = -2 * rank * (self.blocks + 1)
-        cut = self._submit(cut_mesh, job, layout.parts, claim=layout.making_bytes, priority=first)
-        claim = layout.task_bytes
-        parts = []
-        for number, block in enumerate(block for group in layout.groups for block in group):
-            later = first - 2 * (number + 1)
-            pieces = [
-                self._submit(transform_piece, job, cut, part, block, claim=claim, transforms=True, priority=later)
-                for part in range(layout.parts)
-            ]
-            total = self._sum(pieces, claim, later + 1)
-            parts.append(self._submit(store_block, job, cut, total, block, claim=claim, priority=later + 1))
-        return self._submit(finish_mesh, job, parts, priority=first)
+        blocks = [block for group in self.sizes.block_groups for block in group]
+        first = -2 * self.rank * (len(blocks) + 1)
+        split = Task(split_mesh, (self.job, self.sizes.batches), self.sizes.loading_bytes, priority=first)
+        stored = []
+        for number, block in enumerate(blocks, 1):
+            priority = first - 2 * number
+            sums = [self._transform(split, batch, block, priority) for batch in range(self.sizes.batches)]
+            total = self._sum(sums, priority + 1)
+            arguments = self.job, split, total, block
+            stored.append(Task(store_block, arguments, self.sizes.batch_bytes, priority=priority + 1))
+        return Task(finish_mesh, (self.job, stored), priority=first, row=self.job.index)
 
-    def _sum(self, partials: Sequence[Future], claim: float, priority: int) -> Future:
+    def _transform(self, split: Task, batch: int, block: object, priority: int) -> Task:
+        needs_gpu = self.job.settings.backend == "gpu"
+        return Task(transform_batch, (self.job, split, batch, block), self.sizes.batch_bytes, needs_gpu, priority)
+
+    def _sum(self, sums: Sequence[Task], priority: int) -> Task:
         """Add in pairs, pairs of pairs and so on: no task waits for more than two others."""
-        level = list(partials)
-        while len(level) > 1:
-            pairs = [level[k : k + 2] for k in range(0, len(level), 2)]
-            level = [
-                self._submit(add_partials, *pair, claim=claim, priority=priority) if len(pair) > 1 else pair[0]
+        if len(sums) == 1:
+            return sums[0]
+        pairs = [tuple(sums[k : k + 2]) for k in range(0, len(sums), 2)]
+        return self._sum(
+            [
+                Task(add_sums, pair, self.sizes.batch_bytes, priority=priority) if len(pair) > 1 else pair[0]
                 for pair in pairs
-            ]
-        return level[0]
-
-    def _submit(
-        self,
-        task: Callable[..., Any],
-        *arguments: Any,
-        claim: float = 0.0,
-        transforms: bool = False,
-        priority: int = 0,
-    ) -> Future:
-        resources = {}
-        if self.claims_memory and claim:
-            resources[MEMORY] = claim
-        if self.claims_gpu and transforms:
-            resources[GPU] = 1.0
-        return self.client.submit(task, *arguments, pure=False, priority=priority, resources=resources or None)
+            ],
+            priority,
+        )

@@ -1,7 +1,7 @@
-"""A huge mesh as many tasks: cut once into pieces, transformed piece by piece, added up by a tree.
+"""A huge mesh as many tasks: split once into batches of triangles, transformed by batches, added up by a tree.
 
-The pieces lie in the store's scratch space while they are needed, so that each task reads its own and
-nothing hangs on the worker that cut the mesh.
+The batches lie in the store's scratch space while they are needed, so that each task reads its own and
+nothing depends on the worker that split the mesh.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.cluster.worker_plugin import backend_of
-from sobolev_batch.batch.fields.tasks import Job, Part, facts_of, load_surface, reason_of, settings_of
+from sobolev_batch.batch.cluster.worker_plugin import worker_backend
+from sobolev_batch.batch.fields.tasks import Job, StoredBlocks, facts_of
 from sobolev_batch.batch.store.records import Facts
 from sobolev_batch.errors import MeshError, StoreError
 from sobolev_batch.spectral.errors.probe import Draws, Probe, measure
@@ -32,23 +32,23 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 
 
 @dataclass(frozen=True)
-class Cut:
-    """A mesh that was cut: everything about it but its triangles.
+class SplitMesh:
+    """A mesh that was split into batches: all of it but the triangles.
 
     Attributes:
-        token: tells its pieces from those of any other cut.
-        there: the numbers of the pieces that have triangles with an area.
-        settings: of the transform of every piece.
-        draws: the frequencies at which the field is probed.
-        facts: of the whole mesh.
-        quality: likewise, with an empty probe; None where the cut failed.
-        seconds: spent.
-        error: why it failed; empty otherwise.
+        token: Mark of its batches, different from that of any other split.
+        batches: Numbers of the batches that have triangles with an area.
+        transform: Settings of the transform of every batch.
+        draws: Frequencies at which the field is probed, drawn once for all batches and blocks.
+        facts: Facts of the whole mesh.
+        quality: Quality of the whole mesh with an empty probe; None where the split failed.
+        seconds: Time spent.
+        error: Reason why it failed; empty otherwise.
     """
 
     token: str = ""
-    there: frozenset[int] = frozenset()
-    settings: TransformSettings | None = None
+    batches: frozenset[int] = frozenset()
+    transform: TransformSettings | None = None
     draws: Draws | None = None
     facts: Facts = field(default_factory=Facts)
     quality: Quality | None = None
@@ -57,16 +57,16 @@ class Cut:
 
 
 @dataclass(frozen=True, eq=False)
-class Partial:
-    """What some pieces add to one block of a field.
+class BlockSum:
+    """The sum of the transforms of some batches on one block of a field.
 
     Attributes:
         values: complex (block.shape); None where they add nothing.
-        exact: complex128, the exact transform of the pieces at the block's draws, or 0.
-        points: of the quadrature.
-        backends: that computed it.
-        seconds: spent.
-        error: why it failed; empty otherwise.
+        exact: complex128, exact transform of the batches at the draws in the block, or 0.
+        points: Number of quadrature points.
+        backends: Backends that computed it.
+        seconds: Time spent.
+        error: Reason why it failed; empty otherwise.
     """
 
     values: Complexes | None = None
@@ -77,58 +77,59 @@ class Partial:
     error: str = ""
 
     def __sizeof__(self) -> int:
-        # Dask asks, to know what its workers hold.
+        # Dask asks, to know the memory of its workers.
         return 0 if self.values is None else self.values.nbytes
 
 
-def cut_mesh(job: Job, count: int) -> Cut:
-    """Make a mesh, describe it, and store it as at most ``count`` pieces of equally many triangles."""
+def split_mesh(job: Job, count: int) -> SplitMesh:
+    """Load a mesh, describe it, and store it as at most ``count`` batches of equally many triangles."""
     started = time.perf_counter()
+    lattice = job.settings.lattice
     try:
-        mesh = load_surface(job)
+        mesh = job.load()
         if not isinstance(mesh, Mesh):
-            raise MeshError("a closed-form surface cannot be cut into pieces")
-        require_inside(mesh, job.lattice)
-        settings = settings_of(job, mesh)
-        draws = draws_for([mesh], job.lattice, job.orders, settings.lowest_degree(mesh, job.lattice))
+            raise MeshError("a closed-form surface cannot be split into batches of triangles")
+        require_inside(mesh, lattice)
+        transform = job.transform_settings(mesh)
+        draws = draws_for([mesh], lattice, job.settings.orders, transform.lowest_degree(mesh, lattice))
         facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe())
-        size = math.ceil(len(mesh.triangles) / count)
-        token, there = uuid4().hex, set()
-        for number, piece in mesh.batches(size):
-            job.store.scratch.write(job.row, token, number, piece)
-            there.add(number)
+        token, batches = uuid4().hex, set()
+        for number, batch in mesh.batches(math.ceil(len(mesh.triangles) / count)):
+            job.store.scratch.write(job.index, token, number, batch)
+            batches.add(number)
     except StoreError:
         raise
     except Exception as error:
-        return Cut(seconds=time.perf_counter() - started, error=reason_of(job, error))
-    return Cut(token, frozenset(there), settings, draws, facts, quality, time.perf_counter() - started)
+        return SplitMesh(seconds=time.perf_counter() - started, error=job.failure_reason(error))
+    return SplitMesh(token, frozenset(batches), transform, draws, facts, quality, time.perf_counter() - started)
 
 
-def transform_piece(job: Job, cut: Cut, number: int, block: Block) -> Partial:
-    """Transform one piece onto one block of the lattice."""
-    if cut.error or number not in cut.there or cut.settings is None or cut.draws is None:
-        return Partial()
+def transform_batch(job: Job, split: SplitMesh, number: int, block: Block) -> BlockSum:
+    """Transform one batch onto one block of the lattice."""
+    if split.error or number not in split.batches or split.transform is None or split.draws is None:
+        return BlockSum()
     started = time.perf_counter()
+    lattice = job.settings.lattice
+    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
     try:
-        piece = job.store.scratch.read(job.row, cut.token, number)
-        execution = Execution(backend_of(job.backend), allowed_bytes=job.memory)
-        made = transform_block(piece, job.lattice, block, cut.settings, execution)
-        exact = exact_transform(piece, cut.draws.within(block).frequencies)
+        batch = job.store.scratch.read(job.index, split.token, number)
+        result = transform_block(batch, lattice, block, split.transform, execution)
+        exact = exact_transform(batch, split.draws.within(block).frequencies)
     except StoreError:
         raise
     except Exception as error:
-        return Partial(seconds=time.perf_counter() - started, error=reason_of(job, error))
-    return Partial(made.values, exact, made.points, (made.backend,), time.perf_counter() - started)
+        return BlockSum(seconds=time.perf_counter() - started, error=job.failure_reason(error))
+    return BlockSum(result.values, exact, result.points, (result.backend,), time.perf_counter() - started)
 
 
-def add_partials(first: Partial, second: Partial) -> Partial:
-    """The sum of two partial blocks."""
+def add_sums(first: BlockSum, second: BlockSum) -> BlockSum:
+    """Add two sums for the same block."""
     started = time.perf_counter()
     if first.values is None or second.values is None:
         values = second.values if first.values is None else first.values
     else:
         values = first.values + second.values
-    return Partial(
+    return BlockSum(
         values,
         first.exact + second.exact,
         first.points + second.points,
@@ -138,21 +139,22 @@ def add_partials(first: Partial, second: Partial) -> Partial:
     )
 
 
-def store_block(job: Job, cut: Cut, total: Partial, block: Block) -> Part:
-    """Store a block that all pieces were added to, and probe it."""
-    error = cut.error or total.error
-    # The cut counts once, with the first block.
-    seconds = total.seconds + (cut.seconds if block.start == job.lattice.half.start else 0.0)
-    if error or cut.draws is None or cut.quality is None or total.values is None:
-        return Part(Facts(), seconds, error or "no part of the mesh has an area")
+def store_block(job: Job, split: SplitMesh, total: BlockSum, block: Block) -> StoredBlocks:
+    """Store a block that the transforms of all batches were added to, and probe it."""
+    error = split.error or total.error
+    lattice = job.settings.lattice
+    # The split counts once, with the first block.
+    seconds = total.seconds + (split.seconds if block.start == lattice.half.start else 0.0)
+    if error or split.draws is None or split.quality is None or total.values is None:
+        return StoredBlocks(Facts(), seconds, error or "no triangle of the mesh has an area")
     started = time.perf_counter()
-    checksum = job.store.write_field(job.row, job.lattice.place(block), total.values)
-    draws = cut.draws.within(block)
+    checksum = job.store.write_field(job.index, lattice.place(block), total.values)
+    draws = split.draws.within(block)
     probe = measure(draws, total.values[draws.places(block)], np.asarray(total.exact))
-    return Part(
-        replace(cut.facts, points=total.points),
+    return StoredBlocks(
+        replace(split.facts, points=total.points),
         seconds + time.perf_counter() - started,
-        quality=replace(cut.quality, probe=probe),
+        quality=replace(split.quality, probe=probe),
         checksums=(checksum,),
         backends=total.backends,
     )

@@ -1,4 +1,4 @@
-"""How the field of one row becomes tasks: parts of its mesh, blocks of the lattice, and their memory."""
+"""The tasks of one row: batches of its triangles, blocks of the lattice, and their memory."""
 
 from __future__ import annotations
 
@@ -17,116 +17,114 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
-# Meshes above one and a half times this are cut into parts of about this many triangles, whatever the
+# Meshes above one and a half times this are split into batches of about this many triangles, whatever the
 # cluster, so that the same sums are formed on any; smaller ones only where memory is short. The
-# transform of such a part takes seconds, its FFT a small part of them.
-_PART_TRIANGLES = 1 << 21
+# transform of such a batch takes seconds, its FFT a small fraction of them.
+_BATCH_TRIANGLES = 1 << 21
 _FEWEST_TRIANGLES = 1 << 16
 # Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
 MESH_BYTES = 100.0
-# Less makes a transform's batches and parts of a block so small that it becomes slow.
-LEAST_ROOM_BYTES = 256e6
-# Of the choice of rules, for each triangle.
+# With less, the batches of points of a transform become so small that it is slow.
+LEAST_TRANSFORM_BYTES = 256e6
+# For the choice of quadrature rules, for each triangle.
 _CHOICE_BYTES = 100.0
 
 
 @dataclass(frozen=True)
-class Layout:
+class TaskSizes:
     """The tasks of one row.
 
     Attributes:
-        parts: of the mesh, each transformed in a task of its own; 1 leaves it whole.
-        groups: of blocks, those of one group in one task.
-        transform_bytes: what one transform may take, besides its mesh and its block.
-        making_bytes: what the task takes that makes the mesh.
-        task_bytes: what any other takes at most; the same where the mesh is whole.
+        batches: Number of batches of triangles, each transformed in a task of its own; 1 leaves the mesh whole.
+        block_groups: Groups of blocks. The blocks of a group are computed in one task.
+        allowed_bytes: Memory that one transform may take besides its mesh and its block.
+        loading_bytes: Projected memory of the task that loads the mesh.
+        batch_bytes: Projected memory of any other task; the same where the mesh is whole.
     """
 
-    parts: int
-    groups: tuple[tuple[Block, ...], ...]
-    transform_bytes: float
-    making_bytes: float
-    task_bytes: float
+    batches: int
+    block_groups: tuple[tuple[Block, ...], ...]
+    allowed_bytes: float
+    loading_bytes: float
+    batch_bytes: float
 
     @property
-    def largest_bytes(self) -> float:
-        """What the most demanding task takes."""
-        return max(self.making_bytes, self.task_bytes)
+    def projected_bytes(self) -> float:
+        """Memory of the largest task."""
+        return max(self.loading_bytes, self.batch_bytes)
 
     @property
     def task_count(self) -> int:
-        """How many tasks it makes."""
-        if self.parts == 1:
-            return len(self.groups) + (len(self.groups) > 1)
-        # Parts, their sums in pairs, and the storing of each block; the cut and the record.
-        return 2 * self.parts * sum(map(len, self.groups)) + 2
+        """Number of tasks."""
+        if self.batches == 1:
+            return len(self.block_groups) + (len(self.block_groups) > 1)
+        # Batches, their sums in pairs, and the storing of each block; the split and the record.
+        return 2 * self.batches * sum(map(len, self.block_groups)) + 2
 
 
-def lay_out_rows(plan: Plan, rows: Sequence[Row], crew: Workers) -> tuple[dict[str, Layout], dict[str, str]]:
-    """The layouts of rows by their labels, and for each that fits into no worker the reason.
+def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
+    """Return the tasks of rows by their labels, and the reason for each row that fits into no worker.
 
     Raises:
-        ClusterError: the lattice itself fits into no worker, whatever the mesh.
+        ClusterError: The lattice itself fits into no worker, whatever the mesh.
     """
-    lay_out(plan.blocks, plan.transform, ExpectedSize(), crew, len(rows))
-    layouts, refused = {}, {}
+    size_tasks(plan.blocks, plan.transform, ExpectedSize(), workers, len(rows))
+    sizes, refused = {}, {}
     for row in rows:
         try:
-            layouts[row.label] = lay_out(plan.blocks, plan.transform, row.member.expected_size(), crew, len(rows))
+            sizes[row.label] = size_tasks(plan.blocks, plan.transform, row.member.expected_size(), workers, len(rows))
         except ClusterError as error:
             refused[row.label] = f"the mesh is too large: {error}"
-    return layouts, refused
+    return sizes, refused
 
 
-def lay_out(
-    blocks: Sequence[Block], transform: TransformSettings, size: ExpectedSize, crew: Workers, rows: int
-) -> Layout:
+def size_tasks(
+    blocks: Sequence[Block], transform: TransformSettings, size: ExpectedSize, workers: Workers, rows: int
+) -> TaskSizes:
     """Fit a row's tasks into the memory of workers.
 
     Every task is kept within what a worker has for each of its threads, as long as that leaves a
-    transform enough to work in; a task that needs more runs beside fewer others.
+    transform enough to work in; a task that takes more runs beside fewer others.
 
     Args:
-        blocks: of the lattice, all but the last equal.
-        transform: settings of the fields.
-        size: of the row's surface.
-        crew: the workers.
-        rows: how many rows are to be computed.
+        blocks: Blocks of the lattice, all but the last of equal size.
+        transform: Settings of the fields.
+        size: Size of the row's surface.
+        workers: Workers of the cluster.
+        rows: Number of rows that are to be computed.
 
     Raises:
-        ClusterError: no worker has the memory that it takes.
+        ClusterError: No worker has the memory.
     """
     block = blocks[0]
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
 
-    def least(triangles: float) -> float:
-        return LEAST_ROOM_BYTES + _CHOICE_BYTES * triangles
+    def transform_bytes(triangles: float) -> float:
+        return LEAST_TRANSFORM_BYTES + _CHOICE_BYTES * triangles
 
-    def fixed(triangles: float) -> float:
-        # The block and what it is added to or compared with.
+    def held_bytes(triangles: float) -> float:
+        # The mesh, the block, and a block that it is added to or compared with.
         return MESH_BYTES * triangles + 2 * block_bytes
 
-    whole = size.triangles <= 1.5 * _PART_TRIANGLES and (
-        fixed(size.triangles) + least(size.triangles) <= crew.largest_bytes
-    )
-    part = size.triangles if whole else _PART_TRIANGLES
-    while not whole and fixed(part) + least(part) > crew.share_bytes and part > _FEWEST_TRIANGLES:
-        part //= 2
-    making = max(size.projected_bytes, MESH_BYTES * size.triangles)
-    needed = max(making, fixed(part) + least(part))
-    if needed > crew.largest_bytes:
-        raise ClusterError(
-            f"it takes about {needed / 1e9:.2g} GB in one task, and no worker has more than "
-            f"{crew.largest_bytes / 1e9:.2g} GB to spare (of its limit it keeps 15 % and 0.3 GB for itself); "
-            "start workers with more memory"
-        )
-    room = max(least(part), crew.share_bytes - fixed(part))
-    # Not all of the room is taken, but a mesh may turn out larger than its file suggested.
-    wanted = projected_bytes(block, transform, triangles=part) - block_bytes
-    task = fixed(part) + min(room, max(wanted, least(part)))
-    parts = 1 if whole else max(1, math.ceil(size.triangles / part))
-    # A task computes as many blocks as leaves two for every thread: each makes the mesh anew.
-    count = len(blocks) if parts > 1 else min(len(blocks), max(1, math.ceil(2 * crew.threads / max(rows, 1))))
+    def least_bytes(triangles: float) -> float:
+        return held_bytes(triangles) + transform_bytes(triangles)
+
+    fits = least_bytes(size.triangles) <= workers.largest_allowed_bytes
+    whole = size.triangles <= 1.5 * _BATCH_TRIANGLES and fits
+    batch = size.triangles if whole else _BATCH_TRIANGLES
+    while not whole and least_bytes(batch) > workers.allowed_bytes_per_task and batch > _FEWEST_TRIANGLES:
+        batch //= 2
+    loading_bytes = max(size.projected_bytes, MESH_BYTES * size.triangles)
+    workers.require_memory(max(loading_bytes, least_bytes(batch)))
+    allowed_bytes = max(transform_bytes(batch), workers.allowed_bytes_per_task - held_bytes(batch))
+    # The transform seldom takes all that it may, but a mesh may turn out larger than its file suggested.
+    wanted_bytes = projected_bytes(block, transform, triangles=batch) - block_bytes
+    batch_bytes = held_bytes(batch) + min(allowed_bytes, max(wanted_bytes, transform_bytes(batch)))
+    batches = 1 if whole else max(1, math.ceil(size.triangles / batch))
+    # A task computes as many blocks as leaves two tasks for every thread: each task loads the mesh anew.
+    count = len(blocks) if batches > 1 else min(len(blocks), max(1, math.ceil(2 * workers.threads / max(rows, 1))))
     ends = [len(blocks) * k // count for k in range(count + 1)]
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
-    return Layout(parts, groups, room, max(making, task) if parts == 1 else making, task)
+    if batches == 1:
+        loading_bytes = max(loading_bytes, batch_bytes)
+    return TaskSizes(batches, groups, allowed_bytes, loading_bytes, batch_bytes)

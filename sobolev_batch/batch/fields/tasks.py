@@ -1,4 +1,4 @@
-"""What runs on a worker: a mesh's source becomes its stored Fourier field and a completion record.
+"""The tasks of a field: they run on a worker, and turn a mesh's source into stored values and a completion record.
 
 Each task is a pure function of its arguments that writes whole chunks, so running it again, or
 twice at once, leaves the same store.
@@ -10,13 +10,15 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 from distributed import get_worker
 
-from sobolev_batch.batch.cluster.worker_plugin import backend_of
+from sobolev_batch.batch.cluster.worker_plugin import worker_backend
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
@@ -32,44 +34,78 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.registry import Member
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Job:
-    """Everything that the field of one row depends on, where it goes, and what it may use.
+class FieldSettings:
+    """The settings that all fields of a plan share; see `Plan`."""
 
-    Attributes:
-        store, row: where it goes.
-        label: of the row, for people.
-        key: of the row.
-        member, similarity: the surface.
-        lattice, transform, orders, aim: the field; see `Plan`.
-        fingerprint: of the member when the study was planned; empty if that is not to be checked.
-        memory: what one transform may take besides its mesh and its block, in bytes.
-        backend: "auto", "cpu" or "gpu".
-    """
-
-    store: Store
-    row: int
-    label: str
-    key: str
-    member: Member
-    similarity: Similarity
     lattice: Lattice
     transform: TransformSettings
     orders: tuple[float, ...]
-    aim: DistanceTarget | None = None
-    memory: float | None = None
+    similarity: Similarity
     backend: Backends = "auto"
-    fingerprint: str = ""
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Return the settings of a plan."""
+        return cls(plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend)
 
 
 @dataclass(frozen=True)
-class Part:
-    """What one task did for a mesh; ``error`` is empty unless it failed."""
+class Job:
+    """The field of one row, and where it is stored.
+
+    Attributes:
+        store: Store of the field.
+        index: Index of the row in the store.
+        row: Row of the plan.
+        settings: Settings of all fields.
+        aim: Accuracy that the field is computed for, if the study asks for one.
+        allowed_bytes: Memory that one transform may take besides its mesh and its block.
+    """
+
+    store: Store
+    index: int
+    row: Row
+    settings: FieldSettings
+    aim: DistanceTarget | None = None
+    allowed_bytes: float | None = None
+
+    def load(self) -> Surface:
+        """Load the surface, in the study's unit.
+
+        Raises:
+            MeshError: It cannot be loaded, or is not the one that the study was planned with: its field would be
+                recorded under the key of another.
+        """
+        surface = self.settings.similarity.apply(self.row.member.load())
+        if self.row.fingerprint and self.row.member.fingerprint_digest() != self.row.fingerprint:
+            raise MeshError("a file of it was changed while the study was going on; run the study again")
+        return surface
+
+    def transform_settings(self, surface: Surface) -> TransformSettings:
+        """Return the settings of a field that is computed block by block, from its a priori error."""
+        if self.aim is None or isinstance(surface, Sphere):
+            return self.settings.transform
+        return choose_settings(surface, self.settings.lattice, self.aim.error_target(surface), self.settings.transform)
+
+    def failure_reason(self, error: Exception) -> str:
+        """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
+        if isinstance(error, LatticeError):
+            advice = "" if self.aim is None else "; it was chosen for surfaces that reach less far: name another store"
+            return f"{error}{advice}"
+        if isinstance(error, InputError):
+            return str(error)
+        _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
+        return " ".join(str(error).split()) or type(error).__name__
+
+
+@dataclass(frozen=True)
+class StoredBlocks:
+    """The outcome of a task that stored blocks of a field; ``error`` is empty unless it failed."""
 
     facts: Facts
     seconds: float
@@ -82,115 +118,93 @@ class Part:
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     """Compute and store the whole field of a mesh, then its completion record, unless that is there."""
     # Dask has a task done again whose worker was lost with the result.
-    there = job.store.read_record(job.row)
-    if there is not None and there.completes(job.key):
-        return there
+    record = job.store.read_record(job.index)
+    if record is not None and record.completes(job.row.key):
+        return record
     return finish_mesh(job, [compute_blocks(job, blocks)])
 
 
-def compute_blocks(job: Job, blocks: Sequence[Block]) -> Part:
+def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks:
     """Compute and store some blocks of a mesh's field.
 
-    A mesh that cannot be made or transformed does not raise: the reason is part of the outcome, so
+    A mesh that cannot be loaded or transformed does not raise: the reason is part of the outcome, so
     that one bad mesh stops nothing else.
 
     Raises:
-        StoreError: the store cannot be written, which is not the mesh's fault.
+        StoreError: The store cannot be written, which is not the mesh's fault.
     """
     started = time.perf_counter()
     try:
-        surface = load_surface(job)
-        part = _compute(job, surface, blocks)
-        return replace(part, facts=facts_of(surface, part.facts.points), seconds=time.perf_counter() - started)
+        surface = job.load()
+        is_whole = tuple(blocks) == (job.settings.lattice.half,)
+        stored = _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
+        facts = facts_of(surface, stored.facts.points)
+        return replace(stored, facts=facts, seconds=time.perf_counter() - started)
     except StoreError:
         raise
     except Exception as error:
-        return Part(Facts(), time.perf_counter() - started, reason_of(job, error))
+        return StoredBlocks(Facts(), time.perf_counter() - started, job.failure_reason(error))
 
 
-def load_surface(job: Job) -> Surface:
-    """The surface of a job, in the study's unit.
-
-    Raises:
-        MeshError: it cannot be made, or is not the one that the study was planned with: its field would be
-            recorded under the key of another.
-    """
-    surface = job.similarity.apply(job.member.load())
-    if job.fingerprint and job.member.fingerprint_digest() != job.fingerprint:
-        raise MeshError("a file of it was changed while the study was going on; run the study again")
-    return surface
-
-
-def reason_of(job: Job, error: Exception) -> str:
-    """Why a mesh failed, in one line; what is not the fault of its input is logged with its traceback."""
-    if isinstance(error, LatticeError):
-        advice = "" if job.aim is None else "; it was chosen for surfaces that reach less far: name another store"
-        return f"{error}{advice}"
-    if isinstance(error, InputError):
-        return str(error)
-    _log.error("%s failed for a reason that is not its mesh's", job.label, exc_info=error)
-    return " ".join(str(error).split()) or type(error).__name__
+def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
+    """Compute and store a field of one block; its facts have the number of points alone."""
+    lattice, transform = job.settings.lattice, job.settings.transform
+    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
+    if job.aim is not None and not isinstance(surface, Sphere):
+        goal = job.aim.error_target(surface)
+        field = field_for(surface, lattice, goal, transform, execution)
+    else:
+        field = compute_field(surface, lattice, transform, job.settings.orders, execution)
+    checksum = job.store.write_field(job.index, lattice.place(lattice.half), field.values)
+    return StoredBlocks(Facts(points=field.points), 0.0, "", field.quality, (checksum,), (field.backend,))
 
 
-def settings_of(job: Job, surface: Surface) -> TransformSettings:
-    """The settings of a field that is computed block by block: as forecast, not measured and mended."""
-    if job.aim is None or isinstance(surface, Sphere):
-        return job.transform
-    return choose_settings(surface, job.lattice, job.aim.error_target(surface), job.transform)
-
-
-def _compute(job: Job, surface: Surface, blocks: Sequence[Block]) -> Part:
-    """Compute and store some blocks; what there is to tell of the surface itself is left out."""
-    execution = Execution(backend_of(job.backend), allowed_bytes=job.memory)
-    if tuple(blocks) == (job.lattice.half,):
-        if job.aim is not None and not isinstance(surface, Sphere):
-            goal = job.aim.error_target(surface)
-            field = field_for(surface, job.lattice, goal, job.transform, execution)
-        else:
-            field = compute_field(surface, job.lattice, job.transform, job.orders, execution)
-        checksum = job.store.write_field(job.row, job.lattice.place(job.lattice.half), field.values)
-        return Part(Facts(points=field.points), 0.0, "", field.quality, (checksum,), (field.backend,))
-    settings = settings_of(job, surface)
-    plan = settings.plan(surface, job.lattice)
-    draws = draws_for([surface], job.lattice, job.orders, plan.lowest_degree)
+def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
+    """Compute and store some of several blocks; the facts have the number of points alone."""
+    lattice, orders = job.settings.lattice, job.settings.orders
+    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
+    transform = job.transform_settings(surface)
+    plan = transform.plan(surface, lattice)
+    draws = draws_for([surface], lattice, orders, plan.lowest_degree)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
-        made = transform_block(surface, job.lattice, block, settings, execution, plan)
-        checksums.append(job.store.write_field(job.row, job.lattice.place(block), made.values))
-        probes.append(probe_block(surface, job.lattice, settings, job.orders, block, made.values, draws))
-        backends.append(made.backend)
-        points = made.points
+        result = transform_block(surface, lattice, block, transform, execution, plan)
+        checksums.append(job.store.write_field(job.index, lattice.place(block), result.values))
+        probes.append(probe_block(surface, lattice, transform, orders, block, result.values, draws))
+        backends.append(result.backend)
+        points = result.points
     quality = Quality.of_surface(surface, join(probes))
-    return Part(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
+    return StoredBlocks(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
 
 
-def finish_mesh(job: Job, parts: Sequence[Part]) -> Record:
+def finish_mesh(job: Job, stored: Sequence[StoredBlocks]) -> Record:
     """Write the completion record of a mesh whose blocks are all stored, or that failed."""
-    errors = [part.error for part in parts if part.error]
-    qualities = [part.quality for part in parts if part.quality is not None]
+    errors = [blocks.error for blocks in stored if blocks.error]
+    backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
     record = Record(
-        key=job.key,
+        key=job.row.key,
         status="failed" if errors else "complete",
         reason=errors[0] if errors else "",
-        facts=Facts() if errors else parts[0].facts,
-        quality="" if errors else _whole(qualities).to_json(),
-        checksums=() if errors else tuple(checksum for part in parts for checksum in part.checksums),
-        seconds=sum(part.seconds for part in parts),
+        facts=Facts() if errors else stored[0].facts,
+        quality="" if errors else _joined_quality(stored).to_json(),
+        checksums=() if errors else tuple(checksum for blocks in stored for checksum in blocks.checksums),
+        seconds=sum(blocks.seconds for blocks in stored),
         worker=_worker_address(),
-        backend=", ".join(dict.fromkeys(backend for part in parts for backend in part.backends)),
+        backend=", ".join(backends),
         finished=utc_now(),
     )
-    job.store.write_record(job.row, record)
-    _log.info("%s: %s in %.2f s by %s", job.label, record.status, record.seconds, record.backend)
+    job.store.write_record(job.index, record)
+    _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
     return record
 
 
-def _whole(qualities: Sequence[Quality]) -> Quality:
+def _joined_quality(stored: Sequence[StoredBlocks]) -> Quality:
+    qualities = [blocks.quality for blocks in stored if blocks.quality is not None]
     return replace(qualities[0], probe=join([quality.probe for quality in qualities]))
 
 
 def facts_of(surface: Surface, points: int) -> Facts:
-    """What is recorded of a surface and its points."""
+    """Return what is recorded of a surface and its quadrature points."""
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area, points=points)
     (mean_length, longest), counts = surface.edge_length_range, surface.counts

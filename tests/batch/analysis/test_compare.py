@@ -20,15 +20,24 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.analysis.compare import Comparer
-from sobolev_batch.batch.analysis.compare_tasks import Comparison, Stored, compare_by_proximity, compare_by_witness
+from sobolev_batch.batch.analysis.compare_tasks import (
+    Comparison,
+    StoredMesh,
+    WitnessSettings,
+    compare_by_proximity,
+    compare_by_witness,
+)
+from sobolev_batch.batch.analysis.kinds import ProximityKind, WitnessKind
 from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.execution import Cluster
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.run import Summary
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, ComparisonRecords, Kind
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, ComparisonRecords
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.cli import cli, studies
 from sobolev_batch.results.status import Status
 from tests.support.stores import assert_same_fields, assert_same_tables
@@ -194,8 +203,8 @@ def flip(path: Path) -> None:
     ("key", "flipped", "words"),
     [
         ("witness/witness/c/1/0/0", True, "its witness function is damaged"),
-        ("records/witness/c/2", True, "the note of its witness is damaged"),
-        ("records/proximity/c/2", True, "the note of its proximity is damaged"),
+        ("records/witness/c/2", True, "the record of its witness is damaged"),
+        ("records/proximity/c/2", True, "the record of its proximity is damaged"),
     ],
 )
 def test_damage_is_named_and_repaired(
@@ -235,6 +244,12 @@ def test_a_removal_that_was_cut_short(gone: str, store: Path, client: Client) ->
     assert_right(store, asking())
 
 
+def forbid_the_first(patched: pytest.MonkeyPatch) -> None:
+    """Make comparisons of the first mesh too large for any worker."""
+    for kind in (WitnessKind, ProximityKind):
+        patched.setattr(kind, "projected_bytes", lambda self, i: 1e15 if i == 0 else 1.0)
+
+
 def test_another_member_becomes_the_reference(store_path: Path, client: Client) -> None:
     """Whose own note, of a failure even, speaks for nothing any more."""
 
@@ -242,7 +257,7 @@ def test_another_member_becomes_the_reference(store_path: Path, client: Client) 
         return asking(reference={"source": "family", "family": "ico", "member": member}, scaling={"mode": "none"})
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Comparer, "_needed_bytes", lambda self, kind, i: 1e15 if i == 0 else 1.0)
+        forbid_the_first(patched)
         assert [*sb.run(study("3"), store_path, client).not_compared] == ["ico/0"]
     for member in ("2", "0", "3"):
         sb.run(study(member), store_path, client)
@@ -264,25 +279,19 @@ def test_notes_of_what_is_not_asked_for_any_more_go(store_path: Path, client: Cl
     assert not (store_path / "proximity").exists()
 
 
-def test_a_task_that_outlives_its_run_is_not_believed(
-    store: Path, client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_that_outlives_its_run_is_not_believed(store: Path, client: Client) -> None:
     """It writes values of other orders into the array of the next run, and a note of its own."""
     other, straggler = (
         asking(witness={"orders": [-3.0, -5.0]}),
         ComparisonRecord("of another run", "complete", checksum=1),
     )
-    make = Comparer._make
 
-    def make_and_spoil(self: Comparer, kind: Kind, *arguments: Any) -> None:
-        make(self, kind, *arguments)
-        if kind == "witness":
-            ComparisonRecords(self.store, kind).write(1, straggler)
+    def spoil(progress: Progress) -> None:
+        if progress.stage == "comparisons" and progress.done == progress.total:
+            ComparisonRecords(Store.open(store), "witness").write(1, straggler)
 
-    monkeypatch.setattr(Comparer, "_make", make_and_spoil)
-    sb.run(other, store, client)
+    sb.run(other, store, client, on_progress=spoil)
     assert np.isnan(variable(sb.open_store(store), "witness", "witness").sel(mesh="ico/1")).all()
-    monkeypatch.undo()
     sb.run(other, store, client)
     assert_right(store, other)
 
@@ -360,14 +369,14 @@ def test_blocks_and_parts_of_the_lattice_add_up(
     assert len(plan.blocks) > 2
     assert_right(store_path, study)
     stored = [
-        Stored(i, row.label, row.member, record.facts.digest, record.checksums)
+        StoredMesh(i, row.label, row.member, record.facts.digest, record.checksums)
         for i, (row, record) in enumerate(zip(plan.rows, here.records(), strict=True))
         if record is not None
     ]
     comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity)
     # Here and not on a worker, so that each block is evaluated in parts.
     monkeypatch.setattr("sobolev_batch.spectral.metrics.witness.BLOCK_SAMPLES", 300)
-    note = compare_by_witness(comparison, plan.lattice, plan.blocks, ORDERS, 1e8)
+    note = compare_by_witness(comparison, WitnessSettings(plan.lattice, plan.blocks, ORDERS, 1e8))
     assert note.status == "complete", note.reason
     assert_right(store_path, study)
 
@@ -465,10 +474,10 @@ def test_nothing_is_left_of_a_mesh_whose_comparison_fails_later(
     # Another mesh, of as many vertices.
     write_sphere(files / "a.ply", 2, radius=0.7)
     with monkeypatch.context() as patched:
-        patched.setattr(Comparer, "_needed_bytes", lambda self, kind, i: 1e15 if i == 0 else 1.0)
+        forbid_the_first(patched)
         summary = sb.run(of_files(files), place, client)
     assert [*summary.not_compared] == ["f/a"]
-    assert summary.not_compared["f/a"].startswith("no witness: it takes about 1e+06 GB")
+    assert summary.not_compared["f/a"].startswith("no witness: it takes about 1.0PB")
     assert "; no proximity: it takes" in summary.not_compared["f/a"]
     tree = sb.open_store(place)
     assert np.isnan(variable(tree, "witness", "witness").sel(mesh="f/a")).all()
@@ -511,11 +520,11 @@ def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
     plan, records = make_plan(study), Store(store).records()
     here = Store.open(store)
     stored = [
-        Stored(i, row.label, row.member, record.facts.digest, record.checksums)
+        StoredMesh(i, row.label, row.member, record.facts.digest, record.checksums)
         for i, (row, record) in enumerate(zip(plan.rows, records, strict=True))
         if record is not None
     ]
-    changed = Stored(1, "ico/1", plan.rows[2].member, stored[1].digest, stored[1].checksums)
+    changed = StoredMesh(1, "ico/1", plan.rows[2].member, stored[1].digest, stored[1].checksums)
     note = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity), 100)
     assert note.status == "failed"
     assert "is not the mesh whose field is stored" in note.reason
@@ -542,7 +551,7 @@ def test_too_little_memory_is_foreseen(store: Path, client: Client) -> None:
     study = asking(witness={"orders": [-2.0]})
     here, plan = Store.open(store), make_plan(study)
     small = Workers((WorkerInfo("tcp://small", 1, 2e8, "cpu", ""),))
-    reasons = Comparer.of(here, plan, plan.rows, here.records()).carry_out(client, small, lambda progress: None)
+    reasons = Comparer(Workspace.of(here, plan)).run(Cluster(client, small))
     assert sorted(reasons) == ["ico/0", "ico/1", "ico/2", "ico/3"]
     assert reasons["ico/0"].startswith("no witness: it takes about")
     assert "start workers with more memory" in reasons["ico/0"]

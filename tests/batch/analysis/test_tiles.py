@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Sphere, Study, fourier_transform, proportion
-from sobolev_batch.batch.analysis import tiles as reduction
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
@@ -35,9 +35,10 @@ def fields() -> NDArray[np.complex128]:
 
 @pytest.fixture
 def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytest.MonkeyPatch) -> Reducer:
-    """Of fields in several chunks, with room for three rows, one that meets them, and one that is read."""
+    """Of fields in several chunks, of which a task holds five: three rows, one other, and one that is read."""
+    monkeypatch.setattr(planning, "_LARGEST_CHUNK_BYTES", 16_000)
     family = {"name": "ico", "source": "icosphere", "levels": list(range(ROWS - 1))}
-    study = replace(Study.from_table(small_table(family=[family])), largest_chunk_bytes=16_000)
+    study = Study.from_table(small_table(family=[family]))
     plan = make_plan(study)
     assert len(plan.blocks) > 2
     store = prepare_store(store_path, plan)
@@ -46,9 +47,18 @@ def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytes
         place = plan.lattice.place(block)
         for row, field in enumerate(fields):
             checksums[row] += (store.write_field(row, place, field[place]),)
-    monkeypatch.setattr(reduction, "_TILE_BYTES", 5 * 16 * plan.blocks[0].size)
-    areas, errors = np.ones(ROWS), np.zeros((2, ROWS))
-    return Reducer(store, plan.lattice, plan.blocks, study.orders, CENTER, areas, errors, np.ones(13), checksums)
+    return Reducer(
+        store=store,
+        lattice=plan.lattice,
+        blocks=plan.blocks,
+        orders=study.orders,
+        center=CENTER,
+        areas=np.ones(ROWS),
+        errors=np.zeros((2, ROWS)),
+        widths=np.ones(13),
+        checksums=checksums,
+        tile_bytes=5 * 16 * plan.blocks[0].size,
+    )
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2, 500])
@@ -62,13 +72,13 @@ def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int)
         shared = set(side) & set(others)
         pairs += [(i, j) for i in side for j in others if i <= j or not {i, j} <= shared]
     assert sorted(pairs) == list(combinations_with_replacement(rows, 2))
-    assert [row for strip in reducer.strips(rows, workers) for row in strip] == rows
+    assert [row for batch in reducer.row_batches(rows, workers) for row in batch] == rows
 
 
-def test_many_workers_get_smaller_tiles(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction, "_TILE_BYTES", 1 << 30)
+def test_many_workers_get_smaller_tiles(reducer: Reducer) -> None:
+    reducer = replace(reducer, tile_bytes=1 << 30)
     rows = range(500)
-    assert [len(strip) for strip in reducer.strips(rows, 2)] == [125] * 4
+    assert [len(batch) for batch in reducer.row_batches(rows, 2)] == [125] * 4
     assert len(list(reducer.tiles(rows, 2))) == 4
     assert len(list(reducer.tiles(rows, 8))) >= 16
 
@@ -91,7 +101,7 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
 def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, others = [0, 2, CENTER], [0, 2, CENTER, 7, 9]
     by_products = reducer.tile(rows, others)
-    monkeypatch.setattr(reduction, "_TILE_BYTES", 3 * 16 * reducer.blocks[0].size)
+    reducer = replace(reducer, tile_bytes=3 * 16 * reducer.blocks[0].size)
     monkeypatch.setattr(Reducer, "_block_sums", None)
     for found, expected in zip(reducer.tile(rows, others), by_products, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
@@ -102,12 +112,11 @@ def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, mon
 def test_tiles_whose_others_are_all_other_rows(
     reducer: Reducer,
     fields: NDArray[np.complex128],
-    monkeypatch: pytest.MonkeyPatch,
     rows: list[int],
     others: list[int],
     fitting: int,
 ) -> None:
-    monkeypatch.setattr(reduction, "_TILE_BYTES", fitting * 16 * reducer.blocks[0].size)
+    reducer = replace(reducer, tile_bytes=fitting * 16 * reducer.blocks[0].size)
     found = reducer.tile(rows, others).values
     lattice = reducer.lattice
     differences = (fields[rows][:, None] - fields[others]).reshape(-1, *lattice.shape)
@@ -118,7 +127,7 @@ def test_tiles_whose_others_are_all_other_rows(
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     norms, to_center, parts = reducer.norms([1, 3, CENTER])
-    weights = reducer.weights.per_shell
+    weights = SobolevWeights(reducer.lattice, reducer.orders).per_shell
     for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
         sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
         assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)

@@ -17,7 +17,7 @@ from distributed import Client
 
 from sobolev_batch import AddressError, ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
-from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.recipes import write_study
 from tests.support.studies import variable
 
@@ -73,13 +73,13 @@ def _die_once(mark: Path) -> int:
 def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
     # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
     with dask_settings.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1) as client:
-        first = client.submit(os.getpid, pure=False).result(timeout=60)
-        assert client.submit(_die_once, tmp_path / "mark").result(timeout=120) != first
+        first = client.submit(os.getpid, pure=False).result(timeout=PATIENCE_SECONDS)
+        assert client.submit(_die_once, tmp_path / "mark").result(timeout=PATIENCE_SECONDS) != first
 
 
 def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
 
 
 def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
         address = scheduler_address(scheduler)
         processes.append(dask("worker", address, *WORKER[2:], *listening))
         with Client(address) as client:
-            client.wait_for_workers(1, timeout=60)
+            client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
         with (
             pytest.raises(AddressError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"),
             remote_client(address),
@@ -186,7 +186,7 @@ def test_every_port_of_a_run_is_on_loopback(script: str, store: str, least: int,
         assert process.stdout is not None
         process.stdout.readline()  # it computes, and waits
         found = listening(psutil.Process(process.pid))
-        errors = process.communicate("\n", timeout=120)[1]
+        errors = process.communicate("\n", timeout=PATIENCE_SECONDS)[1]
     assert process.returncode == 0, errors
     assert {ip for ip, _ in found} <= {"127.0.0.1", "::1"}, found
     assert len(found) >= least, found

@@ -1,18 +1,92 @@
-"""The scheduler dies in the middle of a run: the run ends with an error, and nothing is recorded as failed."""
+"""Tasks and their outcomes, and a scheduler that dies in the middle of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from distributed import Client
 
-from sobolev_batch import ClusterError, Study, run
+from sobolev_batch import ClusterError, DamageError, StoreError, Study, run
+from sobolev_batch.batch.cluster.execution import Cluster, Task, failure_reason
 from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
-from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop
 from tests.support.studies import small_table
+
+
+@pytest.fixture
+def cluster(client: Client) -> Cluster:
+    # It declares memory, which tasks may claim.
+    prepare_workers(client)
+    return Cluster(client, Workers((WorkerInfo("tcp://a", 1, 2e9, "cpu", ""),)))
+
+
+def test_each_task_comes_back_with_its_outcome(cluster: Cluster) -> None:
+    outcomes = {task.row: outcome for task, outcome in cluster.run(Task(divmod, (7, k), row=k) for k in range(3))}
+    assert (outcomes[1], outcomes[2]) == ((7, 0), (3, 1))
+    assert isinstance(outcomes[0], ZeroDivisionError)
+    assert failure_reason(outcomes[0]).startswith("ZeroDivisionError: ")
+    with pytest.raises(ZeroDivisionError):
+        list(cluster.results([Task(divmod, (7, 0))]))
+
+
+def _append(path: Path) -> int:
+    with path.open("a") as file:
+        file.write("called\n")
+    return 3
+
+
+def _total(number: int, others: list[int]) -> int:
+    return number + sum(others)
+
+
+def test_a_task_among_the_arguments_of_others_is_done_once(cluster: Cluster, tmp_path: Path) -> None:
+    first = Task(_append, (tmp_path / "calls",))
+    ((_, total),) = cluster.run([Task(_total, (first, [first, Task(abs, (-4,)), 5]))])
+    assert total == 3 + 3 + 4 + 5
+    assert (tmp_path / "calls").read_text() == "called\n"
+
+
+def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path: Path) -> None:
+    large = [Task(_append, (tmp_path / "calls",), 3e9) for _ in range(5)]
+    outcomes = [outcome for _, outcome in cluster.run([*large, Task(abs, (-4,), 1e6)], 3e9, in_flight=1)]
+    assert outcomes.pop() == 4
+    assert all(isinstance(outcome, ClusterError) for outcome in outcomes)
+    assert failure_reason(outcomes[0]).startswith("it takes about 3.0GB in one task, and no worker has more than 2.0GB")
+    assert len(outcomes) == 5
+    assert not (tmp_path / "calls").exists()
+
+
+def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
+    read: list[int] = []
+
+    def tasks() -> Iterator[Task]:
+        for k in range(9):
+            read.append(k)
+            yield Task(abs, (-k,))
+
+    done = 0
+    for _ in cluster.run(tasks(), in_flight=2):
+        done += 1
+        assert len(read) <= done + 1
+    assert (done, read) == (9, list(range(9)))
+
+
+def _fail(error: Exception) -> None:
+    raise error
+
+
+def test_failures_of_the_store_end_all(cluster: Cluster) -> None:
+    with pytest.raises(StoreError, match="disk full; then the same command goes on from what is stored"):
+        list(cluster.run([Task(_fail, (StoreError("disk full"),))]))
+    with pytest.raises(DamageError) as caught:
+        list(cluster.run([Task(_fail, (DamageError("message", "what", 3),))]))
+    assert caught.value.row == 3
 
 
 def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path) -> None:
@@ -29,9 +103,10 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path) -> N
     try:
         address = scheduler_address(scheduler)
         processes.append(dask("worker", address, *WORKER))
-        # It gives up looking for the scheduler after a second instead of half a minute.
-        client = Client(address, timeout=1)
-        client.wait_for_workers(1, timeout=60)
+        client = Client(address)
+        client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
+        # Now that it is connected: it looks a second for a scheduler that is gone, instead of half a minute.
+        client._timeout = 1
         with pytest.raises(ClusterError, match=r"the scheduler at .* was lost; the same command goes on"):
             run(study, store_path, client, on_progress=end)
     finally:

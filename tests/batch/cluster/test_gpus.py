@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from sobolev_batch import BackendError
-from sobolev_batch.batch.cluster.gpus import chosen_devices, claim_device, visible_devices
+from sobolev_batch.batch.cluster.gpus import GpuLock, chosen_devices, visible_devices
 
 HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 
@@ -86,14 +86,14 @@ def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 WORKER = """
 import os, sys
-from sobolev_batch.batch.cluster.gpus import claim_device
-claim = claim_device(sys.argv[1:])
-print(claim.device if claim else None, os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+from sobolev_batch.batch.cluster.gpus import GpuLock
+lock = GpuLock.acquire(sys.argv[1:])
+print(lock.device if lock else None, os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
 sys.stdin.read()
 """
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are claimed on Linux only")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are locked on Linux only")
 def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free() -> None:
     devices = [f"GPU-{os.getpid()}-{number}" for number in range(2)]
     processes: list[subprocess.Popen[str]] = []
@@ -121,14 +121,14 @@ def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free() 
             process.communicate()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are claimed on Linux only")
-def test_a_device_that_is_released_can_be_claimed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are locked on Linux only")
+def test_a_device_that_is_released_can_be_locked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "before")
     device = f"GPU-{os.getpid()}-released"
-    first = claim_device([device])
+    first = GpuLock.acquire([device])
     assert first is not None
-    assert claim_device([device]) is None
+    assert GpuLock.acquire([device]) is None
     first.release()
-    second = claim_device([device])
+    second = GpuLock.acquire([device])
     assert second is not None
     second.release()

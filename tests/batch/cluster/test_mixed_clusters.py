@@ -13,7 +13,7 @@ import xarray as xr
 
 from sobolev_batch import ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import GPU
 from tests.support import pretend_gpu
 from tests.support.processes import tcp_cluster
@@ -51,7 +51,7 @@ def test_one_device_serves_one_worker_and_studies_use_what_there_is(
     mixed: str, finished_store: Path, tmp_path: Path
 ) -> None:
     with remote_client(mixed) as client:
-        crew = enlist(client)
+        crew = prepare_workers(client)
         assert sorted(member.backend for member in crew.members) == ["cpu", "cpu", "gpu"]
         notes = sorted(member.note for member in crew.members if member.backend == "cpu")
         assert notes[0].startswith("no GPU left: other workers have all of the 1 that it may use")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,14 +16,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import Client, Worker
 
 from sobolev_batch import Study, icosphere, open_store, run
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support import gate
-from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop
 from tests.support.studies import small_table, variable
+
+_POLL_SECONDS = 0.02
 
 
 class Cluster:
@@ -101,7 +104,7 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
     processes = [cluster.start(), cluster.start()]
     records: list[Any] = []
     with Client(cluster.address) as ours:
-        ours.wait_for_workers(2, timeout=60)
+        ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
         early = set(ours.scheduler_info(n_workers=-1)["workers"])
         held: Gate | None = None
 
@@ -117,7 +120,7 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
                 assert len(busy) == 1
                 held.set_aside()
                 cluster.start()
-                ours.wait_for_workers(3, timeout=60)
+                ours.wait_for_workers(3, timeout=PATIENCE_SECONDS)
                 # The one in the middle of its task, and the one that could have taken it.
                 ours.retire_workers(list(early))
 
@@ -130,7 +133,7 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
     assert held is not None
     assert held.open()
     for process in processes:
-        process.communicate(timeout=60)
+        process.communicate(timeout=PATIENCE_SECONDS)
     last = next(record for record in Store.open(store_path).records() if record and record.key == records[-1].key)
     assert last.worker in early
     check_store(client, study, store_path, tmp_path / "undisturbed.zarr")
@@ -139,11 +142,11 @@ def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
 def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
     cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
 ) -> None:
-    leaving = cluster.start("--lifetime", "6s")
+    leaving = cluster.start()
     left = threading.Event()
 
     with Client(cluster.address) as ours, following(ours, "remove-worker", left):
-        ours.wait_for_workers(1, timeout=60)
+        ours.wait_for_workers(1, timeout=PATIENCE_SECONDS)
         first = next(iter(ours.scheduler_info()["workers"]))
         held: Gate | None = None
 
@@ -154,7 +157,10 @@ def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
                 threading.Thread(target=replace, args=(held,)).start()
 
         def replace(held: Gate) -> None:
-            assert left.wait(timeout=120)
+            while not any(ours.run(executing).values()):
+                time.sleep(_POLL_SECONDS)
+            ours.run(end_lifetime)
+            assert left.wait(timeout=PATIENCE_SECONDS)
             held.set_aside()
             cluster.start()
 
@@ -162,10 +168,20 @@ def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
     assert len(summary.computed) == 5
     assert held is not None
     held.open()
-    leaving.communicate(timeout=60)
+    leaving.communicate(timeout=PATIENCE_SECONDS)
     workers = {record.worker for record in Store.open(store_path).records() if record}
     assert workers - {first}
     check_store(client, study, store_path, tmp_path / "undisturbed.zarr")
+
+
+def executing(dask_worker: Worker) -> int:
+    """Return how many tasks the worker is in the middle of."""
+    return len(dask_worker.state.executing)
+
+
+def end_lifetime(dask_worker: Worker) -> None:
+    """Do what the worker does by itself at the end of its lifetime."""
+    dask_worker.io_loop.add_callback(dask_worker.close_gracefully, reason="worker-lifetime-reached")
 
 
 @contextmanager

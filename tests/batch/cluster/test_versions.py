@@ -14,9 +14,9 @@ from distributed import Client, Future
 
 from sobolev_batch import ClusterError, Study, run
 from sobolev_batch.batch.cluster.versions import require_same_versions
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.store.store import Store
-from tests.support.processes import SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.studies import small_table
 
 _POLL_SECONDS = 0.02
@@ -63,7 +63,7 @@ def test_workers_that_differ_are_named_before_anything_is_computed(
     wrong = [dask("worker", cluster, *WORKER, "--name", folder.name, found_first=folder) for folder in (other, lacking)]
     try:
         with Client(cluster) as client:
-            client.wait_for_workers(3, timeout=60)
+            client.wait_for_workers(3, timeout=PATIENCE_SECONDS)
             addresses = {
                 worker["id"]: address for address, worker in client.scheduler_info(n_workers=-1)["workers"].items()
             }
@@ -91,7 +91,7 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
     cluster: str, other: Path, lacking: Path, tmp_path: Path
 ) -> None:
     with Client(cluster) as client:
-        enlist(client)
+        prepare_workers(client)
         right = client.submit(lambda: os.environ.get("PYTHONPATH"), pure=False).result()
         tasks: list[Future] = client.map(wait_for, [str(tmp_path / "go")] * 40, pure=False)
         wrong = [
@@ -99,7 +99,7 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
             dask("worker", cluster, *WORKER, "--nanny", found_first=lacking),
         ]
         try:
-            said = [process.communicate(timeout=60)[1] for process in wrong]
+            said = [process.communicate(timeout=PATIENCE_SECONDS)[1] for process in wrong]
         finally:
             (tmp_path / "go").touch()
             for process in wrong:
@@ -112,18 +112,18 @@ def test_workers_that_join_later_take_no_task_and_harm_none(
         assert client.run_on_scheduler(
             lambda dask_scheduler: {t.suspicious for t in dask_scheduler.tasks.values()}
         ) == {0}
-        assert len(enlist(client).members) == 1
+        assert len(prepare_workers(client).members) == 1
 
 
 CLIENT = """
 import sys
 from distributed import Client
 from sobolev_batch import ClusterError
-from sobolev_batch.batch.cluster.worker_plugin import enlist
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 
 with Client(sys.argv[1]) as client:
     try:
-        enlist(client)
+        prepare_workers(client)
     except ClusterError as error:
         print(error)
 """
@@ -132,7 +132,7 @@ with Client(sys.argv[1]) as client:
 def test_a_client_that_differs_is_refused_and_leaves_the_cluster_as_it_is(cluster: str, other: Path) -> None:
     paths = os.pathsep.join([str(other), str(Path(__file__).parents[3])])
     with Client(cluster) as client:
-        enlist(client)
+        prepare_workers(client)
         before = plugins(client)
         done = subprocess.run(
             [sys.executable, "-c", CLIENT, cluster],
@@ -140,7 +140,7 @@ def test_a_client_that_differs_is_refused_and_leaves_the_cluster_as_it_is(cluste
             cwd=other,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE_SECONDS,
             check=True,
         )
         assert "9.9 here" in done.stdout

@@ -11,9 +11,9 @@ from distributed import Client
 
 from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
-from sobolev_batch.batch.cluster.worker_plugin import enlist, worry_about
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers, waiting_reason
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY
-from tests.support.processes import tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
 
 
@@ -47,37 +47,37 @@ def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
 
 
 def test_workers_declare_their_memory(client: Client) -> None:
-    crew = enlist(client)
+    crew = prepare_workers(client)
     assert crew.threads == 2
     workers = client.scheduler_info(n_workers=-1)["workers"]
     for member in crew.members:
         assert member.backend == "cpu"
         assert member.note
         declared = workers[member.address]["resources"]
-        assert declared == {MEMORY: member.spare_bytes}
+        assert declared == {MEMORY: member.allowed_bytes}
         assert GPU not in declared
-        assert 0.5 < member.spare_bytes / workers[member.address]["memory_limit"] < 0.85
+        assert 0.5 < member.allowed_bytes / workers[member.address]["memory_limit"] < 0.85
 
 
 def test_workers_that_join_later_are_equipped_too() -> None:
     with local_client(1) as client:
-        enlist(client)
+        prepare_workers(client)
         client.cluster.scale(2)
-        client.wait_for_workers(2, timeout=60)
-        assert len(enlist(client).members) == 2
+        client.wait_for_workers(2, timeout=PATIENCE_SECONDS)
+        assert len(prepare_workers(client).members) == 2
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         assert all(worker["resources"][MEMORY] > 0 for worker in workers)
 
 
 def test_the_memory_of_local_workers_can_be_given() -> None:
     with local_client(1, "3GB") as client:
-        (member,) = enlist(client).members
-    assert member.spare_bytes == pytest.approx(0.85 * 3e9 - 300e6)
+        (member,) = prepare_workers(client).members
+    assert member.allowed_bytes == pytest.approx(0.85 * 3e9 - 300e6)
 
 
 @pytest.mark.parametrize("memory", ["much", "-1", "0", "0.5", "1e3", "10MB", "inf", "nan", "50%", ""])
 def test_a_memory_that_no_worker_can_live_in(memory: str) -> None:
-    with pytest.raises(InputError, match=r"a worker's memory must be .* found "):
+    with pytest.raises(InputError, match=r"memory (of a worker )?must be .*found "):
         local_client(1, memory).__enter__()
 
 
@@ -87,10 +87,10 @@ def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -
 
 
 def test_what_a_study_waits_for_is_told(client: Client) -> None:
-    assert worry_about(client, "auto") == ""
-    assert worry_about(client, "gpu").startswith("no worker with a GPU is left")
+    assert waiting_reason(client, "auto") == ""
+    assert waiting_reason(client, "gpu").startswith("no worker with a GPU is left")
     with tcp_cluster() as (address, _), Client(address) as lonely:
-        assert worry_about(lonely, "auto") == "no worker is left; waiting for one to start"
+        assert waiting_reason(lonely, "auto") == "no worker is left; waiting for one to start"
 
 
 def _die_once(marker: Path) -> str:
@@ -102,14 +102,14 @@ def _die_once(marker: Path) -> str:
 
 def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tmp_path: Path) -> None:
     with local_client(1, "1GB") as client:
-        enlist(client)
+        prepare_workers(client)
         task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
-        assert task.result(timeout=120) == "alive"
+        assert task.result(timeout=PATIENCE_SECONDS) == "alive"
 
 
-def test_a_cluster_is_enlisted_as_it_is_after_the_setup_of_its_workers() -> None:
+def test_workers_are_described_as_they_are_after_their_setup() -> None:
     """A second client registers nothing and waits for nothing of its own accord."""
     with local_client(1) as client, Client(client.scheduler.address, set_as_default=False) as second:
-        first = enlist(client)
-        assert enlist(second) == first
-        assert all(member.spare_bytes > 0 and member.note for member in first.members)
+        first = prepare_workers(client)
+        assert prepare_workers(second) == first
+        assert all(member.allowed_bytes > 0 and member.note for member in first.members)

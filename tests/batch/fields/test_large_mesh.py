@@ -1,4 +1,4 @@
-"""A mesh in pieces gives the field that it gives as a whole."""
+"""A mesh in batches gives the field that it gives as a whole."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import Lattice, Mesh, MeshError, StoreError, Study, icosphere
-from sobolev_batch.batch.fields.graph import Submitter
-from sobolev_batch.batch.fields.large_mesh import Cut, Partial, add_partials, cut_mesh, transform_piece
-from sobolev_batch.batch.fields.sizing import Layout
-from sobolev_batch.batch.fields.tasks import Job
+from sobolev_batch.batch.cluster.execution import Cluster
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
+from sobolev_batch.batch.fields.graph import field_task
+from sobolev_batch.batch.fields.large_mesh import BlockSum, SplitMesh, add_sums, split_mesh, transform_batch
+from sobolev_batch.batch.fields.sizing import TaskSizes
+from sobolev_batch.batch.fields.tasks import FieldSettings, Job
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member
 from tests.support.studies import small_table
 
 
 class Ball(Member):
-    """Of two scales, so that pieces get different rules, and with a run of triangles without area."""
+    """Of two scales, so that batches get different rules, and with a run of triangles without area."""
 
     def load(self) -> Mesh:
         fine, coarse = icosphere(4), icosphere(1)
@@ -53,21 +55,22 @@ def plan() -> Plan:
 
 def job_of(plan: Plan, store_path: Path, member: Member, row: int = 0) -> Job:
     store = prepare_store(store_path, plan)
-    orders = plan.study.orders
-    return Job(store, row, "a/0", "key", member, plan.similarity, plan.lattice, plan.transform, orders)
+    return Job(store, row, Row("a/0", "a", member, "", "key"), FieldSettings.of(plan))
 
 
-def computed(client: Client, job: Job, parts: int, blocks: tuple[Block, ...]) -> Record:
-    layout = Layout(parts, tuple((block,) for block in blocks), 1e9, 1e9, 1e9)
-    record: Record = Submitter(client, False, False, len(blocks)).field(job, layout, 0).result()
+def computed(client: Client, job: Job, batches: int, blocks: tuple[Block, ...]) -> Record:
+    sizes = TaskSizes(batches, tuple((block,) for block in blocks), 1e9, 1e9, 1e9)
+    workers = Workers((WorkerInfo("tcp://a", 1, 2e9, "cpu", ""),))
+    ((_, record),) = Cluster(client, workers).run([field_task(job, sizes)])
+    assert isinstance(record, Record)
     return record
 
 
-@pytest.mark.parametrize("parts", [2, 3, 7])
-def test_pieces_add_up_to_the_whole(client: Client, plan: Plan, store_path: Path, parts: int) -> None:
+@pytest.mark.parametrize("batches", [2, 3, 7])
+def test_batches_add_up_to_the_whole(client: Client, plan: Plan, store_path: Path, batches: int) -> None:
     whole = computed(client, job_of(plan, store_path, Ball("ball", 0)), 1, plan.blocks)
     job = job_of(plan, store_path, Ball("ball", 0), row=1)
-    record = computed(client, job, parts, plan.blocks)
+    record = computed(client, job, batches, plan.blocks)
     assert record.status == "complete", record.reason
     place = plan.lattice.place(plan.lattice.half)
     expected, found = job.store.read_fields([0, 1], place)
@@ -77,7 +80,7 @@ def test_pieces_add_up_to_the_whole(client: Client, plan: Plan, store_path: Path
     assert record.backend == "finufft"
 
 
-def test_blocks_of_pieces_are_those_of_the_whole(client: Client, plan: Plan, store_path: Path) -> None:
+def test_blocks_of_batches_are_those_of_the_whole(client: Client, plan: Plan, store_path: Path) -> None:
     blocks = plan.lattice.split(1000)
     assert len(blocks) == 3
     plan = replace(plan, blocks=blocks)
@@ -92,7 +95,7 @@ def test_blocks_of_pieces_are_those_of_the_whole(client: Client, plan: Plan, sto
 
 
 @pytest.mark.parametrize(("member", "reason"), [(Torn, "torn.ply: no triangles"), (Outside, r"reaches to \|coord")])
-def test_a_mesh_that_cannot_be_cut_fails_alone(
+def test_a_mesh_that_cannot_be_split_fails_alone(
     client: Client, plan: Plan, store_path: Path, member: type[Ball], reason: str
 ) -> None:
     record = computed(client, job_of(plan, store_path, member("torn", 0)), 3, plan.blocks)
@@ -100,20 +103,20 @@ def test_a_mesh_that_cannot_be_cut_fails_alone(
     assert re.search(reason, record.reason)
 
 
-def test_a_piece_that_is_gone_is_no_failure_of_its_mesh(plan: Plan, store_path: Path) -> None:
+def test_a_batch_that_is_gone_is_no_failure_of_its_mesh(plan: Plan, store_path: Path) -> None:
     job = job_of(plan, store_path, Ball("ball", 0))
-    cut = cut_mesh(job, 3)
-    assert cut.there == {0, 1, 2}
+    split = split_mesh(job, 3)
+    assert split.batches == {0, 1, 2}
     job.store.scratch.discard(0)
-    with pytest.raises(StoreError, match="batch 1 of the triangles of row 0 cannot be read"):
-        transform_piece(job, cut, 1, plan.blocks[0])
+    with pytest.raises(StoreError, match="1 of the mesh of row 0 cannot be read"):
+        transform_batch(job, split, 1, plan.blocks[0])
 
 
 def test_errors_survive_the_sum() -> None:
-    total = add_partials(Partial(np.ones(2, dtype=np.complex128)), Partial(error="gone"))
-    assert (total.error, add_partials(Partial(error="first"), total).error) == ("gone", "first")
+    total = add_sums(BlockSum(np.ones(2, dtype=np.complex128)), BlockSum(error="gone"))
+    assert (total.error, add_sums(BlockSum(error="first"), total).error) == ("gone", "first")
 
 
-def test_a_cut_that_failed_is_not_transformed(plan: Plan, store_path: Path) -> None:
+def test_a_split_that_failed_is_not_transformed(plan: Plan, store_path: Path) -> None:
     job = job_of(plan, store_path, Ball("ball", 0))
-    assert transform_piece(job, Cut(error="no"), 0, Lattice(1.0, 4).half).values is None
+    assert transform_batch(job, SplitMesh(error="no"), 0, Lattice(1.0, 4).half).values is None

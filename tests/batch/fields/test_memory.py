@@ -13,9 +13,9 @@ TASK = """
 import resource, sys
 import numpy as np
 import sobolev_batch as sb
-from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.study.plan import Row, make_plan
 from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.fields.tasks import Job, compute_mesh
+from sobolev_batch.batch.fields.tasks import FieldSettings, Job, compute_mesh
 from sobolev_batch.surfaces.sources.registry import Member
 
 
@@ -40,9 +40,7 @@ table = {
 }
 plan = make_plan(sb.Study.from_table(table))
 store = prepare_store(sys.argv[1], plan)
-study = plan.study
-sheet = Sheet("sheet", 0)
-job = Job(store, 0, "a/0", "key", sheet, plan.similarity, plan.lattice, plan.transform, study.orders)
+job = Job(store, 0, Row("a/0", "a", Sheet("sheet", 0), "", "key"), FieldSettings.of(plan))
 record = compute_mesh(job, plan.blocks)
 assert record.status == "complete", record.reason
 print(record.facts.triangles, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

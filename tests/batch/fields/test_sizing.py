@@ -6,7 +6,7 @@ import pytest
 
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
-from sobolev_batch.batch.fields.sizing import lay_out
+from sobolev_batch.batch.fields.sizing import size_tasks
 from sobolev_batch.spectral.backends.costs import CPU_COSTS, NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
@@ -19,69 +19,70 @@ LARGE = Lattice(5.0, 512).split(1 << 24)
 TRANSFORM = TransformSettings()
 
 
-def crew(*spare_gigabytes: float, threads: int = 1) -> Workers:
+def workers_with(*gigabytes: float, threads: int = 1) -> Workers:
     return Workers(
         tuple(
-            WorkerInfo(f"tcp://{number}", threads, 1e9 * spare, "cpu", "")
-            for number, spare in enumerate(spare_gigabytes)
+            WorkerInfo(f"tcp://{number}", threads, 1e9 * allowed, "cpu", "") for number, allowed in enumerate(gigabytes)
         )
     )
 
 
 def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
-    layout = lay_out(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000, 1e7), crew(8, 8), rows=100)
-    assert (layout.parts, layout.groups) == (1, (ONE_CHUNK,))
+    sizes = size_tasks(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000, 1e7), workers_with(8, 8), rows=100)
+    assert (sizes.batches, sizes.block_groups) == (1, (ONE_CHUNK,))
     # It claims what it is going to use, and may use what there is.
-    assert layout.transform_bytes == pytest.approx(8e9, rel=0.01)
-    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < layout.largest_bytes < 0.4e9
+    assert sizes.allowed_bytes == pytest.approx(8e9, rel=0.01)
+    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < sizes.projected_bytes < 0.4e9
 
 
-@pytest.mark.parametrize("workers", [crew(4), crew(4, 4), crew(64, 64, 64, threads=8)])
-def test_a_huge_mesh_is_cut_into_the_same_parts_on_any_cluster(workers: Workers) -> None:
-    assert lay_out(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000_000, 2e9), workers, rows=1).parts == 10
+@pytest.mark.parametrize("workers", [workers_with(4), workers_with(4, 4), workers_with(64, 64, 64, threads=8)])
+def test_a_huge_mesh_is_split_into_the_same_batches_on_any_cluster(workers: Workers) -> None:
+    assert size_tasks(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000_000, 2e9), workers, rows=1).batches == 10
 
 
-def test_where_memory_is_short_parts_are_smaller() -> None:
-    layout = lay_out(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000_000, 0.9e9), crew(2.1, threads=5), rows=1)
-    assert layout.parts == 39
-    assert layout.task_bytes <= 2.1e9 / 5
-    assert layout.making_bytes <= 2.1e9
+def test_where_memory_is_short_batches_are_smaller() -> None:
+    sizes = size_tasks(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000_000, 0.9e9), workers_with(2.1, threads=5), rows=1)
+    assert sizes.batches == 39
+    assert sizes.batch_bytes <= 2.1e9 / 5
+    assert sizes.loading_bytes <= 2.1e9
 
 
 def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() -> None:
-    tight = lay_out(LARGE, TRANSFORM, ExpectedSize(1000, 0), crew(1.5), rows=10)
-    assert tight.transform_bytes < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
-    assert tight.largest_bytes == pytest.approx(1.5e9)
+    tight = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(1.5), rows=10)
+    assert tight.allowed_bytes < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
+    assert tight.projected_bytes == pytest.approx(1.5e9)
     # Four at once would leave nothing to each: such tasks run beside fewer others.
-    crowded = lay_out(LARGE, TRANSFORM, ExpectedSize(1000, 0), crew(2.25, threads=4), rows=10)
-    assert crowded.transform_bytes == pytest.approx(256e6, rel=1e-2)
-    assert 2.25e9 / 4 < crowded.largest_bytes <= 2.25e9
+    crowded = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(2.25, threads=4), rows=10)
+    assert crowded.allowed_bytes == pytest.approx(256e6, rel=1e-2)
+    assert 2.25e9 / 4 < crowded.projected_bytes <= 2.25e9
 
 
 @pytest.mark.parametrize("triangles", [2_500_000, 3_000_000, 20_000_000])
 @pytest.mark.parametrize("blocks", [ONE_CHUNK, LARGE])
 @pytest.mark.parametrize("threads", [4, 8])
 def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
-    layout = lay_out(blocks, TRANSFORM, ExpectedSize(triangles, 0), crew(4, threads=threads), rows=1)
-    part = triangles / layout.parts
-    workload = Workload(part * 3, part * 12, int(part))
-    fastest_batching(Batching(NufftSpec(blocks[0].shape, 1e-9)), workload, CPU_COSTS, layout.transform_bytes)
-    assert layout.largest_bytes <= 4e9
+    sizes = size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers_with(4, threads=threads), rows=1)
+    batch = triangles / sizes.batches
+    workload = Workload(batch * 3, batch * 12, int(batch))
+    fastest_batching(Batching(NufftSpec(blocks[0].shape, 1e-9)), workload, CPU_COSTS, sizes.allowed_bytes)
+    assert sizes.projected_bytes <= 4e9
 
 
 @pytest.mark.parametrize(("rows", "groups"), [(1, 4), (2, 2), (4, 1), (1000, 1)])
 def test_blocks_of_a_few_meshes_are_spread_over_threads_those_of_many_stay_together(rows: int, groups: int) -> None:
-    found = lay_out(LARGE, TRANSFORM, ExpectedSize(1000, 0), crew(8, 8), rows).groups
+    found = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(8, 8), rows).block_groups
     assert len(found) == min(groups, len(LARGE))
     assert tuple(block for group in found for block in group) == LARGE
 
 
-@pytest.mark.parametrize(("size", "needed"), [(ExpectedSize(1000, 9e9), "9 GB"), (ExpectedSize(60_000_000, 0), "6 GB")])
+@pytest.mark.parametrize(
+    ("size", "needed"), [(ExpectedSize(1000, 9e9), r"9\.0GB"), (ExpectedSize(60_000_000, 0), r"6\.0GB")]
+)
 def test_what_fits_into_no_worker_is_refused_with_both_numbers(size: ExpectedSize, needed: str) -> None:
-    with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than 3\.1 GB"):
-        lay_out(ONE_CHUNK, TRANSFORM, size, crew(3.1, 2.0), rows=1)
+    with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than 3\.1GB"):
+        size_tasks(ONE_CHUNK, TRANSFORM, size, workers_with(3.1, 2.0), rows=1)
 
 
 def test_a_block_that_fits_into_no_worker_is_refused() -> None:
-    with pytest.raises(ClusterError, match=r"0\.7 GB in one task, and no worker has more than 0\.4 GB"):
-        lay_out(LARGE, TRANSFORM, ExpectedSize(), crew(0.4), rows=1)
+    with pytest.raises(ClusterError, match=r"7\d\d\.\dMB in one task, and no worker has more than 400\.0MB"):
+        size_tasks(LARGE, TRANSFORM, ExpectedSize(), workers_with(0.4), rows=1)

@@ -1,0 +1,102 @@
+"""The workspace of a run: a store, and how much of a plan it holds."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.study.plan import Plan, Row
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """A store and the plan that is carried out in it.
+
+    Attributes:
+        store: Store, laid out for the plan.
+        plan: Plan of the study.
+        rows: Rows of the plan, in the order of the store.
+        records: Completion record of each row, kept up to date; None without one.
+    """
+
+    store: Store
+    plan: Plan
+    rows: tuple[Row, ...]
+    records: list[Record | None]
+
+    @classmethod
+    def of(cls, store: Store, plan: Plan) -> Self:
+        """Return the workspace of a store that is laid out for a plan."""
+        by_label = {row.label: row for row in plan.rows}
+        return cls(store, plan, tuple(by_label[label] for label in store.labels()), list(store.records()))
+
+    @classmethod
+    def prepared(cls, location: Location, plan: Plan) -> Self:
+        """Create or open the store of a plan; see `prepare_store`."""
+        return cls.of(prepare_store(location, plan), plan)
+
+    @property
+    def labels(self) -> list[str]:
+        """Label of each row."""
+        return [row.label for row in self.rows]
+
+    @property
+    def reference(self) -> int:
+        """Row of the reference."""
+        return self.labels.index(self.plan.reference)
+
+    @property
+    def complete(self) -> dict[int, Record]:
+        """Records of the rows whose fields are stored."""
+        return complete_records(self.records)
+
+    @property
+    def missing(self) -> list[int]:
+        """Rows whose fields are to be computed."""
+        return [i for i, record in enumerate(self.records) if record is None or not record.completes(self.rows[i].key)]
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Reason of each row without a field, by its label."""
+        return {
+            row.label: record.reason if record else "not computed"
+            for row, record in zip(self.rows, self.records, strict=True)
+            if record is None or record.status == "failed"
+        }
+
+    def withdraw_lost_fields(self) -> None:
+        """Withdraw the records of fields that are not in the store, or not as a whole."""
+        complete = self.complete
+        if complete:
+            whole = self.store.rows_with_complete_fields()
+            self.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
+
+    def withdraw(self, rows: Iterable[int], reason: str) -> None:
+        """Withdraw the records of damaged fields, which makes them missing."""
+        for i in rows:
+            _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
+            self.store.write_record(i, None)
+            self.records[i] = None
+
+    def withdraw_results_of(self, rows: Sequence[int]) -> None:
+        """Withdraw the tables and qualities that follow from fields which are about to be replaced."""
+        replaced = {i for i in rows if self.records[i] is not None}
+        if replaced:
+            Tables(self.store).invalidate()
+            self.store.write_qualities(
+                [record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)]
+            )
+
+
+def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
+    """Return the records of fields that are complete, by their rows."""
+    return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
