@@ -18,7 +18,7 @@ from sobolev_batch.spectral.lattice import Block
 # Points of one NUFFT: two million take 0.3 GB with their strengths and sorting, and make the FFT a small part of
 # the time.
 DEFAULT_BATCH = 1 << 21
-# The smallest batch holds eight nodes sets of the largest triangle rule.
+# The smallest batch holds eight node sets of the largest triangle rule.
 _SMALLEST_BATCH = 1 << 12
 # The widest kernel of FINUFFT and cuFINUFFT: a grid has at least twice as many cells along each axis.
 _WIDEST_KERNEL = 16
