@@ -1,4 +1,4 @@
-"""Shorthands for tests of sources: members, what they load, how they are connected."""
+"""Shorthands for tests of sources."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def members(table: dict[str, Any], folder: Path = Path()) -> tuple[Member, ...]:
-    """The members of the source that a table names."""
+    """Return the members of the source that a table names."""
     return parse_source(table).members(folder)
 
 
 def loaded(member: Member) -> Mesh:
-    """What a member makes, which must be a mesh."""
+    """Return the surface of a member, which must be a mesh."""
     surface = member.load()
     assert isinstance(surface, Mesh)
     return surface
 
 
-def listed(found: tuple[Member, ...]) -> list[tuple[str, int]]:
-    """Names and levels."""
-    return [(member.name, member.level) for member in found]
+def listed(members: tuple[Member, ...]) -> list[tuple[str, int]]:
+    """Return names and levels."""
+    return [(member.name, member.level) for member in members]
 
 
 def connectivity(mesh: Mesh) -> list[list[int]]:
-    """The triangles without regard to order and orientation."""
+    """Return the triangles without regard to order and orientation."""
     return sorted(sorted(triangle) for triangle in mesh.triangles.tolist())

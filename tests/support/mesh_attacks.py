@@ -1,6 +1,6 @@
 """Files made to hang a reader, to exhaust its memory or to lead it elsewhere; none of them is a mesh.
 
-Each is small on disk, so that what it costs to refuse it can be held against its size.
+Each is small on disk, so that the cost of refusing it can be compared with its size.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from tests.support.mesh_files import BIG, LITTLE, Gltf, box_scene, gifti, obj, off, ply, stl_binary, stl_text
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
-# Writes what it takes into a folder; the path of the file to be read.
+# Writes an attack into a folder, and returns the path of the file to read.
 Attack = Callable[[Path], Path]
 
 _MEGABYTE = 1 << 20

@@ -1,7 +1,6 @@
-"""Writers of mesh files, kept apart from the libraries that the package reads them with.
+"""Writers of mesh files, independent of the libraries that the package reads them with.
 
-They write what they are told, so that tests can make files that lie: counts can be given, indices
-and coordinates need not make sense.
+They check nothing, so that tests can write damaged files: with wrong counts, indices or coordinates.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from sobolev_batch import Mesh
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 Faces = Sequence[Sequence[int]]
-# Writes a file whose name has an ending, and reads it: see the fixture `read`.
+# Writes contents to a file whose name has an ending, and reads the mesh: see the fixture `read`.
 Read = Callable[[str, bytes], Mesh]
 
 LITTLE, BIG = "binary_little_endian", "binary_big_endian"
@@ -31,7 +30,7 @@ _STRUCT_CODES |= {"float": "f", "double": "d"}
 
 
 def numbers(row: ArrayLike) -> str:
-    """The shortest decimals that read back as the same doubles."""
+    """Return the shortest decimals that read back as the same doubles."""
     return " ".join(repr(float(x)) for x in np.asarray(row).ravel())
 
 
@@ -47,7 +46,7 @@ def ply(
     face_count: int | None = None,
     more: str = "",
 ) -> bytes:
-    """A PLY file; ``more`` names further real vertex properties, whose values are all 1/2."""
+    """Return a PLY file; ``more`` names further real vertex properties, whose values are all 1/2."""
     rows = [[*row, *([0.5] * len(more))] for row in np.asarray(vertices).tolist()]
     header = [
         "ply",
@@ -72,7 +71,7 @@ def ply(
 
 
 def obj(vertices: ArrayLike, faces: Faces, corner: Callable[[int, int], str] | None = None) -> bytes:
-    """An OBJ file; ``corner`` spells the vertex of a face from its index, from 1, and its place."""
+    """Return an OBJ file; ``corner`` writes a corner of a face from the index of its vertex, from 1, and its rank."""
     spell = corner or (lambda vertex, place: str(vertex))
     lines = [f"v {numbers(row)}" for row in np.asarray(vertices)]
     lines += ["f " + " ".join(spell(vertex + 1, place) for place, vertex in enumerate(face)) for face in faces]
@@ -87,7 +86,7 @@ def off(
     vertex_count: int | None = None,
     face_count: int | None = None,
 ) -> bytes:
-    """An OFF file."""
+    """Return an OFF file."""
     rows = np.asarray(vertices)
     counts = (len(rows) if vertex_count is None else vertex_count, len(faces) if face_count is None else face_count)
     lines = [f"{counts[0]} {counts[1]} 0", *[numbers(row) for row in rows]]
@@ -96,7 +95,7 @@ def off(
 
 
 def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
-    """An ASCII STL file."""
+    """Return an ASCII STL file."""
     rows = np.asarray(vertices)
     facets = [
         "facet normal 0 0 0\nouter loop\n"
@@ -108,7 +107,7 @@ def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
 
 
 def stl_binary(vertices: ArrayLike, faces: Faces, start: bytes = b"box", *, count: int | None = None) -> bytes:
-    """A binary STL file."""
+    """Return a binary STL file."""
     rows = np.asarray(vertices, dtype=np.float64)
     facets = [struct.pack("<12fH", 0, 0, 0, *rows[list(face)].ravel(), 0) for face in faces]
     return start.ljust(80, b"\0") + struct.pack("<I", len(facets) if count is None else count) + b"".join(facets)
@@ -119,14 +118,14 @@ _COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint
 
 
 class Gltf:
-    """A glTF scene: ``tree`` is its JSON document, open to changes, ``blob`` its one buffer.
+    """A glTF scene, with its JSON document as ``tree``, which may be changed, and its one buffer as ``blob``.
 
     Args:
-        meshes: for each mesh its primitives: vertices, indices (or None) and mode (or None).
-        nodes: as in the JSON document.
-        roots: the indices of the scene's root nodes; all nodes unless given.
-        real: the type of the coordinates.
-        index: the type of the indices.
+        meshes: Primitives of each mesh: vertices, indices (or None) and mode (or None).
+        nodes: Nodes, as in the JSON document.
+        roots: Indices of the scene's root nodes; all nodes unless given.
+        real: Type of the coordinates.
+        index: Type of the indices.
     """
 
     def __init__(
@@ -153,7 +152,7 @@ class Gltf:
         self.tree["buffers"] = [{"byteLength": len(self.blob)}]
 
     def accessor(self, values: ArrayLike, kind: str, dtype: str) -> int:
-        """Append values to the buffer; the index of their accessor."""
+        """Append values to the buffer, and return the index of their accessor."""
         array = np.ascontiguousarray(values, dtype=dtype)
         self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes})
         self.tree["accessors"].append(
@@ -179,7 +178,7 @@ class Gltf:
         return primitive
 
     def glb(self) -> bytes:
-        """The binary form."""
+        """Return the binary form."""
         self.tree["buffers"][0]["byteLength"] = len(self.blob)
         document = json.dumps(self.tree).encode()
         document += b" " * (-len(document) % 4)
@@ -193,7 +192,7 @@ class Gltf:
         )
 
     def gltf(self, uri: str | None = None) -> bytes:
-        """The JSON form; the buffer is embedded, or in a file of its own where ``uri`` says so."""
+        """Return the JSON form; the buffer is embedded, or in the file that ``uri`` names."""
         embedded = "data:application/octet-stream;base64," + base64.b64encode(self.blob).decode()
         self.tree["buffers"][0] = {"byteLength": len(self.blob), "uri": uri or embedded}
         return json.dumps(self.tree).encode()
@@ -207,7 +206,7 @@ def gifti(
     ordering: str = "C",
     points: int = 1,
 ) -> bytes:
-    """A GIFTI file with so many point sets."""
+    """Return a GIFTI file with several point sets."""
     arrays = []
     if vertices is not None:
         arrays += [
@@ -225,12 +224,12 @@ def gifti(
     return bytes(nibabel.GiftiImage(darrays=arrays).to_bytes())
 
 
-# Each as the end of the file's name and its bytes.
+# The end of a file's name, and its bytes.
 Content = tuple[str, bytes]
 
 
 def box_scene() -> Gltf:
-    """The box as a scene of one node; a fresh one, open to changes."""
+    """Return the box as a new scene of one node, which may be changed."""
     return Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}])
 
 

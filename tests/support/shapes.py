@@ -1,4 +1,4 @@
-"""Small surfaces whose areas are known, and random ones, for the tests of this room."""
+"""Small surfaces whose areas are known, and random ones."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# A box with sides of 1, 2 and 4, so that no two axes can be mistaken for each other. All its
-# coordinates are exact in single precision.
+# A box with sides of 1, 2 and 4, so that axes cannot be confused. Its coordinates are exact in single precision.
 BOX_VERTICES: Reals = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)], dtype=np.float64)
 BOX_QUADS: list[list[int]] = [
     [0, 1, 3, 2],
@@ -25,7 +24,7 @@ BOX_QUADS: list[list[int]] = [
     [1, 5, 7, 3],
 ]
 BOX_TRIANGLES: list[list[int]] = [[q[0], q[i], q[i + 1]] for q in BOX_QUADS for i in (1, 2)]
-# Three sides of the box in one piece, three in two.
+# Three sides of the box as quadrilaterals, three as pairs of triangles.
 BOX_MIXED: list[list[int]] = [*BOX_QUADS[:3], *BOX_TRIANGLES[6:]]
 BOX_AREA = 28.0
 
@@ -40,23 +39,23 @@ TETRAHEDRON_AREA = 1.5 + np.sqrt(3) / 2
 
 
 def box() -> Mesh:
-    """The box as a mesh."""
+    """Return the box as a mesh."""
     return Mesh(BOX_VERTICES, BOX_TRIANGLES)
 
 
 def tetrahedron() -> Mesh:
-    """The corner of a unit cube, cut off."""
+    """Return the corner of a unit cube, cut off."""
     return Mesh(TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES)
 
 
 def soup(mesh: Mesh) -> list[list[tuple[float, ...]]]:
-    """The triangles as sorted coordinates: equal for meshes that differ in nothing but order and sharing."""
+    """Return the triangles as sorted coordinates: equal for meshes that differ only in order and sharing."""
     return sorted(sorted(tuple(corner) for corner in triangle) for triangle in mesh.vertices[mesh.triangles].tolist())
 
 
 @st.composite
 def meshes(draw: st.DrawFn) -> Mesh:
-    """Random triangle soups on shared vertices: mostly non-manifold, always with an area above zero."""
+    """Draw random triangles on shared vertices: mostly non-manifold, always with an area above zero."""
     vertex_count = draw(st.integers(3, 8))
     coordinates = st.floats(-10, 10, width=32).map(lambda x: round(x, 3))
     vertices = draw(arrays.arrays(np.float64, (vertex_count, 3), elements=coordinates))

@@ -1,4 +1,4 @@
-"""Parametrisations for tests, as functions of a module so that they survive pickling."""
+"""Parametrisations for tests, as functions of a module, which survive pickling."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class Turned:
 
 
 def angular_ball(derivatives: bool) -> ParametrisedSurface:
-    """The unit sphere in its two angles."""
+    """Return the unit sphere in its two angles."""
     return ParametrisedSurface(ball, HALF_TURN, TURN, ball_derivatives if derivatives else None)
 
 
 def turned_torus(torus: Torus) -> ParametrisedSurface:
-    """A torus that lies askew, without derivatives."""
+    """Return a torus turned about its centre, without derivatives."""
     return ParametrisedSurface(Turned(torus), TURN, TURN)

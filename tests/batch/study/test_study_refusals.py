@@ -76,7 +76,7 @@ def test_names_and_titles_hold_nothing_unseen(name: str) -> None:
     code = next(f"U+{ord(c):04X}" for c in name if c not in "ab[31m")
     for key in ("study.name", "family.0.name", "study.title"):
         message = refusal(changed(key, name))
-        assert f"it holds the character {code}" in message
+        assert f"it holds the invisible character {code}" in message
         assert "visible characters" in message
         assert key.rsplit(".", 1)[1] in message
 

@@ -216,7 +216,7 @@ def test_a_dump_tells_everything_of_nested_sources() -> None:
     assert json.loads(parse_source(table).model_dump_json()) == {"mesh": {"levels": [3]}, "triangles": [80, 20]}
 
 
-def test_a_sole_member_is_the_only_one() -> None:
+def test_a_single_member_is_the_only_one() -> None:
     assert single_member(parse_source(BALL), Path()).name == "3"
     many = parse_source({"source": "icosphere", "levels": list(range(8))})
     with pytest.raises(StudyError, match=r"exactly one surface is needed here, but the source makes 8: 0, 1, 2, 3, 4$"):
