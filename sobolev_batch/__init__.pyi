@@ -55,3 +55,5 @@ from .surfaces.shapes.proximity import proximity as proximity
 from .surfaces.shapes.similarity import Similarity as Similarity
 from .surfaces.shapes.sphere import Sphere as Sphere
 from .surfaces.shapes.torus import Torus as Torus
+
+__all__: list[str]

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from sobolev_batch.cli.group import cli
-from sobolev_batch.cli.options import Memory, memory_of
+from sobolev_batch.cli.options import memory_of
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import distance
@@ -21,7 +21,7 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
 @click.option("--rtol", type=float, help="Largest error relative to the distance; chooses the lattice.")
-@click.option("--memory", type=Memory(), help="Memory of a transform with --rtol, such as 4GB. [default: 2GB]")
+@click.option("--memory", type=byte_count, metavar="SIZE", help="Memory of a transform, for --rtol. [default: 2GB]")
 @click.option("--memory-gb", type=float, hidden=True)
 @click.option("--xi-max", type=float, help="Highest frequency on each axis. [default: 5]")
 @click.option("--M", "intervals", type=int, help="Lattice intervals on each axis. [default: 64]")
@@ -39,7 +39,10 @@ def compare_command(
     with_proximity: bool,
     no_scaling: bool,
 ) -> None:
-    """Print the Sobolev distance of the mesh files A and B; B is the reference."""
+    """Print the Sobolev distance of two mesh files.
+
+    B is the reference.
+    """
     if rtol is not None and (xi_max is not None or intervals is not None):
         raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
     memory = memory_of(memory, "--memory-gb", None if memory_gb is None else byte_count(1e9 * memory_gb))

@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 import click
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.errors import InputError
-from sobolev_batch.parameters import byte_count
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -44,19 +42,6 @@ up_option = click.option(
 def output_option(text: str, default: str) -> Callable[[Command], Command]:
     """Return the option --output of a command that writes files."""
     return click.option("--output", type=click.Path(path_type=Path), default=default, show_default=True, help=text)
-
-
-class Memory(click.ParamType):
-    """A size of memory, such as 4GB, in bytes."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the size in bytes."""
-        try:
-            return byte_count(value)
-        except InputError as error:
-            self.fail(str(error), param, ctx)
 
 
 def memory_of(memory: int | None, old: str, old_memory: int | None) -> int | None:

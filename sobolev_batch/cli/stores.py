@@ -49,7 +49,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 @store_argument
 @click.pass_context
 def verify_command(context: click.Context, store: Location) -> None:
-    """Check all data of STORE against checksums and completion records.
+    """Check all data of STORE against its checksums.
 
     Damaged data are named. If STORE can be written, they are also withdrawn, and `run` computes them again.
     The exit status is 1 if anything is damaged.
@@ -82,7 +82,7 @@ def verify_command(context: click.Context, store: Location) -> None:
 @store_argument
 @click.option("--force", is_flag=True, help="Release it even if its run gave a sign of life a moment ago.")
 def release_command(store: Location, force: bool) -> None:
-    """Remove the lock of STORE after its run was killed together with its machine."""
+    """Remove the lock that a killed run left on STORE."""
     lock = release(store, force=force)
     if lock is None:
         click.echo(f"{store}: not locked by any run")
@@ -96,7 +96,7 @@ def release_command(store: Location, force: bool) -> None:
 @order_option
 @click.option("--matrix", is_flag=True, help="Print the distances of every mesh to every other instead.")
 def table_command(store: Location, style: Format, orders: tuple[float, ...], matrix: bool) -> None:
-    """Print the convergence tables of STORE, or its distance matrices."""
+    """Print the tables or distance matrices of STORE."""
     form = format_matrix if matrix else format_table
     click.echo(form(open_store(store), style, orders or None))
 
@@ -111,7 +111,9 @@ def table_command(store: Location, style: Format, orders: tuple[float, ...], mat
 def plot_command(
     context: click.Context, store: Location, output: Path, witnesses: tuple[str, ...], folder: Path, up: Axis
 ) -> None:
-    """Draw the results of STORE: convergence, transforms, distances, and meshes.
+    """Draw the results of STORE as pictures.
+
+    These are its convergence, transforms, distances and spectra, and some of its meshes.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. The study makes
     them again, and they are drawn with the extra "vtk"; by default a few are chosen by their distances.
@@ -199,7 +201,10 @@ def witness_command(
 @up_option
 @click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Mesh to show; may be repeated.")
 def report_command(store: Location, output: Path, folder: Path, up: Axis, witnesses: tuple[str, ...]) -> None:
-    """Write the results of STORE as one HTML page, which needs no other files."""
+    """Write the results of STORE as one HTML page.
+
+    The page needs no other files and makes no requests.
+    """
     # Imported here, as for plots.
     from sobolev_batch.results.report.build import report
 

@@ -14,8 +14,9 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.submit import submit
 from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
-from sobolev_batch.cli.options import Memory, memory_of, store_option, study_argument, trust_option
+from sobolev_batch.cli.options import memory_of, store_option, study_argument, trust_option
 from sobolev_batch.cli.reporter import Reporter
+from sobolev_batch.parameters import byte_count
 from sobolev_batch.results.open import open_store
 from sobolev_batch.results.plan import DEFAULT_FOLDER, default_store, plan
 from sobolev_batch.results.tables.convergence import format_table
@@ -27,8 +28,8 @@ from sobolev_batch.results.tables.convergence import format_table
 @click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler, such as tls://host:8786.")
 @trust_option
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
-@click.option("--memory", type=Memory(), help="Memory of each of them, such as 4GB. [default: an equal share]")
-@click.option("--worker-memory", type=Memory(), hidden=True)
+@click.option("--memory", type=byte_count, metavar="SIZE", help="Memory of each, such as 4GB. [default: equal parts]")
+@click.option("--worker-memory", type=byte_count, hidden=True)
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -77,7 +78,10 @@ def run_command(
 @trust_option
 @store_option
 def submit_command(study: Path, scheduler: str, trust_network: bool, store: Location | None) -> None:
-    """Hand STUDY over to a cluster, which computes it without this process."""
+    """Hand STUDY over to a cluster and return.
+
+    The cluster computes it without this process.
+    """
     parsed = Study.from_toml(study)
     with remote_client(scheduler, trust_network) as client:
         submission = submit(parsed, store or _made_default_store(parsed), client)
@@ -91,10 +95,10 @@ def submit_command(study: Path, scheduler: str, trust_network: bool, store: Loca
 @click.option("--scheduler", metavar="ADDRESS", help="Plan for its workers. [default: processes on this machine]")
 @trust_option
 def plan_command(study: Path, store: Location | None, scheduler: str | None, trust_network: bool) -> None:
-    """Show what running STUDY would do, without computing anything.
+    """Show what running STUDY would do.
 
-    Prints the lattice and why it was chosen, the tasks and their memory, the bytes to be stored, and how much of it
-    the store has already.
+    Nothing is computed. The plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be
+    stored, and the number of surfaces that the store has already.
     """
     parsed = Study.from_toml(study)
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:

@@ -17,18 +17,18 @@ from tests.support.repository import PACKAGE
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
-def modules() -> Iterator[str]:
+def modules() -> Iterator[tuple[str, Path]]:
     for layer in ("results", "cli"):
         for file in sorted((PACKAGE / layer).rglob("*.py")):
             if not file.name.startswith("_"):
-                yield ".".join(["sobolev_batch", *file.relative_to(PACKAGE).with_suffix("").parts])
+                yield ".".join(["sobolev_batch", *file.relative_to(PACKAGE).with_suffix("").parts]), file
 
 
 def examples(name: str) -> list[doctest.DocTest]:
     return [test for test in doctest.DocTestFinder().find(importlib.import_module(name)) if test.examples]
 
 
-WITH_EXAMPLES = [name for name in modules() if ">>>" in Path(str(importlib.util.find_spec(name).origin)).read_text()]
+WITH_EXAMPLES = [name for name, file in modules() if ">>>" in file.read_text(encoding="utf-8")]
 
 
 @pytest.fixture(scope="module")

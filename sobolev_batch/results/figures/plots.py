@@ -279,8 +279,9 @@ def draw_spectrum(spectra: Spectra, order: float, ax: Axes | None = None) -> Axe
             color = "white" if share > 0.6 * np.nanmax(shares) else "black"
             axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
     # Long labels would run into each other.
-    turned = {"rotation": 20, "ha": "right"} if len(spectra.bands) > _MOST_HORIZONTAL_BANDS else {}
-    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, **turned)
+    is_turned = len(spectra.bands) > _MOST_HORIZONTAL_BANDS
+    rotation, alignment = (20, "right") if is_turned else (0, "center")
+    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, rotation=rotation, ha=alignment)
     axes.set_yticks(range(len(spectra.labels)), [shortened(label) for label in spectra.labels], fontsize=7.5)
     axes.set_xlabel("wavelength in the study's unit")
     axes.set_title(f"differences by wavelength, order {order:g}")

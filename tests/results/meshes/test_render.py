@@ -19,7 +19,7 @@ from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.witness_plots import write_witness_plots
 from sobolev_batch.results.meshes import render as rendering
 from sobolev_batch.results.meshes.render import render
-from sobolev_batch.results.meshes.views import MeshView
+from sobolev_batch.results.meshes.views import MeshView, make_views
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
 

@@ -17,6 +17,7 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.cli import cli
+from sobolev_batch.results.figures.spectra import Spectra
 from sobolev_batch.results.meshes.views import make_views
 from sobolev_batch.results.report import build
 from sobolev_batch.results.report.build import make_report
@@ -306,7 +307,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
     def damaged(*_: object, **__: object) -> None:
         raise ValueError("Stored and computed checksum do not match.")
 
-    monkeypatch.setattr(build.Spectra, "of", damaged)
+    monkeypatch.setattr(Spectra, "of", damaged)
     with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
         make_report(store)
 
