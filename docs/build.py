@@ -68,10 +68,8 @@ def located(source: str, output: Path, link: re.Match[str]) -> str:
     if not path.exists():
         raise FileNotFoundError(f"{source} links to {target}, which does not exist")
     name = path.relative_to(ROOT).as_posix()
-    if name.startswith("docs/pictures/"):
-        url = name.removeprefix("docs/")
-    else:
-        url = PAGES.get(name) or relpath(path, output)
+    is_picture = name.startswith("docs/pictures/")
+    url = name.removeprefix("docs/") if is_picture else PAGES.get(name) or relpath(path, output)
     return f'{kind}="{url}{"#" * bool(section)}{section}"'
 
 
