@@ -74,7 +74,7 @@ def test_the_header_tells_what_the_numbers_are(spheres: Spheres, tmp_path: Path)
     ):
         assert comment in header
     assert "witness_minus_4" not in header
-    unit = re.search(r"one unit of the study has (\S+)", header)
+    unit = re.search(r"one unit of the study is (\S+)", header)
     assert unit is not None
     assert float(unit[1]) == pytest.approx(RADIUS)
 

@@ -291,7 +291,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
         assert len(cells) == 9
         assert "±" in cells[-1]
         assert "Chamfer is the mean distance" in reader.texts("#convergence")[0]
-        assert "proximity" in reader.texts("#asked dt")
+        assert "proximity" in reader.texts("#study-settings dt")
 
 
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
