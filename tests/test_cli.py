@@ -154,6 +154,18 @@ def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
     assert len(re.findall(r"^chosen: ", done.stdout, re.M)) == 3
 
 
+def test_the_old_name_of_memory_works_for_now(pair: Path) -> None:
+    options = ("compare", "1.off", "3.off", "--order", "-8", "--rtol", "1e-2")
+    done = call(*options, "--memory", "1GB", folder=pair)
+    old = call(*options, "--memory-gb", "1", folder=pair)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert old.stdout == done.stdout
+    assert old.stderr == "--memory-gb is now called --memory and takes sizes such as 4GB; --memory-gb will be removed\n"
+    both = call(*options, "--memory", "1GB", "--memory-gb", "1", folder=pair)
+    assert both.returncode == 2
+    assert "give --memory alone" in both.stderr
+
+
 def test_compare_two_files(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=pair)
     assert done.returncode == 0, done.stderr
