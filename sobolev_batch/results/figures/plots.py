@@ -225,9 +225,7 @@ def plot_map(store: AnyStore, order: float | None = None, ax: Axes | None = None
             name = shortened(matrix.labels[i].partition("/")[2] or matrix.labels[i])
             axes.annotate(name, embedding.points[i], (5, 4), textcoords="offset points", fontsize=7, alpha=0.8)
     explained = "" if np.isnan(embedding.explained) else f", {embedding.explained:.0%} of the variance"
-    axes.set_title(
-        f"map of the meshes at order {matrix.order:g}{explained}{_omission(tree, matrix)}", fontsize="medium"
-    )
+    axes.set_title(f"map at order {matrix.order:g}{explained}{_omission(tree, matrix)}", fontsize="medium")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.1)
     axes.grid(visible=True, alpha=0.3)
