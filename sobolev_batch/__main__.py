@@ -1,4 +1,4 @@
-"""python -m sobolev_batch, and the command sobolev-batch: the command line, from its first moment on."""
+"""Entry point of the command line: ``sobolev-batch``, or ``python -m sobolev_batch``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from types import FrameType
 
 
 def main() -> None:
-    """Run the command line; the process ends with its exit status."""
-    # The command line takes a second to import, in which some library may catch what an interrupt raises.
+    """Run the command line and end the process with its exit status."""
+    # The import takes a second, in which a library may catch the exception of an interrupt.
     before = {number: signal.signal(number, _leave) for number in (signal.SIGINT, signal.SIGTERM)}
     from sobolev_batch import cli
 
@@ -20,7 +20,7 @@ def main() -> None:
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
-    sys.stderr.write("interrupted before anything was begun\n")
+    sys.stderr.write("interrupted before anything began\n")
     sys.stderr.flush()
     os._exit(128 + number)
 

@@ -54,10 +54,6 @@ class LockError(StoreError):
     """Another run holds the lock on a store."""
 
 
-# The name of earlier versions.
-ClaimError = LockError
-
-
 class DamageError(StoreError):
     """Stored data are not as they were written.
 

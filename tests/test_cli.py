@@ -63,10 +63,10 @@ def test_plan_and_status(folder: Path) -> None:
     assert plan.returncode == 0
     assert "3 in 1 families, reference reference" in plan.stdout
     assert "xi_max 3, M 16, spacing 0.375, half period 1.33333" in plan.stdout
-    assert "41.6 kB per surface, 125 kB in all" in plan.stdout
-    assert "storage/cli.zarr, 3 of 3 already there" in plan.stdout
+    assert "41.6KB per surface, 124.8KB in all" in plan.stdout
+    assert "storage/cli.zarr, 3 of 3 already stored" in plan.stdout
     fresh = call("plan", "study.toml", "--store", "elsewhere.zarr", folder=folder)
-    assert "elsewhere.zarr, 0 of 3 already there" in fresh.stdout
+    assert "elsewhere.zarr, 0 of 3 already stored" in fresh.stdout
     assert not (folder / "elsewhere.zarr").exists()
     status = call("status", "storage/cli.zarr", folder=folder)
     first, second = status.stdout.splitlines()
@@ -149,9 +149,21 @@ def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
     done = call("plan", "asking.toml", folder=folder)
     assert done.returncode == 0
     assert re.search(
-        r"^accuracy: +rtol 0\.001 of every distance to reference; 2 GB for a transform, M <= \d+$", done.stdout, re.M
+        r"^accuracy: +rtol 0\.001 of every distance to reference; 2.0GB for a transform, M <= \d+$", done.stdout, re.M
     )
     assert len(re.findall(r"^chosen: ", done.stdout, re.M)) == 3
+
+
+def test_the_old_name_of_memory_works_for_now(pair: Path) -> None:
+    options = ("compare", "1.off", "3.off", "--order", "-8", "--rtol", "1e-2")
+    done = call(*options, "--memory", "1GB", folder=pair)
+    old = call(*options, "--memory-gb", "1", folder=pair)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert old.stdout == done.stdout
+    assert old.stderr == "--memory-gb is now called --memory and takes sizes such as 4GB; --memory-gb will be removed\n"
+    both = call(*options, "--memory", "1GB", "--memory-gb", "1", folder=pair)
+    assert both.returncode == 2
+    assert "give --memory alone" in both.stderr
 
 
 def test_compare_two_files(pair: Path) -> None:

@@ -6,7 +6,7 @@ import sys
 
 import click
 
-# Each joins the group.
+# Importing these modules adds their commands to the group.
 from sobolev_batch.cli import meshes, stores, studies  # noqa: F401
 from sobolev_batch.cli.group import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_OTHER, EXIT_TERMINATED, cli
 from sobolev_batch.cli.interruption import Terminated, ignore_requests, raise_when_asked
@@ -18,7 +18,7 @@ __all__ = ["cli", "main"]
 def main() -> None:
     """Run the command line; the process ends with its exit status."""
     debug = "--debug" in sys.argv
-    # Also what ends a job at its time limit: it leaves the time to give up the claim on a store.
+    # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
     raise_when_asked()
     try:
         status = cli.main(standalone_mode=False)
@@ -27,17 +27,17 @@ def main() -> None:
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         ignore_requests()
-        click.echo("interrupted; the same command goes on from what is stored", err=True)
+        click.echo("interrupted; the same command continues from the store", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except Terminated:
         ignore_requests()
-        click.echo("terminated; the same command goes on from what is stored", err=True)
+        click.echo("terminated; the same command continues from the store", err=True)
         sys.exit(EXIT_TERMINATED)
     except Exception as error:
         if debug:
             raise
-        known = isinstance(error, SobolevBatchError)
-        what = str(error) if known else f"{type(error).__name__}: {error} (--debug shows where)"
-        click.echo(f"error: {what}", err=True)
+        is_ours = isinstance(error, SobolevBatchError)
+        message = str(error) if is_ours else f"{type(error).__name__}: {error} (--debug shows where)"
+        click.echo(f"error: {message}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
     sys.exit(status or 0)

@@ -1,4 +1,4 @@
-"""The command sobolev-batch itself, which its subcommands join."""
+"""The command sobolev-batch, which has all others as subcommands."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import sys
 
 import click
 
-# Of a command that has begun; EXIT_INTERRUPTED and EXIT_TERMINATED as shells expect them.
+# Exit statuses; shells expect the last two after SIGINT and SIGTERM.
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 3, 130, 143
-# Of object storage, by the names of their loggers.
+# Loggers of the drivers of object storage.
 _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
 
 
@@ -20,10 +20,10 @@ _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "az
 def cli(context: click.Context, debug: bool) -> None:
     """Sobolev distances of negative order between surface meshes.
 
-    A study file names families of meshes and a reference; `run` stores the Fourier field of every
-    mesh and prints how far each is from the reference.
+    A study file names families of meshes and a reference. `run` stores the Fourier field of every
+    mesh and prints its distance from the reference.
 
-    Exit status: 0 all done, 2 the input is wrong, 3 some meshes failed, 1 anything else.
+    Exit status: 0 all done, 1 another error, 2 wrong input, 3 some meshes failed.
     """
     context.obj = debug
     logging.basicConfig(
@@ -32,9 +32,9 @@ def cli(context: click.Context, debug: bool) -> None:
         stream=sys.stderr,
     )
     if debug:
-        # Below that they log what they send, with its signature and a session's token.
+        # At debug level they log requests with their signatures and session tokens.
         for driver in _DRIVERS:
             logging.getLogger(driver).setLevel(logging.INFO)
     else:
-        # The cluster's own messages at shutdown are of no use to someone who reads a table.
+        # The cluster's messages at shutdown would only hide the table.
         logging.getLogger("distributed").setLevel(logging.ERROR)

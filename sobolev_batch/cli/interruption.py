@@ -1,4 +1,4 @@
-"""Being asked to end: Ctrl-C and the SIGTERM of a job at its time limit, as exceptions that cannot get lost."""
+"""Requests to end (Ctrl-C, or the SIGTERM of a job at its time limit) as exceptions that cannot get lost."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-# Long enough for the finalizer to have returned.
+# By then the finalizer has returned.
 _AGAIN_SECONDS = 0.01
 
 
 class Terminated(SystemExit):
-    """Somebody has asked the process to end."""
+    """The process was asked to end by SIGTERM."""
 
 
 def raise_when_asked() -> None:
     """Raise KeyboardInterrupt and `Terminated` in the main thread when the process is asked to end.
 
-    An exception that a signal raises within a finalizer gets no further than that: Python only reports it.
-    It is then raised again.
+    Python only reports an exception that a signal raises within a finalizer. It is then raised again.
     """
     signal.signal(signal.SIGTERM, _terminate)
     if not hasattr(signal, "setitimer"):  # Windows
@@ -45,7 +44,7 @@ def raise_when_asked() -> None:
 
 
 def ignore_requests() -> None:
-    """What asks a process to end that is ending must not change how it ends."""
+    """Ignore further requests, which would change how an ending process ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     if hasattr(signal, "setitimer"):

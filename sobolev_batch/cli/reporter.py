@@ -1,4 +1,4 @@
-"""Progress for people who wait for a run."""
+"""Progress of a run, shown on standard error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sobolev_batch.batch.cluster.progress import Progress
 
 
 class Reporter:
-    """Progress for people: a bar on a terminal, a plain line per step elsewhere; on standard error."""
+    """Shows progress on standard error: a bar on a terminal, elsewhere a line for each step."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -39,7 +39,7 @@ class Reporter:
         elif progress.stage == "reduction" and progress.done == progress.total:
             click.echo("tables reduced", err=True)
         elif progress.stage == "comparisons" and progress.done == progress.total:
-            click.echo(f"{progress.total} comparisons with the reference made", err=True)
+            click.echo(f"{progress.total} comparisons with the reference finished", err=True)
 
     def _draw(self, progress: Progress) -> None:
         if progress.done == 0:

@@ -21,18 +21,30 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 @xr.register_dataarray_accessor("sobolev")  # type: ignore[no-untyped-call]
 class SobolevAccessor:
-    """What this package computes from fields, on any Fourier field in xarray: ``field.sobolev.norm(-2)``.
+    """Norms, distances and more as methods of any Fourier field in xarray: ``field.sobolev.norm(-2)``.
 
-    It is there once `fourier_transform` or `open_store` has been taken from the package; of fields that plain
-    xarray opens, once this class has: ``from sobolev_batch import SobolevAccessor``.
+    Fields have the accessor once you import `fourier_transform` or `open_store` from the package. For fields that
+    you open with plain xarray, import this class: ``from sobolev_batch import SobolevAccessor``.
 
     A field lies over xi_x, xi_y and xi_z >= 0, is the transform ∫ exp(-2πi ξ·x) dμ(x) with ξ in cycles per
     unit length, and may be lazy. `norm`, `inner_product`, `distance`, `proportion` and `spectrum` also take a
-    stack of fields along one more dimension, such as mesh: one of them is read at a time, and the results
-    lie along that dimension.
+    stack of fields along one more dimension, such as mesh. They read one field at a time, and their results
+    have that dimension.
 
-    Raises, in all methods:
-        LatticeError: an array that is no field, or no single one where one is needed.
+    Raises:
+        LatticeError: In all methods: the array is no field, or several fields where one is needed.
+
+    >>> import sobolev_batch as sb
+    >>> fields = sb.open_store("storage/icosphere.zarr")["fourier"]["fourier"]
+    >>> coarse, reference = fields.sel(mesh="icosphere/1"), fields.sel(mesh="reference")
+    >>> coarse.sobolev.lattice
+    Lattice(xi_max=5.0, M=48)
+    >>> coarse.sobolev.norm(-4)["norm"].item() < reference.sobolev.norm(-4)["norm"].item()
+    True
+    >>> coarse.sobolev.distance(reference, [-10, -4])["distance"].dims
+    ('order',)
+    >>> fields.sel(mesh=["icosphere/0", "icosphere/1"]).sobolev.distance(reference, -4)["distance"].dims
+    ('mesh',)
     """
 
     def __init__(self, field: xr.DataArray) -> None:
@@ -40,23 +52,23 @@ class SobolevAccessor:
 
     @property
     def lattice(self) -> Lattice:
-        """The lattice on whose half the field is sampled."""
+        """Lattice on whose Hermitian half the field is sampled."""
         return Lattice.of(self._field)
 
     def norm(self, order: Orders) -> xr.Dataset:
-        """The norm ||a||_s of one order or several, with its error: see `sobolev_batch.norm`."""
+        """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""
         return self._each(lambda field: norm(field, order))
 
     def inner_product(self, other: Operand, order: Orders) -> xr.Dataset:
-        """The inner product with another field or a surface: see `sobolev_batch.inner_product`."""
+        """Return the inner product with another field or a surface; see `sobolev_batch.inner_product`."""
         return self._each_with(other, order, lambda field, common: inner_product(field, common, order))
 
     def distance(self, other: Operand, order: Orders) -> xr.Dataset:
-        """The distance from another field or a surface, with its error: see `sobolev_batch.distance`."""
+        """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""
         return self._each_with(other, order, lambda field, common: distance(field, common, order))
 
     def proportion(self, other: Operand, order: Orders) -> xr.Dataset:
-        """What a pure change of the other's area explains of the distance: see `sobolev_batch.proportion`."""
+        """Return the parts of the distance that are area and shape; see `sobolev_batch.proportion`."""
         return self._each_with(other, order, lambda field, common: proportion(field, common, order))
 
     def spectrum(
@@ -67,7 +79,10 @@ class SobolevAccessor:
         bands: int | Sequence[float] | None = None,
         similarity: Similarity | None = None,
     ) -> xr.Dataset:
-        """The squared distance, or without another the squared norm, by wavelength: see `sobolev_batch.spectrum`."""
+        """Return the squared distance, or the squared norm if other is None, by wavelength.
+
+        See `sobolev_batch.spectrum`.
+        """
 
         def one(field: xr.DataArray, common: Operand | None) -> xr.Dataset:
             return spectrum(field, common, order, bands=bands, similarity=similarity)
@@ -79,56 +94,70 @@ class SobolevAccessor:
     def witness(
         self, other: Operand, order: Orders, points: ArrayLike, *, eps: float | None = None, memory: float | None = None
     ) -> xr.DataArray:
-        """The witness function at points (n, 3), positive where this surface has more: see `sobolev_batch.witness`."""
+        """Return the witness function at points (n, 3), positive where this surface has more area.
+
+        See `sobolev_batch.witness`.
+        """
         return witness(self._field, other, order, points, eps=eps, memory=memory)
 
     def at(self, frequencies: ArrayLike, *, reach: float | None = None) -> xr.DataArray:
-        """The field at any frequencies ξ within the cube of its lattice, by band-limited interpolation.
+        """Return the field at any frequencies ξ within the cube of its lattice, by band-limited interpolation.
+
+        The whole field is read.
 
         Args:
-            frequencies: real (n, 3), in cycles per unit length, |ξ_i| <= ξ_max.
-            reach: the surface lies in |x_i| <= reach, in units of length. Computed and stored fields know
-                their surface's bounding box; other ones need it.
+            frequencies: Frequencies ξ, real (n, 3), in cycles per unit length, |ξ_i| <= ξ_max.
+            reach: Half width of a cube |x_i| <= reach that contains the surface, in units of length. Computed and
+                stored fields know their surface's bounding box; other fields need this.
 
         Returns:
-            complex128 (frequency,), with the coordinates xi_x, xi_y, xi_z, `error` (a bound on what
-            interpolation adds) and `amplification` (of the field's own error, at most). Where the box fills a
+            complex128 (frequency,), with the coordinates xi_x, xi_y, xi_z, `error` (a bound on the error of
+            interpolation) and `amplification` (a bound on the factor of the field's own error). If the box fills a
             third of the period, `error` is 2e-10 of the area, and 1e-7 beside the faces of the cube.
-            The whole field is read.
 
         Raises:
-            LatticeError: frequencies beyond the cube.
-            InputError: frequencies that are not finite or not (n, 3); no reach where one is needed.
+            LatticeError: A frequency lies beyond the cube.
+            InputError: Frequencies are not finite or not (n, 3), or reach is needed and missing.
+
+        >>> import sobolev_batch as sb
+        >>> field = sb.fourier_transform(sb.Sphere(), sb.Lattice(xi_max=3.0, M=24))
+        >>> complex(field.sobolev.at([[0.0, 0.0, 0.0]]).item()).real  # the area, 4π
+        12.566...
         """
         return interpolate(self._field, frequencies, reach=reach)
 
     def full(self) -> xr.DataArray:
-        """The field on the whole lattice, (M+1, M+1, M+1): at -ξ it is the conjugate of that at ξ.
+        """Return the field on the whole lattice, (M+1, M+1, M+1); at -ξ it is the conjugate of its value at ξ.
 
-        Lazy where the field is a Dask array; other dimensions stay.
+        The result is lazy if the field is a Dask array. Other dimensions stay.
+
+        >>> import sobolev_batch as sb
+        >>> field = sb.fourier_transform(sb.Sphere(), sb.Lattice(xi_max=3.0, M=24))
+        >>> field.shape, field.sobolev.full().shape
+        ((25, 25, 13), (25, 25, 25))
         """
         return full_lattice(self._field)
 
     def _each_with(
         self, other: Operand, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]
     ) -> xr.Dataset:
-        """Over each field with one other, which is transformed once if it is a surface."""
+        """Apply a function to each field and one other, which is transformed once if it is a surface."""
         stacked = self._stacked()
         first = self._field if stacked is None else self._field.isel({stacked: 0})
         _, common = pair_of(first, other, None, check_orders(order))
         return self._each(lambda field: one(field, common))
 
     def _each(self, one: Callable[[xr.DataArray], xr.Dataset]) -> xr.Dataset:
-        """What is found of each field, one after the other, along the dimension that they are stacked in."""
+        """Apply a function to each field and join the results along the dimension of the stack."""
         stacked = self._stacked()
         if stacked is None:
             return one(self._field)
-        found = [one(self._field.isel({stacked: i})) for i in range(self._field.sizes[stacked])]
-        joined = xr.concat(found, dim=stacked, coords="minimal", compat="equals", join="exact", data_vars="all")
+        results = [one(self._field.isel({stacked: i})) for i in range(self._field.sizes[stacked])]
+        joined = xr.concat(results, dim=stacked, coords="minimal", compat="equals", join="exact", data_vars="all")
         return joined.assign_coords({stacked: self._field[stacked]} if stacked in self._field.coords else {})
 
     def _stacked(self) -> str | None:
-        """The one dimension besides those of a field."""
+        """Return the dimension of the stack, or None for a single field."""
         others = [str(name) for name in self._field.dims if name not in AXES]
         if len(others) > 1:
             raise LatticeError(f"fields may be stacked along one dimension, found {', '.join(others)}")

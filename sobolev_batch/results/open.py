@@ -12,48 +12,119 @@ import xarray as xr
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.errors import DamageError
+from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.parameters import renamed_parameters
+
+# A store as functions for its readers take it.
+AnyStore = str | Path | Location | xr.DataTree
+
+_SOURCE = "source"
+# Attributes of variables that the store itself does not describe.
+_ATTRIBUTES = {
+    "mesh": {"long_name": "label of the mesh"},
+    "other": {"long_name": "label of the other mesh"},
+    "order": {"long_name": "Sobolev order s"},
+    "fourier": {"long_name": "Fourier transform of the area measure", "convention": "∫ exp(-2πi ξ·x) dμ(x)"},
+    **{f"xi_{axis}": {"long_name": f"frequency along {axis}"} for axis in "xyz"},
+    "norm": {"long_name": "Sobolev norm", "kernel": "(1 + |ξ|²)^s"},
+    "distance": {"long_name": "Sobolev distance", "kernel": "(1 + |ξ|²)^s"},
+    "error": {"long_name": "bound on the error"},
+    "truncation": {"long_name": "error of truncation"},
+    "aliasing": {"long_name": "error of aliasing"},
+    "discretisation": {"long_name": "error of discretisation"},
+    "relative": {"long_name": "distance over the norm of the reference", "units": "1"},
+    "relative_error": {"long_name": "bound on the error of the relative distance", "units": "1"},
+    "rate": {"long_name": "observed order of convergence in the edge length", "units": "1"},
+    "rate_error": {"long_name": "bound on the error of the rate", "units": "1"},
+    "area_part": {"long_name": "distance by a change of total area"},
+    "shape_part": {"long_name": "distance by a change of shape"},
+    "edge_length": {"long_name": "mean edge length"},
+    "area": {"long_name": "area"},
+    "seconds": {"long_name": "time spent in tasks"},
+    "resolved": {"long_name": "distance exceeds its error"},
+    "within": {"long_name": "error is as small as the study asks for"},
+}
+
+
+@renamed_parameters(place="store")
+def open_store(store: str | Path | Location) -> xr.DataTree:
+    """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
+
+    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study asks for them also
+    witness and proximity. docs/store.md lists their variables with dimensions and units. Fields stay on disk until
+    you ask for values of them; they have the accessor `field.sobolev`.
+
+    Args:
+        store: Path or URL of the store.
+
+    Raises:
+        StoreError: The location has no store of a study, cannot be reached, or holds something else.
+        DamageError: Data of a table are missing. (Damaged data raise when they are read.)
+
+    >>> import sobolev_batch as sb
+    >>> tree = sb.open_store("storage/icosphere.zarr")
+    >>> tree["convergence"]["distance"].dims
+    ('mesh', 'order')
+    >>> tree["convergence"].attrs["reference"]
+    'reference'
+    """
+    opened = Store.open(store)
+    lost = Tables(opened).lost()
+    if lost:
+        # Without this check they would read as NaN, zero or nothing, like data.
+        raise DamageError(
+            f"{opened.path}: the table {lost[0]} is missing or incomplete; run the study again to replace it",
+            "it is missing",
+        )
+    # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
+    keys: Any = opened.zarr_store()
+    with opened.location.access("read"):
+        tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
+    tree.encoding = {**tree.encoding, _SOURCE: str(store)}
+    for node in tree.subtree:
+        for name, variable in node.dataset.variables.items():
+            variable.attrs = {**_ATTRIBUTES.get(str(name), {}), **variable.attrs}
+    return tree
+
+
+def as_tree(store: AnyStore) -> xr.DataTree:
+    """Return a store as a DataTree, which it may be already."""
+    return store if isinstance(store, xr.DataTree) else open_store(store)
+
+
+def location_of(store: AnyStore) -> str | Path | Location:
+    """Return the path or URL of a store, which may be open.
+
+    Raises:
+        InputError: A DataTree that does not say where it was opened.
+    """
+    if not isinstance(store, xr.DataTree):
+        return store
+    source = store.encoding.get(_SOURCE)
+    if not source:
+        raise InputError(
+            "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "
+            "or give the path or URL of the store"
+        )
+    return str(source)
 
 
 @contextmanager
-def fields_read(place: str | Path | Location) -> Iterator[None]:
-    """Where fields of an open store are read: says what to do about a damaged one.
+def fields_read(store: AnyStore) -> Iterator[None]:
+    """Explain a checksum error that reading a field of an open store raises.
 
     Raises:
-        DamageError: the bytes of a field are not those that were stored.
+        DamageError: The bytes of a field are not those that were stored.
     """
     try:
         yield
     except ValueError as error:
-        # Of zarr's codec, which has no exception of its own.
+        # zarr's codec has no exception of its own.
         if "checksum" not in str(error):
             raise
+        place = (store.encoding.get(_SOURCE) or "the store") if isinstance(store, xr.DataTree) else Location.of(store)
         raise DamageError(
-            f"{Location.of(place)}: a field is damaged: its bytes are not those that were stored; "
-            "sobolev-batch verify tells which, and run computes it again",
+            f"{place}: a field is damaged: its bytes are not those that were stored; "
+            "sobolev-batch verify names it, and run computes it again",
             "its bytes are not those that were stored",
         ) from error
-
-
-def open_store(place: str | Path | Location) -> xr.DataTree:
-    """Open the store at a path or URL lazily, as `xarray.open_datatree(place, engine="zarr")` does.
-
-    Groups: fourier (the fields), meshes, norms, distances, convergence, records; see docs/store.md.
-    Fields stay where they are until values of them are asked for.
-
-    Raises:
-        StoreError: no store of a study is there, it cannot be reached, or it is not as this package writes it.
-        DamageError: data of a table are not there. (Those that are damaged raise when they are read.)
-    """
-    store = Store.open(place)
-    lost = Tables(store).lost()
-    if lost:
-        # They would read as NaN, zero or nothing, like data.
-        raise DamageError(
-            f"{store.path}: the table {lost[0]} is not there, or not all of it; run the study again to make it anew",
-            "it is not there",
-        )
-    # Left to itself, xarray looks for older formats, which nobody has checked, and lists what it knows already.
-    keys: Any = store.zarr_store()
-    with store.location.access("read"):
-        return xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)

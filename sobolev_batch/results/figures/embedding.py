@@ -1,4 +1,4 @@
-"""What a distance matrix says of its meshes: which are alike, and where each lies on a map."""
+"""Structure of a distance matrix: the meshes that are similar, and a map of all of them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scipy.spatial.distance import squareform
 Reals = NDArray[np.float64]
 
 
-def alike_together(distances: Reals) -> NDArray[np.intp]:
-    """An order of meshes in which those that are alike stand beside each other.
+def clustered_order(distances: Reals) -> NDArray[np.intp]:
+    """Return an order of meshes in which similar ones stand beside each other.
 
     Hierarchical clustering by mean distances, its leaves in the order that makes neighbours closest
     (Z. Bar-Joseph et al. 2001, doi:10.1093/bioinformatics/17.suppl_1.S22).
 
     Args:
-        distances: (meshes, meshes), symmetric, without NaN.
+        distances: Distances (meshes, meshes), symmetric, without NaN.
 
     Returns:
         Indices of meshes, (meshes,).
@@ -31,28 +31,27 @@ def alike_together(distances: Reals) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True)
-class Map:
+class Embedding:
     """Meshes as points of the plane.
 
     Attributes:
-        places: (meshes, 2), in the unit of the distances; the first axis is the longer one.
-        share: of the meshes' variance in the space of the norm, what the plane shows; NaN where there is none.
+        points: Coordinates (meshes, 2) in the unit of the distances; the first axis is the longer one.
+        explained: Fraction of the meshes' variance that the plane shows; NaN where all meshes are equal.
     """
 
-    places: Reals
-    share: float
+    points: Reals
+    explained: float
 
     @classmethod
-    def of(cls, distances: Reals) -> Map:
-        """The best plane through the meshes, by classical scaling.
+    def of(cls, distances: Reals) -> Embedding:
+        """Return the best plane through the meshes, by classical scaling.
 
         Distances of a norm are those of points in a Euclidean space, so that double centring gives their
-        inner products exactly, up to the errors of the distances; its first two principal axes span the
-        plane that shows the largest part of their variance. Distances in it are never larger than the
-        true ones.
+        inner products exactly, up to the errors of the distances. Its first two principal axes span the
+        plane that shows most of their variance. Distances in it are never larger than the true ones.
 
         Args:
-            distances: (meshes, meshes), symmetric, without NaN.
+            distances: Distances (meshes, meshes), symmetric, without NaN.
 
         Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952),
         doi:10.1007/BF02288916.
@@ -65,11 +64,11 @@ class Map:
         eigenvalues, axes = np.linalg.eigh(products)
         # Rounding and the errors of the distances make some of them negative.
         variances = np.maximum(eigenvalues[::-1], 0.0)
-        places = np.zeros((count, 2))
+        points = np.zeros((count, 2))
         shown = min(2, count)
-        places[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
-        # The sign of an eigenvector is nobody's choice: without one, pictures would flip between machines.
-        for axis in places.T:
+        points[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
+        # Eigenvectors have no sign of their own: maps would flip between machines.
+        for axis in points.T:
             axis *= np.sign(axis[np.argmax(np.abs(axis))]) or 1.0
         total = variances.sum()
-        return cls(places, float(variances[:2].sum() / total) if total > 0 else float("nan"))
+        return cls(points, float(variances[:2].sum() / total) if total > 0 else float("nan"))

@@ -1,404 +1,392 @@
-"""Pictures of a store: convergence, transforms along one frequency axis, distance matrices, maps of the meshes."""
+"""Plots of a store: convergence, transforms along one frequency axis, distance matrices, maps, spectra."""
 
 from __future__ import annotations
 
-import re
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
+from matplotlib.ticker import PercentFormatter
 
-from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.figures.embedding import Map, alike_together
-from sobolev_batch.results.figures.spectra import Wavelengths
-from sobolev_batch.results.meshes.render import Pictures, render, scales
-from sobolev_batch.results.meshes.views import PICTURES, Axis, Portrait, make_gallery
-from sobolev_batch.results.tables.convergence import chosen_orders, convergence_frame, finished_group
+from sobolev_batch.errors import InputError
+from sobolev_batch.results.figures.embedding import Embedding, clustered_order
+from sobolev_batch.results.figures.spectra import Spectra, spread
+from sobolev_batch.results.figures.style import (
+    add_legend,
+    escaped,
+    family_styles,
+    hide_frame,
+    new_axes,
+    panels,
+    shortened,
+    write_figures,
+)
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read
+from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.groups import (
+    chosen_orders,
+    complete_meshes,
+    families_of,
+    finished_group,
+    reference_of,
+)
 from sobolev_batch.results.tables.matrix import Matrix
-from sobolev_batch.surfaces.sources.names import file_stem
 
-# P. Tol, "Colour schemes" (2021), "bright": told apart with every kind of colour vision. The report has them too.
-COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#777777")
-_MARKERS = "osD^vPX"
-_WIDTH_INCHES = 6.4
-# Of a mesh.
-_HEIGHT_INCHES = 5.0
-_MOST_CURVES = 5
 # In matrices and on maps.
 MOST_MESHES = 300
+_MOST_CURVES = 5
 _MOST_TICKS = 40
-_LONGEST_LABEL = 24
-# Of the width of a map.
+# Distance between names on a map, as a fraction of its width.
 _NAMES_APART = 0.08
-_LEGEND_ENTRIES = 12
-# Smaller ones are not written into their cells.
+# Smaller fractions are not written into their cells.
 _SMALLEST_SHARE = 0.005
-_MOST_BANDS_LEVEL = 6
-# Of a mesh, one for each of its first orders.
-MOST_VIEWS = 6
-_VIEWS_ABREAST = 3
-# Meshes in one picture.
-_MOST_ABREAST = 9
+_MOST_HORIZONTAL_BANDS = 6
+_CONVERGENCE_INCHES, _TRANSFORM_INCHES, _MATRIX_INCHES, _MAP_INCHES = 3.6, 3.4, 5.6, 4.4
 
 
-def plot_store(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
-    """Draw the pictures of an open store into a folder.
+def plot_convergence(store: AnyStore, order: float | None = None, ax: Axes | None = None) -> Axes:
+    """Plot the relative distance to the reference against the mean edge length, one line for each family.
 
-    convergence.png, transform.png and spectrum.png; where the study asks for the
-    distances of all pairs, matrix.png and map.png too.
-
-    Returns:
-        The paths of the pictures.
-
-    Raises:
-        InputError: the store has no tables yet.
-        StoreError: the folder cannot be written.
-    """
-    folder = Path(folder)
-    pictures = {"convergence.png": convergence_figure(tree), "transform.png": transform_figure(tree)}
-    if "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]:
-        pictures |= {"matrix.png": matrix_figure(tree), "map.png": map_figure(tree)}
-    if "similarity" in tree.attrs and (spectra := Wavelengths.of_store(tree)) is not None:
-        pictures["spectrum.png"] = spectrum_figure(spectra, spectra.orders)
-    return _write(pictures, folder)
-
-
-def plot_witnesses(
-    tree: xr.DataTree,
-    output: str | Path,
-    folder: str | Path = ".",
-    wanted: Sequence[str] = (),
-    up: Axis = "z",
-) -> tuple[tuple[Path, ...], Mapping[str, str]]:
-    """Draw meshes of an open store, coloured by their witness functions, into a folder.
-
-    Each as witness-*.png with colours of its own; several also beside each other in witness.png, on one scale of
-    colours, at the study's first order.
+    Both axes are logarithmic; bars show errors, and a dotted line has slope 2. No function of this package touches
+    pyplot: without ``ax``, the plot has a figure of its own, ``ax.figure``.
 
     Args:
-        tree: an open store with tables.
-        output: the folder of the pictures.
-        folder: where relative paths in the study start; meshes are made again by it.
-        wanted: labels; by default those that `make_gallery` chooses.
-        up: the axis that points upwards in the meshes' own coordinates.
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
 
     Returns:
-        The paths of the pictures, and for each mesh without one the reason.
+        The axes.
 
     Raises:
-        InputError: a label that the store does not have, or too many.
-        StoreError: the folder cannot be written.
+        InputError: The store has no tables yet, or lacks the order.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_convergence("storage/icosphere.zarr", order=-10)
+    >>> ax.get_xlabel()
+    "mean edge length in the study's unit"
+    >>> ax.figure.savefig("convergence.png")
     """
-    gallery = make_gallery(tree, tree.attrs["study"]["table"], folder, wanted, PICTURES, up)
-    numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
-    abreast = gallery.portraits[:_MOST_ABREAST]
-    try:
-        rendered = render(gallery.portraits, MOST_VIEWS)
-        on_one_scale = render(abreast, 1, common=True)
-    except InputError as error:
-        return (), {**gallery.absent, **{portrait.label: str(error) for portrait in gallery.portraits}}
-    figures = {
-        f"witness-{file_stem(numbers[portrait.label], portrait.label)}.png": witness_figure(portrait, pictures)
-        for portrait, pictures in zip(gallery.portraits, rendered, strict=True)
-    }
-    if len(abreast) > 1:
-        figures["witness.png"] = witnesses_figure(abreast, [pictures[0] for pictures in on_one_scale])
-    return _write(figures, Path(output)), gallery.absent
+    tree = as_tree(store)
+    order = _order_of(tree, order)
+    axes = ax or new_axes(_CONVERGENCE_INCHES)
+    frame, styles = table(tree, order), family_styles(tree)
+    frame = frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
+    for family, rows in frame.groupby("family", sort=False):
+        ordered = rows.sort_values("edge_length")
+        color, marker = styles[str(family)]
+        sizes, values, errors = (ordered[name].to_numpy() for name in ("edge_length", "relative", "relative_error"))
+        style = f"{marker}-" if (ordered["level"] >= 0).all() else marker
+        axes.loglog(sizes, values, style, color=color, label=escaped(str(family)), markersize=4, linewidth=1.2)
+        axes.errorbar(sizes, values, yerr=_error_bars(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
+    if len(frame):
+        _draw_slope(axes, frame["edge_length"].to_numpy(), frame["relative"].to_numpy())
+        add_legend(axes)
+    axes.set_title(f"order {order:g}")
+    axes.set_xlabel("mean edge length in the study's unit")
+    axes.set_ylabel("relative Sobolev distance")
+    axes.grid(visible=True, which="major", alpha=0.3)
+    return axes
 
 
-def _write(figures: Mapping[str, Figure], folder: Path) -> tuple[Path, ...]:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in figures.items():
-            save(figure, folder / name)
-    except OSError as error:
-        raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
-    return tuple(folder / name for name in figures)
+def plot_transform(store: AnyStore, family: str | None = None, ax: Axes | None = None) -> Axes:
+    """Plot the real part of Fourier fields along the positive ξ_x axis, for a family and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        family: Family of meshes, of which up to five are drawn; default the first that has any.
+        ax: Axes to draw on.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, or no computed mesh of the family.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_transform("storage/icosphere.zarr")
+    >>> [line.get_label() for line in ax.lines]
+    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3', 'reference']
+    """
+    tree = as_tree(store)
+    members, reference = _complete_members(tree), reference_of(tree)
+    family = next(iter(members), None) if family is None else family
+    if family not in members:
+        raise InputError(f"no mesh of the family {family!r} is computed, only of: {', '.join(members) or 'none'}")
+    axes = ax or new_axes(_TRANSFORM_INCHES)
+    fields = tree["fourier"]["fourier"].sel(xi_y=0, xi_z=0, method="nearest")
+    fields = fields.isel(xi_x=slice(fields.sizes["xi_x"] // 2, None))
+    curves = [(label, "-", 1.0) for label in spread(members[family], _MOST_CURVES)]
+    if reference in complete_meshes(tree):
+        curves.append((reference, "k--", 1.2))
+    with fields_read(store):
+        for label, style, width in curves:
+            values = np.real(fields.sel(mesh=label).to_numpy())
+            axes.plot(fields["xi_x"], values, style, linewidth=width, label=escaped(label))
+    axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
+    axes.set_ylabel("Re of the transform")
+    axes.legend(frameon=False, fontsize="small")
+    axes.grid(visible=True, alpha=0.3)
+    return axes
 
 
-def save(figure: Figure, target: object, **options: object) -> None:
-    """Write a picture; characters that its font lacks become boxes."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(target, dpi=150, **options)  # type: ignore[arg-type]
+def plot_matrix(store: AnyStore, order: float | None = None, ax: Axes | None = None) -> Axes:
+    """Plot the distances of all pairs as a heat map, with similar meshes beside each other.
+
+    Colours are on a logarithmic scale. Up to 300 meshes are drawn: the first ones and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on; its figure gets a colour bar too.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order, or has distances to the reference alone.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_matrix("storage/icosphere.zarr", order=-10)
+    >>> len(ax.get_yticklabels())
+    5
+    """
+    tree = as_tree(store)
+    matrix = _matrix_of(tree, order)
+    axes = ax or new_axes(_MATRIX_INCHES)
+    arrangement = clustered_order(matrix.values)
+    values = matrix.values[np.ix_(arrangement, arrangement)]
+    positive = values[values > 0]
+    axes.set_title(f"Sobolev distance of order {matrix.order:g}{_omission(tree, matrix)}")
+    if not positive.size:
+        axes.text(0.5, 0.5, "no two meshes differ", ha="center")
+        axes.set_axis_off()
+        return axes
+    norm = LogNorm(positive.min(), positive.max())
+    image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=norm, cmap="viridis", aspect="equal")
+    axes.figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit")
+    labels = [shortened(matrix.labels[i]) for i in arrangement]
+    size = float(np.clip(240 / len(labels), 4, 8))
+    if len(labels) <= _MOST_TICKS:
+        axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
+        axes.set_yticks(range(len(labels)), labels, fontsize=size)
+    else:
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.set_xlabel(f"{len(labels)} meshes, similar ones beside each other")
+    hide_frame(axes)
+    return axes
 
 
-def convergence_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
-    """Relative distance to the reference against mean edge length, one panel per order."""
-    frame = convergence_frame(tree, orders)
-    styles = _styles(tree)
-    orders = list(dict.fromkeys(frame["order"]))
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.6 * len(orders)), layout="constrained")
-    panels = figure.subplots(len(orders), 1, squeeze=False)[:, 0]
-    for axes, order in zip(panels, orders, strict=True):
-        chosen = frame[(frame["order"] == order) & (frame["relative"] > 0) & frame["edge_length"].notna()]
-        for family, line in chosen.groupby("family", sort=False):
-            ordered = line.sort_values("edge_length")
-            color, marker = styles[str(family)]
-            sizes, values, errors = (ordered[name].to_numpy() for name in ("edge_length", "relative", "relative_error"))
-            style = f"{marker}-" if (ordered["level"] >= 0).all() else marker
-            axes.loglog(sizes, values, style, color=color, label=_plain(str(family)), markersize=4, linewidth=1.2)
-            axes.errorbar(sizes, values, yerr=_reach(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
-        if len(chosen):
-            _draw_slope(axes, chosen["edge_length"].to_numpy(), chosen["relative"].to_numpy())
-            _legend(axes)
-        axes.set_title(f"order {order:g}")
-        axes.set_xlabel("mean edge length in the study's unit")
-        axes.set_ylabel("relative Sobolev distance")
-        axes.grid(visible=True, which="major", alpha=0.3)
-    return figure
+def plot_map(store: AnyStore, order: float | None = None, ax: Axes | None = None) -> Axes:
+    """Plot the meshes as points of a plane whose distances approximate the Sobolev distances.
+
+    The plane shows most of the meshes' variance (classical scaling); distances in it are never larger than the true
+    ones. Up to 300 meshes are drawn: the first ones and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order, or has distances to the reference alone.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_map("storage/icosphere.zarr", order=-10)
+    >>> [text.get_text() for text in ax.get_legend().get_texts()]
+    ['icosphere', 'reference']
+    """
+    tree = as_tree(store)
+    matrix, reference = _matrix_of(tree, order), reference_of(tree)
+    styles, family_of = family_styles(tree), families_of(tree)
+    axes = ax or new_axes(_MAP_INCHES)
+    embedding = Embedding.of(matrix.values)
+    families = [family_of[label] for label in matrix.labels]
+    for family in dict.fromkeys(families):
+        chosen = [i for i, label in enumerate(matrix.labels) if families[i] == family and label != reference]
+        if chosen:
+            color, marker = styles[family]
+            axes.plot(*embedding.points[chosen].T, marker, color=color, label=escaped(family), markersize=5, alpha=0.85)
+    center = matrix.labels.index(reference) if reference in matrix.labels else None
+    if center is not None:
+        axes.plot(*embedding.points[center], "*", color="black", markersize=12, label=escaped(reference))
+    for i in _legible(embedding.points, first=center or 0):
+        if i != center:
+            name = shortened(matrix.labels[i].partition("/")[2] or matrix.labels[i])
+            axes.annotate(name, embedding.points[i], (5, 4), textcoords="offset points", fontsize=7, alpha=0.8)
+    explained = "" if np.isnan(embedding.explained) else f", {embedding.explained:.0%} of the variance"
+    axes.set_title(f"map at order {matrix.order:g}{explained}{_omission(tree, matrix)}", fontsize="medium")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.1)
+    axes.grid(visible=True, alpha=0.3)
+    axes.set_xlabel("in the unit of distances")
+    if matrix.labels:
+        add_legend(axes)
+    return axes
 
 
-def transform_figure(tree: xr.DataTree) -> Figure:
-    """The real part of transforms along the positive ξ_x axis, reference and the levels of each family."""
-    fields = tree["fourier"]["fourier"]
-    meshes = tree["meshes"].to_dataset().load()
-    reference = tree["convergence"].attrs["reference"]
-    complete = meshes["status"].values == "complete"
-    families = [
-        family
-        for family in dict.fromkeys(meshes["family"].values.tolist())
-        if np.any(complete & (meshes["family"].values == family) & (meshes["mesh"].values != reference))
-    ]
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.4 * max(1, len(families))), layout="constrained")
-    panels = figure.subplots(max(1, len(families)), 1, squeeze=False)[:, 0]
-    along = fields.sel(xi_y=0, xi_z=0, method="nearest")
-    along = along.isel(xi_x=slice(fields.sizes["xi_x"] // 2, None))
-    for axes, family in zip(panels, families, strict=False):
-        rows = np.flatnonzero(complete & (meshes["family"].values == family) & (meshes["mesh"].values != reference))
-        spread = np.unique(np.linspace(0, len(rows) - 1, min(_MOST_CURVES, len(rows))).round().astype(int))
-        for row in rows[spread]:
-            values = np.real(along.isel(mesh=int(row)).to_numpy())
-            axes.plot(along["xi_x"], values, linewidth=1, label=_plain(str(meshes["mesh"].values[row])))
-        place = meshes["mesh"].values.tolist().index(reference)
-        if complete[place]:
-            values = np.real(along.isel(mesh=place).to_numpy())
-            axes.plot(along["xi_x"], values, "k--", linewidth=1.2, label=_plain(str(reference)))
-        axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
-        axes.set_ylabel("Re of the transform")
-        axes.legend(frameon=False, fontsize="small")
-        axes.grid(visible=True, alpha=0.3)
-    return figure
+def plot_spectrum(store: AnyStore, order: float | None = None, ax: Axes | None = None) -> Axes:
+    """Plot the fractions of each mesh's squared distance to the reference by wavelength, as a heat map.
+
+    The field of each mesh is read; up to 24 meshes are drawn, evenly through the study.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on; its figure gets a colour bar too.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order, or has no mesh to compare.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_spectrum("storage/icosphere.zarr", order=-10)
+    >>> [text.get_text() for text in ax.get_yticklabels()]
+    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3']
+    """
+    tree = as_tree(store)
+    order = _order_of(tree, order)
+    with fields_read(store):
+        spectra = Spectra.of(tree, order)
+    if spectra is None:
+        raise InputError("the store has no mesh to compare: the reference or all others are not computed")
+    return draw_spectrum(spectra, order, ax)
 
 
-def matrix_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
-    """The distances of all pairs, one panel per order, meshes that are alike beside each other."""
-    matrices = _matrices(tree, orders)
-    figure = Figure(figsize=(_WIDTH_INCHES, 5.6 * len(matrices)), layout="constrained")
-    panels = figure.subplots(len(matrices), 1, squeeze=False)[:, 0]
-    for axes, matrix in zip(panels, matrices, strict=True):
-        arranged = alike_together(matrix.values)
-        values = matrix.values[np.ix_(arranged, arranged)]
-        seen = values[values > 0]
-        axes.set_title(f"Sobolev distance of order {matrix.order:g}{_cut(tree, matrix)}")
-        if not seen.size:
-            axes.text(0.5, 0.5, "no two meshes differ", ha="center")
-            axes.set_axis_off()
-            continue
-        image = axes.imshow(
-            np.ma.masked_less_equal(values, 0), norm=LogNorm(seen.min(), seen.max()), cmap="viridis", aspect="equal"
+def draw_spectrum(spectra: Spectra, order: float, ax: Axes | None = None) -> Axes:
+    """Plot spectra of one order; see `plot_spectrum`."""
+    axes = ax or new_axes(spectrum_inches(spectra))
+    shares = spectra.shares[:, spectra.orders.index(order)]
+    image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
+    axes.figure.colorbar(image, ax=axes, label="fraction of the squared distance", format=PercentFormatter(1.0, 0))
+    for (i, j), share in np.ndenumerate(shares):
+        if share >= _SMALLEST_SHARE:
+            color = "white" if share > 0.6 * np.nanmax(shares) else "black"
+            axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
+    # Long labels would run into each other.
+    is_turned = len(spectra.bands) > _MOST_HORIZONTAL_BANDS
+    rotation, alignment = (20, "right") if is_turned else (0, "center")
+    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, rotation=rotation, ha=alignment)
+    axes.set_yticks(range(len(spectra.labels)), [shortened(label) for label in spectra.labels], fontsize=7.5)
+    axes.set_xlabel("wavelength in the study's unit")
+    axes.set_title(f"differences by wavelength, order {order:g}")
+    hide_frame(axes)
+    return axes
+
+
+def spectrum_inches(spectra: Spectra) -> float:
+    """Return the height of a plot of spectra."""
+    return 1.6 + 0.24 * len(spectra.labels)
+
+
+def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
+    """Write the plots of an open store into a folder, with a panel for each order or family.
+
+    The files are convergence.png, transform.png and spectrum.png; where the study asks for the distances of all pairs,
+    matrix.png and map.png too.
+
+    Returns:
+        Paths of the pictures.
+
+    Raises:
+        InputError: The store has no tables yet.
+        StoreError: The folder cannot be written.
+    """
+    orders = chosen_orders(finished_group(tree, "convergence"), None)
+    figures = {"convergence.png": convergence_figure(tree, orders)}
+    if families := list(_complete_members(tree)):
+        figures["transform.png"] = panels(families, _TRANSFORM_INCHES, partial(plot_transform, tree))
+    if has_pairs(tree):
+        figures |= {"matrix.png": matrix_figure(tree, orders), "map.png": map_figure(tree, orders)}
+    if "similarity" in tree.attrs and (spectra := Spectra.of(tree)) is not None:
+        figures["spectrum.png"] = spectrum_figure(spectra, orders)
+    return write_figures(figures, Path(folder))
+
+
+def convergence_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
+    """Return `plot_convergence` for each order."""
+    return panels(orders, _CONVERGENCE_INCHES, partial(plot_convergence, tree))
+
+
+def matrix_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
+    """Return `plot_matrix` for each order."""
+    return panels(orders, _MATRIX_INCHES, partial(plot_matrix, tree))
+
+
+def map_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
+    """Return `plot_map` for each order."""
+    return panels(orders, _MAP_INCHES, partial(plot_map, tree))
+
+
+def spectrum_figure(spectra: Spectra, orders: Sequence[float]) -> Figure:
+    """Return `plot_spectrum` for each order."""
+    return panels(orders, spectrum_inches(spectra), partial(draw_spectrum, spectra))
+
+
+def has_pairs(tree: xr.DataTree) -> bool:
+    """Return True if the store has the distances of all pairs of meshes."""
+    return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
+
+
+def _order_of(tree: xr.DataTree, order: float | None) -> float:
+    return chosen_orders(finished_group(tree, "convergence"), order)[0]
+
+
+def _matrix_of(tree: xr.DataTree, order: float | None) -> Matrix:
+    matrix = Matrix.of(tree, _order_of(tree, order), MOST_MESHES)
+    if matrix is None:
+        raise InputError(
+            'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
         )
-        figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit")
-        labels = [_plain(_shortened(matrix.labels[i])) for i in arranged]
-        size = float(np.clip(240 / len(labels), 4, 8))
-        if len(labels) <= _MOST_TICKS:
-            axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
-            axes.set_yticks(range(len(labels)), labels, fontsize=size)
-        else:
-            axes.set_xticks([])
-            axes.set_yticks([])
-            axes.set_xlabel(f"{len(labels)} meshes, those that are alike beside each other")
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
-    return figure
+    return matrix
 
 
-def map_figure(tree: xr.DataTree, orders: Sequence[float] | None = None) -> Figure:
-    """The meshes as points whose distances are nearly the Sobolev distances, one panel per order."""
-    matrices = _matrices(tree, orders)
-    styles, family_of = _styles(tree), _families(tree)
-    reference = tree["convergence"].attrs["reference"]
-    figure = Figure(figsize=(_WIDTH_INCHES, 4.4 * len(matrices)), layout="constrained")
-    panels = figure.subplots(len(matrices), 1, squeeze=False)[:, 0]
-    for axes, matrix in zip(panels, matrices, strict=True):
-        found = Map.of(matrix.values)
-        families = [family_of[label] for label in matrix.labels]
-        for family in dict.fromkeys(families):
-            chosen = [i for i, label in enumerate(matrix.labels) if families[i] == family and label != reference]
-            if chosen:
-                color, marker = styles[family]
-                axes.plot(*found.places[chosen].T, marker, color=color, label=_plain(family), markersize=5, alpha=0.85)
-        if reference in matrix.labels:
-            place = found.places[matrix.labels.index(reference)]
-            axes.plot(*place, "*", color="black", markersize=12, label=_plain(reference))
-        for i in _spread(found.places, first=matrix.labels.index(reference) if reference in matrix.labels else 0):
-            if matrix.labels[i] == reference:
-                continue
-            name = matrix.labels[i].partition("/")[2] or matrix.labels[i]
-            axes.annotate(
-                _plain(_shortened(name)), found.places[i], (5, 4), textcoords="offset points", fontsize=7, alpha=0.8
-            )
-        share = "" if np.isnan(found.share) else f", {found.share:.0%} of the variance"
-        axes.set_title(f"map of the meshes at order {matrix.order:g}{share}{_cut(tree, matrix)}", fontsize="medium")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.1)
-        axes.grid(visible=True, alpha=0.3)
-        axes.set_xlabel("in the unit of distances")
-        if matrix.labels:
-            _legend(axes)
-    return figure
-
-
-def spectrum_figure(spectra: Wavelengths, orders: Sequence[float]) -> Figure:
-    """Which part of each mesh's squared distance lies at which wavelengths, one panel per order."""
-    height = 1.6 + 0.24 * len(spectra.labels)
-    figure = Figure(figsize=(_WIDTH_INCHES, height * len(orders)), layout="constrained")
-    labels = [_plain(_shortened(label)) for label in spectra.labels]
-    for axes, order in zip(figure.subplots(len(orders), 1, squeeze=False)[:, 0], orders, strict=True):
-        shares = spectra.shares[:, spectra.orders.index(order)]
-        image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
-        figure.colorbar(image, ax=axes, label="share of the squared distance", format=PercentFormatter(1.0, 0))
-        for (i, j), share in np.ndenumerate(shares):
-            if share >= _SMALLEST_SHARE:
-                color = "white" if share > 0.6 * np.nanmax(shares) else "black"
-                axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
-        # Long ones would run into each other.
-        turned = {"rotation": 20, "ha": "right"} if len(spectra.bands) > _MOST_BANDS_LEVEL else {}
-        axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, **turned)
-        axes.set_yticks(range(len(labels)), labels, fontsize=7.5)
-        axes.set_xlabel("wavelength in the study's unit")
-        axes.set_title(f"where the differences lie, order {order:g}")
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
-    return figure
-
-
-def witness_figure(portrait: Portrait, pictures: Pictures) -> Figure:
-    """A mesh seen from one side, coloured by its witness function, one panel per order that was rendered."""
-    columns = min(_VIEWS_ABREAST, len(pictures))
-    rows = -(-len(pictures) // columns)
-    _, high, wide, _ = pictures.shape
-    # Below each panel its colours, above all of them the name of the mesh.
-    panel = min(_WIDTH_INCHES / columns, _HEIGHT_INCHES * wide / high)
-    figure = Figure(figsize=(_WIDTH_INCHES, 0.3 + rows * (0.7 + panel * high / wide)), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels:
-        axes.set_axis_off()
-    (limits,) = scales([portrait], common=False)
-    for axes, order, largest, picture in zip(panels, portrait.orders, limits, pictures, strict=False):
-        axes.imshow(picture)
-        _draw_scale(figure, axes, largest, order)
-    figure.suptitle(_plain(portrait.label), fontsize="medium")
-    return figure
-
-
-def witnesses_figure(portraits: Sequence[Portrait], pictures: Sequence[np.ndarray]) -> Figure:
-    """Meshes beside each other, coloured by their witness functions of the first order on one scale."""
-    columns = min(_VIEWS_ABREAST, len(portraits))
-    rows = -(-len(portraits) // columns)
-    tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
-    size = (_WIDTH_INCHES, 0.8 + rows * (0.3 + tallest * _WIDTH_INCHES / columns))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.ravel():
-        axes.set_axis_off()
-    for axes, portrait, picture in zip(panels.ravel(), portraits, pictures, strict=False):
-        axes.imshow(picture)
-        axes.set_title(f"{_plain(_shortened(portrait.label))}\n{portrait.whole:,} triangles", fontsize="small")
-    _draw_scale(figure, panels, scales(portraits, common=True)[0][0], portraits[0].orders[0])
-    return figure
-
-
-def _draw_scale(figure: Figure, panels: Axes | np.ndarray, largest: float, order: float) -> None:
-    """What the colours of one panel or of all mean."""
-    numbers = ScalarFormatter()
-    numbers.set_powerlimits((-2, 3))
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(-largest, largest), "RdBu_r"),
-        ax=panels,
-        shrink=0.8,
-        orientation="horizontal",
-        ticks=MaxNLocator(4, symmetric=True),
-        format=numbers,
-        aspect=20 if isinstance(panels, Axes) else 50,
-    )
-    bar.set_label(f"witness, order {order:g}", fontsize="small")
-    bar.ax.tick_params(labelsize="x-small")
-    bar.ax.xaxis.get_offset_text().set_fontsize("x-small")
+def _complete_members(tree: xr.DataTree) -> dict[str, list[str]]:
+    """Return the computed meshes of each family that has any besides the reference."""
+    reference, family_of = reference_of(tree), families_of(tree)
+    members: dict[str, list[str]] = {}
+    for label in complete_meshes(tree):
+        if label != reference:
+            members.setdefault(family_of[label], []).append(label)
+    return members
 
 
 def _draw_slope(axes: Axes, sizes: np.ndarray, errors: np.ndarray) -> None:
-    """A line of second order through the geometric middle of the points."""
+    """Draw a line of second order through the geometric mean of the points."""
     span = np.array([sizes.min(), sizes.max()])
-    middle_size, middle_error = np.exp(np.log(sizes).mean()), np.exp(np.log(errors).mean())
-    axes.loglog(span, middle_error * (span / middle_size) ** 2, "k:", linewidth=1, label="slope 2")
+    mean_size, mean_error = np.exp(np.log(sizes).mean()), np.exp(np.log(errors).mean())
+    axes.loglog(span, mean_error * (span / mean_size) ** 2, "k:", linewidth=1, label="slope 2")
 
 
-def _spread(places: np.ndarray, first: int) -> list[int]:
-    """Points that are far enough from each other for their names to be read."""
+def _legible(points: np.ndarray, first: int) -> list[int]:
+    """Return points that are far enough from each other for their names to be read."""
     kept: list[int] = []
-    apart = _NAMES_APART * np.ptp(places, axis=0).max(initial=0.0)
-    for i in sorted(range(len(places)), key=lambda i: i != first):
-        if all(np.linalg.norm(places[i] - places[j]) > apart for j in kept):
+    apart = _NAMES_APART * np.ptp(points, axis=0).max(initial=0.0)
+    for i in sorted(range(len(points)), key=lambda i: i != first):
+        if all(np.linalg.norm(points[i] - points[j]) > apart for j in kept):
             kept.append(i)
     return kept
 
 
-def _reach(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """How far error bars go down and up; on a logarithmic axis not below zero."""
+def _error_bars(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return error bars that stay above zero, as a logarithmic axis needs."""
     known = np.nan_to_num(errors)
     return np.stack([np.minimum(known, 0.999 * values), known])
 
 
-def _matrices(tree: xr.DataTree, orders: Sequence[float] | None) -> list[Matrix]:
-    chosen = chosen_orders(finished_group(tree, "convergence"), orders)
-    return [matrix for order in chosen if (matrix := Matrix.of(tree, order, MOST_MESHES)) is not None]
-
-
-def _families(tree: xr.DataTree) -> dict[str, str]:
-    """The family of each mesh."""
-    meshes = tree["meshes"].to_dataset()
-    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
-
-
-def _styles(tree: xr.DataTree) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each family; only both together are unique where there are many."""
-    families = dict.fromkeys(_families(tree).values())
-    return {
-        family: (COLORS[i % len(COLORS)], _MARKERS[(i + i // len(COLORS)) % len(_MARKERS)])
-        for i, family in enumerate(families)
-    }
-
-
-def _cut(tree: xr.DataTree, matrix: Matrix) -> str:
-    complete = int(np.count_nonzero(tree["meshes"].to_dataset()["status"].values == "complete"))
-    return f"\nthe first {len(matrix.labels)} of {complete} meshes" if len(matrix.labels) < complete else ""
-
-
-def _legend(axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if len(labels) > _LEGEND_ENTRIES:
-        # A longer one would hide the picture.
-        kept = _LEGEND_ENTRIES - 1
-        labels = [*labels[:kept], f"and {len(labels) - kept} more"]
-        handles = handles[: kept + 1]
-    axes.legend(handles, labels, frameon=False, fontsize="small")
-
-
-def _shortened(label: str) -> str:
-    """A label cut in its middle: labels of one family differ at their ends."""
-    if len(label) <= _LONGEST_LABEL:
-        return label
-    return f"{label[: _LONGEST_LABEL // 2]}…{label[1 - _LONGEST_LABEL // 2 :]}"
-
-
-def _plain(text: str) -> str:
-    """A name as matplotlib shows it unchanged: dollars would begin a formula, a leading underscore hides it."""
-    return re.sub(r"^_", "\u2009_", text.replace("$", r"\$"))
+def _omission(tree: xr.DataTree, matrix: Matrix) -> str:
+    total = len(complete_meshes(tree))
+    return f"\nthe first {len(matrix.labels)} of {total} meshes" if len(matrix.labels) < total else ""

@@ -1,8 +1,8 @@
-"""Draws meshes off screen: a program of its own, since VTK ends the process where it finds no OpenGL.
+"""Program that draws meshes off screen, in a process that VTK may end where it finds no OpenGL.
 
 `render` runs it as ``python _render_process.py SCENE PICTURES``. It imports nothing of the package, whose path it does
-not know. SCENE holds the arrays ``count`` and ``side``, and per mesh i ``vertices_i``, ``triangles_i``,
-``values_i`` (k, vertices) and ``limits_i`` (k,), where colours end; PICTURES gets ``picture_i`` (k, height, width, 3).
+not know. SCENE holds the arrays ``count`` and ``side``, and for each mesh i ``vertices_i``, ``triangles_i``,
+``values_i`` (k, vertices) and the colour limits ``limits_i`` (k,). PICTURES gets ``picture_i`` (k, height, width, 3).
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pyvista
 
-# Towards the eye, which looks from the front and above.
+# Direction to the viewer, from the front and above.
 _EYE = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
 _UP = (0.0, 0.0, 1.0)
-# Of the picture's side, around the mesh.
+# Margin around the mesh, as a fraction of the picture's side.
 _MARGIN = 0.02
-# From above the eye's left shoulder, white: colours are to be told from each other, shapes to be seen.
+# White light from above the viewer's left shoulder, dim enough to keep colours distinct and bright enough for shapes.
 _LIGHT = (-0.5, 0.7, 1.5)
 _AMBIENT = 0.62
-# Where two faces meet at a larger angle, in degrees, the edge is drawn as one.
+# Angle in degrees; where two faces meet at a larger one, the edge is drawn sharp.
 _SHARP = 60.0
-_OF_A_MESH = ("vertices", "triangles", "values", "limits")
+_ARRAYS = ("vertices", "triangles", "values", "limits")
 
 
 def main(scene_path: str, pictures_path: str) -> None:
@@ -31,7 +31,7 @@ def main(scene_path: str, pictures_path: str) -> None:
     scene = np.load(scene_path, allow_pickle=False)
     side = int(scene["side"])
     pictures = {
-        f"picture_{i}": _pictures(*(scene[f"{name}_{i}"] for name in _OF_A_MESH), side=side)
+        f"picture_{i}": _pictures(*(scene[f"{name}_{i}"] for name in _ARRAYS), side=side)
         for i in range(int(scene["count"]))
     }
     np.savez(pictures_path, **pictures)
@@ -43,12 +43,12 @@ def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, *, side: 
     right = np.cross(_UP, _EYE)
     right /= np.linalg.norm(right)
     plane = np.stack([right, np.cross(_EYE, right)], axis=1)
-    seen = vertices @ plane
-    low, high = seen.min(axis=0), seen.max(axis=0)
+    projected = vertices @ plane
+    low, high = projected.min(axis=0), projected.max(axis=0)
     scale = (1 - 2 * _MARGIN) * side / (high - low).max()
     size = [round(scale * extent + 2 * _MARGIN * side) for extent in high - low]
     center = (low + high) / 2 @ plane.T
-    found = []
+    pictures = []
     for row, largest in zip(values, limits, strict=True):
         plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
         plotter.add_light(pyvista.Light(light_type="camera light", position=_LIGHT))
@@ -74,10 +74,9 @@ def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, *, side: 
         plotter.camera.up = _UP
         plotter.camera.parallel_scale = size[1] / (2 * scale)
         plotter.reset_camera_clipping_range()
-        picture = plotter.screenshot(return_img=True)
+        pictures.append(plotter.screenshot(return_img=True))
         plotter.close()
-        found.append(picture)
-    return np.stack(found)
+    return np.stack(pictures)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,14 @@ from typing import Self
 
 import xarray as xr
 
-from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.results.meshes.files import SUFFIXES, VertexField
-from sobolev_batch.results.meshes.rebuild import Remaker, require_known
+from sobolev_batch.results.meshes.rebuild import MeshRebuilder, require_known
 from sobolev_batch.results.meshes.witness import witness_at_vertices
-from sobolev_batch.results.open import fields_read, open_store
-from sobolev_batch.results.tables.convergence import finished_group
-from sobolev_batch.spectral.shells import check_orders
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read
+from sobolev_batch.results.tables.groups import finished_group, reference_of
+from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import file_stem
 
 
@@ -25,114 +25,115 @@ class Exporter:
     """Makes the meshes of a store again, each with its witness function.
 
     Attributes:
-        place: of the store.
-        tree: the store, open.
-        remaker: of its meshes.
-        orders: s, each.
+        tree: Open store.
+        rebuilder: Rebuilder of its meshes.
+        orders: Orders s.
+        reference: Label of the reference, whose own witness function is zero.
     """
 
-    place: str | Path | Location
     tree: xr.DataTree
-    remaker: Remaker
+    rebuilder: MeshRebuilder
     orders: tuple[float, ...]
+    reference: str
 
     @classmethod
-    def of(cls, place: str | Path | Location, orders: Sequence[float] | None = None, folder: str | Path = ".") -> Self:
-        """For the store at a path or URL.
+    def of(cls, store: AnyStore, order: Orders | None = None, folder: str | Path = ".") -> Self:
+        """Return the exporter of a store.
 
         Args:
-            place: path or URL of the store.
-            orders: any below -1/2; by default those of the study.
-            folder: where relative paths in the study start.
+            store: Path, URL or opened DataTree of the store.
+            order: One order below -1/2, or several; by default those of the study.
+            folder: Folder where relative paths in the study start.
 
         Raises:
-            InputError: the store has no tables yet or no field of its reference, or the study's meshes cannot be
-                listed here.
-            OrderError: an order that is not below -1/2.
-            StoreError: no store is there.
+            InputError: The store has no tables yet or no field of its reference, or the study's meshes cannot be
+                listed on this machine.
+            OrderError: An order is not below -1/2.
+            StoreError: The location has no store of a study.
         """
-        tree = open_store(place)
+        tree = as_tree(store)
         of_study = finished_group(tree, "convergence")["order"].values.tolist()
-        chosen = tuple(dict.fromkeys(of_study if orders is None else check_orders(list(orders))))
-        remaker = Remaker.of(tree, tree.attrs["study"]["table"], folder)
-        found = cls(place, tree, remaker, chosen)
-        status = remaker.meshes["status"].sel(mesh=found.reference).item()
+        orders = tuple(dict.fromkeys(check_orders(of_study if order is None else order)))
+        rebuilder, reference = MeshRebuilder.of(tree, folder), reference_of(tree)
+        status = rebuilder.meshes["status"].sel(mesh=reference).item()
         if status != "complete":
-            raise InputError(f"the reference {found.reference!r} is {status}: there is nothing to compare with")
-        return found
+            raise InputError(f"the reference {reference!r} is {status}: no mesh can be compared with it")
+        return cls(tree, rebuilder, orders, reference)
 
-    @property
-    def reference(self) -> str:
-        """The label of the reference, whose own witness is zero."""
-        return str(self.tree["convergence"].attrs["reference"])
-
-    def labels(self, wanted: Sequence[str] = ()) -> tuple[str, ...]:
-        """The meshes to be exported: by default all that are complete and have triangles, without the reference.
+    def labels(self, meshes: Sequence[str] = ()) -> tuple[str, ...]:
+        """Return the meshes to export: by default all computed ones with triangles, without the reference.
 
         Raises:
-            InputError: a label that the store does not have, or the reference's.
+            InputError: The store lacks a label, or it is the reference's.
         """
-        meshes = self.remaker.meshes
-        require_known(wanted, meshes)
-        if self.reference in wanted:
+        table = self.rebuilder.meshes
+        require_known(meshes, table)
+        if self.reference in meshes:
             raise InputError(f"{self.reference!r} is the reference: its witness is zero everywhere")
-        if wanted:
-            return tuple(dict.fromkeys(wanted))
-        chosen = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != self.reference)
-        return tuple(meshes["mesh"].values[chosen.values].tolist())
+        if meshes:
+            return tuple(dict.fromkeys(meshes))
+        chosen = (table["status"] == "complete") & (table["triangles"] > 0) & (table["mesh"] != self.reference)
+        return tuple(table["mesh"].values[chosen.values].tolist())
 
     def stem(self, label: str) -> str:
-        """The name of a file for a mesh, without suffix: its number in the store, and what is plain of its label."""
-        return file_stem(self.remaker.meshes["mesh"].values.tolist().index(label), label)
+        """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
+        return file_stem(self.rebuilder.meshes["mesh"].values.tolist().index(label), label)
 
     def field(self, label: str) -> VertexField:
-        """A mesh with its witness function.
+        """Return a mesh with its witness function.
 
         Raises:
-            SobolevBatchError: the mesh cannot be made again, or its field is damaged.
+            SobolevBatchError: The mesh cannot be made again, or its field is damaged.
         """
-        mesh = self.remaker.make(label)
-        with fields_read(self.place):
+        mesh = self.rebuilder.rebuild(label)
+        with fields_read(self.tree):
             values = witness_at_vertices(self.tree, label, mesh.scaled, self.orders)
-        unit = 1 / self.remaker.similarity.scale
-        study = str(self.tree.attrs["study"]["name"])
-        return VertexField(mesh.own, values, self.orders, unit, label, self.reference, study)
+        unit = 1 / self.rebuilder.similarity.scale
+        return VertexField(
+            mesh.own, values, self.orders, unit, label, self.reference, str(self.tree.attrs["study"]["name"])
+        )
 
 
+@renamed_parameters(label="mesh", orders="order", place="store")
 def write_witness(
-    store: str | Path | Location,
-    label: str,
+    store: AnyStore,
+    mesh: str,
     path: str | Path,
-    orders: Sequence[float] | None = None,
+    order: Orders | None = None,
     folder: str | Path = ".",
 ) -> Path:
     """Write a mesh of a store with its witness function against the reference at its vertices.
 
-    The mesh is made again by its study, and only written if it is, to the bit, the one that was computed. A
+    The study makes the mesh again, and it is written only if it is, to the bit, the one that was computed. A
     PLY file holds the vertices in the mesh's own unit in double precision, a property such as
     ``witness_minus_2`` for each order, and the first order as ``quality``, which MeshLab shows; a .vtp file
-    (XML PolyData, for ParaView) holds arrays such as ``witness, order -2``. Both tell what the numbers are.
+    (XML PolyData, for ParaView) holds arrays such as ``witness, order -2``. Both explain their numbers in comments.
 
     Args:
-        store: path or URL of the store.
-        label: of the mesh, such as "family/name".
-        path: the file to write; its suffix is .ply or .vtp. The latter takes the extra "vtk".
-        orders: any below -1/2; by default those of the study.
-        folder: where relative paths in the study start.
+        store: Path, URL or opened DataTree of the store.
+        mesh: Label of the mesh, such as "family/name".
+        path: File to write; its suffix is .ply or .vtp. The latter needs the extra "vtk".
+        order: One order below -1/2, or several; by default those of the study.
+        folder: Folder where relative paths in the study start.
 
     Returns:
         The path of the file. Its values are in 1 / unit length of the study, positive where the mesh has area
         that the reference lacks; see `witness`.
 
     Raises:
-        InputError: an unknown label or suffix; a library that is not installed; a mesh that cannot be
+        InputError: The label or suffix is unknown; a library is not installed; the mesh cannot be
             made again, or is not the one that was computed.
-        StoreError: no store is there, or the file cannot be written.
+        StoreError: The location has no store, or the file cannot be written.
+
+    >>> import sobolev_batch as sb
+    >>> path = sb.write_witness("storage/icosphere.zarr", "icosphere/2", "icosphere-2.ply", order=-4)
+    >>> sb.read_mesh(path).vertices.shape
+    (162, 3)
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: a witness is written as {' or '.join(SUFFIXES)}, found {path.suffix!r}")
-    exporter = Exporter.of(store, orders, folder)
-    (chosen,) = exporter.labels([label])
-    exporter.field(chosen).write(path)
+    exporter = Exporter.of(store, order, folder)
+    (label,) = exporter.labels([mesh])
+    exporter.field(label).write(path)
     return path

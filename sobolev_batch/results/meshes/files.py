@@ -1,4 +1,4 @@
-"""The witness function at the vertices of a mesh, as a file: PLY, or PolyData of VTK."""
+"""Files of a mesh with its witness function at the vertices: PLY, or PolyData of VTK."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 SUFFIXES = (".ply", ".vtp")
 
-# Of a label in a comment.
+# In a comment.
 _LONGEST_NAME = 200
 
 
@@ -24,13 +24,13 @@ class VertexField:
     """A mesh with its witness function at its vertices.
 
     Attributes:
-        mesh: in its own unit of length.
-        values: (orders, vertices), in 1 / unit length of the study.
-        orders: s, each.
-        unit: the study's unit, in that of the mesh.
-        label: of the mesh in its study.
-        reference: what it is compared with.
-        study: the study's name.
+        mesh: Mesh in its own unit of length.
+        values: Witness function (orders, vertices) in 1 / unit length of the study.
+        orders: Orders s.
+        unit: Study's unit of length, in that of the mesh.
+        label: Label of the mesh in its study.
+        reference: Label of the reference.
+        study: Name of the study.
     """
 
     mesh: Mesh
@@ -42,11 +42,11 @@ class VertexField:
     study: str
 
     def write(self, path: Path) -> None:
-        """Write a file; its suffix, one of `SUFFIXES`, decides on the format.
+        """Write a file in the format of its suffix, one of `SUFFIXES`.
 
         Raises:
-            InputError: the library that writes the format is not installed.
-            StoreError: it cannot be written there.
+            InputError: The library that writes the format is not installed.
+            StoreError: The file cannot be written.
         """
         data = self._ply() if path.suffix == ".ply" else self._vtp()
         try:
@@ -55,13 +55,13 @@ class VertexField:
             raise StoreError(f"{path}: the witness cannot be written there: {error.strerror or error}") from error
 
     def notes(self) -> list[str]:
-        """What the numbers are, each note in one line of ASCII."""
+        """Return lines of ASCII that explain the numbers."""
         label, reference, study = map(_ascii, (self.label, self.reference, self.study))
         return [
             f"witness function of the mesh {label} against {reference}, study {study}",
             "positive where the mesh has area that the reference lacks, negative where it lacks area",
             "in 1 / unit length of the study, orders " + ", ".join(map(_number, self.orders)),
-            f"coordinates are in the unit of the mesh, of which one unit of the study has {self.unit!r}",
+            f"coordinates are in the unit of the mesh; one unit of the study is {self.unit!r} of them",
         ]
 
     def _ply(self) -> bytes:
@@ -70,7 +70,7 @@ class VertexField:
         vertices = np.empty(len(self.mesh.vertices), dtype=kinds)
         for axis, column in zip("xyz", self.mesh.vertices.T, strict=True):
             vertices[axis] = column
-        # The scalar that MeshLab and its like show.
+        # The scalar that MeshLab and similar programs show.
         vertices["quality"] = self.values[0]
         for name, row in zip(names, self.values, strict=True):
             vertices[name] = row
@@ -97,7 +97,7 @@ class VertexField:
             surface.point_data[f"witness, order {_number(order)}"] = row
         surface.point_data.active_scalars_name = f"witness, order {_number(self.orders[0])}"
         surface.field_data["notes"] = self.notes()
-        # Into memory: to a full disk VTK writes without a word.
+        # In memory: VTK does not report a full disk.
         writer = vtkXMLPolyDataWriter()
         writer.SetInputData(surface)
         writer.SetDataModeToBinary()
@@ -111,11 +111,11 @@ def _number(order: float) -> str:
 
 
 def _property(order: float) -> str:
-    """A name of letters, digits and underscores, which is what readers of PLY take."""
+    """Return a name of letters, digits and underscores, which readers of PLY accept."""
     digits = _number(-order).replace(".", "_").replace("+", "")
     return f"witness_minus_{digits}"
 
 
 def _ascii(text: str) -> str:
-    found = text.encode("unicode_escape").decode("ascii")
-    return found if len(found) <= _LONGEST_NAME else found[: _LONGEST_NAME - 3] + "..."
+    escaped = text.encode("unicode_escape").decode("ascii")
+    return escaped if len(escaped) <= _LONGEST_NAME else escaped[: _LONGEST_NAME - 3] + "..."

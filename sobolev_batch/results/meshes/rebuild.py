@@ -7,26 +7,26 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import xarray as xr
 
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.tables.convergence import finished_group
+from sobolev_batch.results.tables.groups import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.registry import Member
 
 
 @dataclass(frozen=True)
-class Remade:
+class RebuiltMesh:
     """A mesh that is, to the bit, the one whose field is stored.
 
     Attributes:
-        own: in its own unit of length, as its file or its source has it.
-        scaled: in the study's unit.
+        own: Mesh in its own unit of length, as in its file or from its source.
+        scaled: Mesh in the study's unit.
     """
 
     own: Mesh
@@ -34,13 +34,13 @@ class Remade:
 
 
 @dataclass(frozen=True)
-class Remaker:
+class MeshRebuilder:
     """Makes meshes of a store again.
 
     Attributes:
-        members: family and member of each surface that the study lists here, by label.
-        meshes: the table of the store that tells what was computed.
-        similarity: from the meshes' own unit of length to the study's.
+        members: Family and member of each surface that the study lists on this machine, by label.
+        meshes: Table of the store about the computed meshes.
+        similarity: Similarity from the meshes' own unit of length to the study's.
     """
 
     members: Mapping[str, tuple[str, Member]]
@@ -48,59 +48,59 @@ class Remaker:
     similarity: Similarity
 
     @classmethod
-    def of(cls, tree: xr.DataTree, table: Mapping[str, Any], folder: str | Path) -> Self:
-        """For an open store.
+    def of(cls, tree: xr.DataTree, folder: str | Path) -> Self:
+        """Return the rebuilder of an open store.
 
         Args:
-            tree: the store.
-            table: the study as it was written.
-            folder: where relative paths in it start.
+            tree: Open store.
+            folder: Folder where relative paths in its study start.
 
         Raises:
-            InputError: the study's meshes cannot be listed here, or the store has no tables yet.
+            InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
         """
         meshes = finished_group(tree, "meshes")
         try:
-            members = members_of(Study.from_table(table, folder=folder))
+            members = members_of(Study.from_table(tree.attrs["study"]["table"], folder=folder))
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
-        found = tree.attrs["similarity"]
-        return cls(members, meshes, Similarity(found["scale"], tuple(found["origin"])))
+        similarity = tree.attrs["similarity"]
+        return cls(members, meshes, Similarity(similarity["scale"], tuple(similarity["origin"])))
 
-    def make(self, label: str, most_triangles: float = math.inf) -> Remade:
-        """The mesh of a label.
+    def rebuild(self, label: str, most_triangles: float = math.inf) -> RebuiltMesh:
+        """Return the mesh of a label.
 
-        Files may have changed, and a store may name files that its study never saw: only a mesh with the
+        Files may have changed, and a store may name files that its study never read: only a mesh with the
         stored digest passes.
 
         Raises:
-            SobolevBatchError: it cannot be made, is larger than it may be, or is not the one that was computed.
+            SobolevBatchError: The mesh cannot be made, is too large, or is not the one that was computed.
         """
-        about = self.meshes.sel(mesh=label)
-        if about["status"].item() != "complete":
-            raise InputError(f"it is {about['status'].item()}")
+        row = self.meshes.sel(mesh=label)
+        triangles = row["triangles"].item()
+        if row["status"].item() != "complete":
+            raise InputError(f"its status is {row['status'].item()!r}")
         if label not in self.members:
             raise InputError("the study makes no such mesh here")
-        if not about["triangles"].item():
+        if not triangles:
             raise InputError("a surface in closed form has no triangles")
-        if about["triangles"].item() > most_triangles:
-            raise InputError(f"it has {about['triangles'].item():,} triangles; up to {most_triangles:,} are made again")
+        if triangles > most_triangles:
+            raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
         own = self.members[label][1].load()
         scaled = self.similarity.apply(own)
-        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != about["digest"].item():
-            raise InputError("what the study makes here is not the mesh that was computed; its files may have changed")
-        return Remade(own, scaled)
+        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
+            raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
+        return RebuiltMesh(own, scaled)
 
 
 def require_known(labels: Sequence[str], meshes: xr.Dataset) -> None:
     """Refuse labels that a store does not have.
 
     Raises:
-        InputError: with a label of the store that one may have been meant for.
+        InputError: A label is unknown; the message suggests one of the store.
     """
     known = meshes["mesh"].values.tolist()
     for label in labels:
         if label not in known:
-            near = difflib.get_close_matches(label, known, n=1)
-            remedy = f"did you mean {near[0]!r}?" if near else f"only such as {known[0]!r}"
+            similar = difflib.get_close_matches(label, known, n=1)
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {known[0]!r}"
             raise InputError(f"the store has no mesh {label!r}, {remedy}")

@@ -16,80 +16,88 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.meshes.views import Portrait
+from sobolev_batch.results.meshes.views import MeshView
 
-# (k, height, width, 3), in red, green and blue.
+# Pictures (k, height, width, 3) in red, green and blue.
 Pictures = NDArray[np.uint8]
 
-_EASEL = Path(__file__).with_name("_render_process.py")
-# A processor draws a picture within a second or two.
-_PATIENCE_SECONDS = 300.0
+_PROGRAM = Path(__file__).with_name("_render_process.py")
 _REMEDY = (
-    "drawing without a display takes EGL and a renderer, on Debian and Ubuntu: "
+    "drawing without a display needs EGL and a renderer, on Debian and Ubuntu: "
     "apt-get install libegl1 libgl1-mesa-dri libx11-6"
 )
 
 
-def render(portraits: Sequence[Portrait], orders: int, side: int = 900, *, common: bool = False) -> list[Pictures]:
+def render(
+    views: Sequence[MeshView],
+    orders: int,
+    side: int = 900,
+    *,
+    common: bool = False,
+    program: Path = _PROGRAM,
+    timeout_seconds: float = 300.0,
+) -> list[Pictures]:
     """Draw each mesh from the front and above, once for each of its first orders.
 
-    Red where the witness is positive, blue where it is negative, as matplotlib's "RdBu_r" between plus and
-    minus the numbers that `scales` tells.
+    Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" between plus and
+    minus `color_limits`.
 
     Args:
-        portraits: the meshes.
-        orders: of each, at most.
-        side: the longer one of each picture, in dots.
-        common: colour all meshes on one scale.
+        views: Meshes to draw.
+        orders: Number of orders of each, at most.
+        side: Longer side of each picture, in pixels.
+        common: Colour all meshes on one scale.
+        program: Program that draws.
+        timeout_seconds: Time for all pictures, each of which takes a processor a second or two.
 
     Raises:
-        InputError: VTK is not installed, or cannot draw here.
+        InputError: VTK is not installed, or cannot draw on this machine.
     """
-    if not portraits:
+    if not views:
         return []
     if find_spec("pyvista") is None:
         raise InputError(
-            "drawing meshes takes the library pyvista, which is not installed; "
+            "drawing meshes needs the library pyvista, which is not installed; "
             "the extra has it: pip install 'sobolev-batch[vtk]'"
         )
-    scene: dict[str, Any] = {"count": np.array(len(portraits)), "side": np.array(side)}
-    for i, (portrait, limits) in enumerate(zip(portraits, scales(portraits, common), strict=True)):
+    scene: dict[str, Any] = {"count": np.array(len(views)), "side": np.array(side)}
+    for i, (view, limits) in enumerate(zip(views, color_limits(views, common), strict=True)):
         scene |= {
             f"limits_{i}": limits[:orders],
-            f"vertices_{i}": portrait.vertices,
-            f"triangles_{i}": portrait.triangles,
-            f"values_{i}": portrait.values[:orders],
+            f"vertices_{i}": view.vertices,
+            f"triangles_{i}": view.triangles,
+            f"values_{i}": view.values[:orders],
         }
     with tempfile.TemporaryDirectory(prefix="sobolev-") as folder:
         files = Path(folder, "scene.npz"), Path(folder, "pictures.npz")
         np.savez(files[0], **scene)
-        _draw(*files)
-        with np.load(files[1], allow_pickle=False) as found:
-            return [found[f"picture_{i}"] for i in range(len(portraits))]
+        _draw([str(program), *map(str, files)], Path(folder), timeout_seconds)
+        with np.load(files[1], allow_pickle=False) as pictures:
+            return [pictures[f"picture_{i}"] for i in range(len(views))]
 
 
-def scales(portraits: Sequence[Portrait], common: bool) -> list[NDArray[np.float64]]:
-    """Where the colours of each mesh end, for each order: at its largest modulus, or at that of all meshes."""
-    largest = [np.abs(portrait.values).max(axis=1) for portrait in portraits]
+def color_limits(views: Sequence[MeshView], common: bool) -> list[NDArray[np.float64]]:
+    """Return the largest modulus of each mesh, or of all of them, for each order."""
+    largest = [np.abs(view.values).max(axis=1) for view in views]
     if common:
-        largest = [np.max(largest, axis=0)] * len(portraits)
+        largest = [np.max(largest, axis=0)] * len(views)
     return [np.where(limits > 0, limits, 1.0) for limits in largest]
 
 
-def _draw(scene: Path, pictures: Path) -> None:
-    """In a process of its own: VTK does not raise where it finds no OpenGL, it crashes."""
+def _draw(arguments: Sequence[str], folder: Path, timeout_seconds: float) -> None:
+    """Draw in a process of its own: without OpenGL, VTK crashes instead of raising."""
     environment = dict(os.environ)
     if sys.platform == "linux":
-        # A display would be tried first, which may be far away or gone; if there is no EGL, OSMesa is next.
+        # Otherwise VTK tries a display first, which may be remote or gone. Without EGL it takes OSMesa.
         environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    # -P: modules beside the program have the names of other libraries.
-    command = [sys.executable, "-P", str(_EASEL), str(scene), str(pictures)]
+    # -P keeps modules beside the program from shadowing libraries of the same name.
+    command = [sys.executable, "-P", *arguments]
     try:
         done = subprocess.run(  # noqa: S603
-            command, env=environment, cwd=scene.parent, capture_output=True, timeout=_PATIENCE_SECONDS, check=False
+            command, env=environment, cwd=folder, capture_output=True, timeout=timeout_seconds, check=False
         )
     except subprocess.TimeoutExpired as error:
-        raise InputError(f"meshes cannot be drawn here: VTK took more than {_PATIENCE_SECONDS:g} s") from error
+        raise InputError(f"meshes cannot be drawn here: VTK took more than {timeout_seconds:g} s") from error
     if done.returncode:
         raise InputError(f"meshes cannot be drawn here: {_reason(done.returncode, done.stderr)}; {_REMEDY}")
 

@@ -1,11 +1,11 @@
-"""Portraits of meshes: where each differs from the reference, as the norm sees it, for looking at."""
+"""Views of meshes: a few meshes of a store, simplified for display, with their witness functions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import fast_simplification
 import numpy as np
@@ -14,32 +14,33 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.meshes.rebuild import Remaker, require_known
+from sobolev_batch.results.meshes.rebuild import MeshRebuilder, require_known
 from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
-from sobolev_batch.results.tables.convergence import convergence_frame, finished_group
+from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.groups import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
-Corners = NDArray[np.int32]
+Triangles = NDArray[np.int32]
 
 Axis = Literal["x", "y", "z"]
 _AXES: tuple[Axis, ...] = get_args(Axis)
 
-# Of a store, where none are named.
+# Of a store, unless meshes are named.
 _MOST_EXTREMES = 4
 _ENOUGH_TRIANGLES = 6_000
-# Larger ones take minutes to be made again.
-_LARGEST_MADE = 2_000_000
+# Larger meshes take minutes to be made again.
+_LARGEST_REBUILT = 2_000_000
 
 
 @dataclass(frozen=True)
-class Detail:
-    """How much may be shown.
+class ViewLimits:
+    """Limits on the size of views.
 
     Attributes:
-        meshes: at most.
-        triangles: of each mesh; larger ones are simplified.
-        values: of all meshes and orders together.
+        meshes: Number of meshes.
+        triangles: Number of triangles of each mesh; larger ones are simplified.
+        values: Number of values of all meshes and orders together.
     """
 
     meshes: int
@@ -48,119 +49,120 @@ class Detail:
 
 
 # Beyond, a page would take long to load and to turn; values take 4 bytes each.
-PAGE = Detail(meshes=4, triangles=12_000, values=500_000)
+PAGE = ViewLimits(meshes=4, triangles=12_000, values=500_000)
 # A picture has hardly more dots on a mesh; values take 8 bytes each, in memory.
-PICTURES = Detail(meshes=100, triangles=200_000, values=50_000_000)
+PICTURES = ViewLimits(meshes=100, triangles=200_000, values=50_000_000)
 
 
 @dataclass(frozen=True)
-class Portrait:
+class MeshView:
     """A mesh with its witness function.
 
     Attributes:
-        label: of the mesh.
-        vertices: (n, 3), in the study's unit of length, turned so that the third axis points upwards.
-        triangles: (m, 3), indices of vertices.
-        values: (orders, n), positive where the mesh has area that the reference lacks; in 1 / unit length.
-        orders: s, each.
-        whole: the number of triangles of the mesh itself; these are a simplification where they are fewer, and
-            cut them where they are more.
+        label: Label of the mesh.
+        vertices: Points (n, 3) in the study's unit of length, turned so that the third axis points upwards.
+        triangles: Indices of vertices, (m, 3).
+        values: Witness function (orders, n), positive where the mesh has area that the reference lacks, in
+            1 / unit length.
+        orders: Orders s.
+        original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
+            and more where it subdivides them.
     """
 
     label: str
     vertices: Reals
-    triangles: Corners
+    triangles: Triangles
     values: Reals
     orders: tuple[float, ...]
-    whole: int
+    original_triangles: int
 
 
 @dataclass(frozen=True)
-class Gallery:
-    """Portraits, and why there are none of others that were asked for.
+class Views:
+    """Views of meshes, and reasons for those that are missing.
 
     Attributes:
-        portraits: in the order of the study.
-        absent: the reason for each mesh without one.
+        views: Views in the order of the study.
+        missing: Reason for each requested mesh without a view.
     """
 
-    portraits: tuple[Portrait, ...]
-    absent: Mapping[str, str]
+    views: tuple[MeshView, ...]
+    missing: Mapping[str, str]
 
 
-def make_gallery(
+def make_views(
     tree: xr.DataTree,
-    table: Mapping[str, Any],
     folder: str | Path,
-    wanted: Sequence[str] = (),
-    detail: Detail = PAGE,
+    meshes: Sequence[str] = (),
+    limits: ViewLimits = PAGE,
     up: Axis = "z",
-) -> Gallery:
+    orders: Sequence[float] | None = None,
+) -> Views:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
     Args:
-        tree: an open store.
-        table: the study as it was written.
-        folder: where relative paths in it start.
-        wanted: labels; by default the closest mesh of each family at the first order, and the farthest ones.
-        detail: how much may be shown.
-        up: the axis that points upwards in the meshes' own coordinates.
+        tree: Open store.
+        folder: Folder where relative paths in the study start.
+        meshes: Labels; by default the closest mesh of each family at the first order, and the farthest ones.
+        limits: Limits on the size of the views.
+        up: Axis that points upwards in the meshes' own coordinates.
+        orders: Orders s of the witness functions; default the store's.
 
     Raises:
-        InputError: a label that the store does not have, or too many.
+        InputError: A label is unknown, or more meshes are named than may be shown.
     """
-    require_known(wanted, finished_group(tree, "meshes"))
-    if len(wanted) > detail.meshes:
-        raise InputError(f"at most {detail.meshes} meshes can be shown, found {len(wanted)}")
-    labels = tuple(dict.fromkeys(wanted)) or tuple(_extremes(tree))
+    require_known(meshes, finished_group(tree, "meshes"))
+    if len(meshes) > limits.meshes:
+        raise InputError(f"at most {limits.meshes} meshes can be shown, found {len(meshes)}")
+    labels = tuple(dict.fromkeys(meshes)) or tuple(_extremes(tree))
     try:
-        remaker = Remaker.of(tree, table, folder)
+        rebuilder = MeshRebuilder.of(tree, folder)
     except InputError as error:
-        return Gallery((), dict.fromkeys(labels, str(error)))
-    orders = tuple(finished_group(tree, "convergence")["order"].values.tolist())
-    portraits, absent = [], {}
+        return Views((), dict.fromkeys(labels, str(error)))
+    chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
+    # A closed mesh has half as many vertices as triangles.
+    most_triangles = min(limits.triangles, 2 * limits.values // (max(1, len(labels)) * len(chosen)))
+    views, missing = [], {}
     for label in labels:
         try:
-            mesh = remaker.make(label, _LARGEST_MADE).scaled
-            # A closed mesh has half as many vertices as triangles.
-            room = 2 * detail.values // (len(labels) * len(orders))
-            portraits.append(_portrait(tree, label, mesh, orders, min(detail.triangles, room), up))
+            mesh = rebuilder.rebuild(label, _LARGEST_REBUILT).scaled
+            views.append(_view(tree, label, mesh, chosen, most_triangles, up))
         except SobolevBatchError as error:
-            absent[label] = str(error)
-    return Gallery(tuple(portraits), absent)
+            missing[label] = str(error)
+    return Views(tuple(views), missing)
 
 
 def _extremes(tree: xr.DataTree) -> Iterator[str]:
-    """The mesh of each family that is closest to the reference, then those that are farthest, while there is room."""
-    frame = convergence_frame(tree)
+    """Yield the mesh of each family that is closest to the reference, then those that are farthest."""
+    frame = table(tree)
     frame = frame[(frame["order"] == frame["order"].iloc[0]) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
-    families = [lines for _, lines in frame.groupby("family", sort=False)]
-    extremes = [lines["distance"].idxmin() for lines in families] + [lines["distance"].idxmax() for lines in families]
+    families = [rows for _, rows in frame.groupby("family", sort=False)]
+    extremes = [rows["distance"].idxmin() for rows in families] + [rows["distance"].idxmax() for rows in families]
     yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
-def _portrait(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int, up: Axis) -> Portrait:
+def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int, up: Axis) -> MeshView:
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
     own, corners = mesh.vertices[used], number[mesh.triangles]
-    vertices, triangles = _for_looking(own, corners, most)
+    vertices, triangles = _for_display(own, corners, most)
     if vertices is own:
         values = witness_at_vertices(tree, label, mesh, orders)[:, used]
     else:
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
         values = witness_at(tree, label, orders, vertices, dtype="complex64")
-    # Axes change places in a circle, so that left stays left.
+    # A cyclic permutation of the axes, which does not mirror the mesh.
     upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
-    return Portrait(label, upright, triangles, values, orders, len(corners))
+    return MeshView(label, upright, triangles, values, orders, len(corners))
 
 
-def _for_looking(vertices: Reals, triangles: Corners, most: int) -> tuple[Reals, Corners]:
-    """Not more triangles than may be shown, and enough to show what varies within one."""
+def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:
+    """Simplify a large mesh, and subdivide a small one so that values vary within its triangles."""
     if len(triangles) > most:
-        found = fast_simplification.simplify(vertices, triangles, target_count=most)
-        return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int32)
+        simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
+        return np.asarray(simplified[0], dtype=np.float64), np.asarray(simplified[1], dtype=np.int32)
     while 4 * len(triangles) <= min(most, _ENOUGH_TRIANGLES):
         vertices, triangles = trimesh.remesh.subdivide(vertices, triangles)
     return np.asarray(vertices), np.asarray(triangles, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""The account of a study that a report gives: what was asked, what came out, of which meshes, by what."""
+"""Texts and tables of a report: the study's settings, its results, its meshes, and how to reproduce it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ import tomli_w
 import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
+from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import convergence_frame, finished_group, has_proximity
-from sobolev_batch.results.tables.formatting import Digits
+from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.formatting import Digits, duration, minus
+from sobolev_batch.results.tables.groups import finished_group, has_proximity
 from sobolev_batch.spectral.lattice import Lattice
 
-# Lines of a page in all; browsers become slow beyond.
-_MOST_LINES = 10_000
-_MOST_MESHES = 5_000
 _LONGEST_VALUE = 300
 
 
@@ -28,9 +27,9 @@ class Cell:
     """One cell of a table.
 
     Attributes:
-        text: as it is shown.
-        key: what it is sorted by: a number or a text; None comes last.
-        mark: what has to be said of it, in a word.
+        text: Text as it is shown.
+        key: Number or text that the column is sorted by; None comes last.
+        mark: Short remark about the number.
     """
 
     text: str
@@ -38,30 +37,30 @@ class Cell:
     mark: str = ""
 
     @classmethod
-    def count(cls, value: int) -> Cell:
-        """A whole number."""
+    def of_count(cls, value: int) -> Cell:
+        """Return the cell of a whole number."""
         return cls(f"{value:,}", value)
 
     @classmethod
-    def words(cls, text: str) -> Cell:
-        """A text, which may be empty."""
+    def of_text(cls, text: str) -> Cell:
+        """Return the cell of a text, which may be empty."""
         return cls(text, text or None)
 
     @classmethod
-    def number(cls, value: float, text: str | None = None, mark: str = "") -> Cell:
-        """A number; nothing where it is NaN."""
+    def of_number(cls, value: float, text: str | None = None, mark: str = "") -> Cell:
+        """Return the cell of a number, empty for NaN."""
         return cls(f"{value:.4g}" if text is None else text, value, mark) if math.isfinite(value) else cls("")
 
 
 @dataclass(frozen=True)
-class Line:
+class TableRow:
     """A mesh in a table.
 
     Attributes:
-        label: of the mesh.
-        family: the number of its family, for its colour.
+        label: Label of the mesh.
+        family: Number of its family, for its colour.
         status: "complete", "failed" or "missing".
-        cells: the other columns.
+        cells: Other columns.
     """
 
     label: str
@@ -75,177 +74,157 @@ class OrderTable:
     """Convergence at one order.
 
     Attributes:
-        order: as it is shown.
-        lines: meshes.
+        order: Order as it is shown.
+        rows: Meshes.
     """
 
     order: str
-    lines: tuple[Line, ...]
+    rows: tuple[TableRow, ...]
 
 
 @dataclass(frozen=True)
-class Account:
-    """All that a report says in words and tables; every text is as it was found and still to be escaped.
+class Content:
+    """Texts and tables of a report, none of them escaped.
 
     Attributes:
-        title: of the study.
-        name: of the study.
-        reference: its label.
-        families: names.
-        asked: what was asked for, by keyword.
-        summary: key figures, by keyword.
-        orders: each as it is shown.
-        tables: of convergence, one per order.
-        meshes: sizes and times of each, in lines of `mesh_columns`.
-        left_out: how many meshes the tables leave out, of convergence and of sizes.
-        failed: the reason of each mesh that failed, or is missing.
-        not_compared: what was asked of each mesh besides that could not be had, and why.
-        accuracy: the rtol that was asked for, None where it was not.
-        has_proximity: whether lines of `tables` end with Hausdorff and Chamfer distances.
-        run: the latest run, by keyword.
-        versions: by library.
-        study_text: the study as TOML.
-        store: where the store is.
+        title: Title of the study.
+        reference: Label of its reference.
+        settings: Settings of the study, by keyword.
+        summary: Key figures, by keyword.
+        orders: Orders as they are shown.
+        tables: Convergence tables, one for each order.
+        meshes: Sizes and times of each mesh.
+        omitted: Number of meshes that the tables of convergence and of sizes leave out.
+        failed: Reason for each mesh that failed or is missing.
+        not_compared: Comparisons of each mesh that could not be made, and why.
+        rtol: Accuracy that the study asks for, or None.
+        has_proximity: True if the tables end with Hausdorff and Chamfer distances.
+        run: Facts about the latest run, by keyword.
+        versions: Versions, by library.
+        study_text: Study as TOML.
     """
 
     title: str
-    name: str
     reference: str
-    families: tuple[str, ...]
-    asked: Mapping[str, str]
+    settings: Mapping[str, str]
     summary: Mapping[str, str]
     orders: tuple[str, ...]
     tables: tuple[OrderTable, ...]
-    meshes: tuple[Line, ...]
-    left_out: tuple[int, int]
+    meshes: tuple[TableRow, ...]
+    omitted: tuple[int, int]
     failed: Mapping[str, str]
     not_compared: Mapping[str, str]
-    accuracy: float | None
+    rtol: float | None
     has_proximity: bool
     run: Mapping[str, str]
     versions: Mapping[str, str]
     study_text: str
-    store: str
 
     @classmethod
-    def of(cls, tree: xr.DataTree, status: Status) -> Account:
-        """The account of an open store.
+    def of(cls, tree: xr.DataTree, status: Status, limits: ReportLimits) -> Content:
+        """Return the content for an open store.
 
         Raises:
-            InputError: the store has no tables yet.
+            InputError: The store has no tables yet.
         """
         meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
         attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
         families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
         orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
-        tables, left_out = _tables(tree, families)
-        lines = tuple(_mesh_lines(meshes, families))
-        study = attributes["study"]
+        tables, omitted = _tables(tree, families, limits.convergence_rows)
+        rows = tuple(_mesh_rows(meshes, families))
         return cls(
             title=attributes["title"],
-            name=study["name"],
             reference=convergence.attrs["reference"],
-            families=families,
-            asked=dict(_asked(attributes, meshes)),
+            settings=dict(_settings(attributes, meshes)),
             summary=dict(_summary(meshes, convergence, orders)),
             orders=orders,
             tables=tables,
-            meshes=lines[:_MOST_MESHES],
-            left_out=(left_out, max(0, len(lines) - _MOST_MESHES)),
+            meshes=rows[: limits.mesh_rows],
+            omitted=(omitted, max(0, len(rows) - limits.mesh_rows)),
             failed=_failures(meshes),
             not_compared=status.not_compared,
-            accuracy=convergence.attrs.get("rtol"),
+            rtol=convergence.attrs.get("rtol"),
             has_proximity=has_proximity(tree),
             run=dict(_run(status)),
             versions=attributes["versions"],
-            study_text=study_text(study["table"]),
-            store=status.store,
+            study_text=study_text(attributes["study"]["table"]),
         )
 
 
-def minus(text: str) -> str:
-    """A number with a minus sign as wide as a digit."""
-    return text.replace("-", "−")
-
-
-def moment(text: str) -> str:
-    """A time of a record, in UTC, for people."""
-    return text.replace("T", " ").removesuffix("Z")
+def utc_text(time: str) -> str:
+    """Return a time of a record, in UTC, for people."""
+    return time.replace("T", " ").removesuffix("Z")
 
 
 def study_text(table: Mapping[str, Any]) -> str:
-    """The study file of a study as it was written, up to comments and layout."""
-    return tomli_w.dumps(_without_nothing(table))
+    """Return the study file of a study, without its comments and layout."""
+    return tomli_w.dumps(_without_nulls(table))
 
 
-def _without_nothing(value: Any) -> Any:
-    """TOML has no null; what is not given is left out."""
+def _without_nulls(value: Any) -> Any:
+    """TOML has no null; keys without a value are left out."""
     if isinstance(value, Mapping):
-        return {key: _without_nothing(entry) for key, entry in value.items() if entry is not None}
-    return [_without_nothing(entry) for entry in value] if isinstance(value, list) else value
+        return {key: _without_nulls(entry) for key, entry in value.items() if entry is not None}
+    return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
 
 
-def _tables(tree: xr.DataTree, families: tuple[str, ...]) -> tuple[tuple[OrderTable, ...], int]:
-    frame = convergence_frame(tree)
-    groups = [(order, lines) for order, lines in frame.groupby("order", sort=False)]
-    most = max(1, _MOST_LINES // max(1, len(groups)))
+def _tables(tree: xr.DataTree, families: tuple[str, ...], most_rows: int) -> tuple[tuple[OrderTable, ...], int]:
+    """Return the table of each order, and how many meshes they leave out."""
+    groups = list(table(tree).groupby("order", sort=False))
+    most = max(1, most_rows // max(1, len(groups)))
     tables = tuple(
-        OrderTable(minus(f"{order:g}"), tuple(_line(line, families) for line in lines[:most].to_dict(orient="records")))
-        for order, lines in groups
-    )
-    return tables, max((len(lines) - most for _, lines in groups), default=0) if len(groups[0][1]) > most else 0
-
-
-def _line(line: Mapping[str, Any], families: tuple[str, ...]) -> Line:
-    about = line["mesh"], families.index(line["family"]), line["status"]
-    if line["status"] != "complete":
-        return Line(*about, (Cell(line["status"]),))
-    distance = Digits.of(line["distance"], line["error"])
-    relative = Digits.of(line["relative"], line["relative_error"])
-    rate = Digits.of(line["rate"], line["rate_error"])
-    mark = "" if line["within"] else "above rtol"
-    area = math.nan if not line["distance"] else (line["area_part"] / line["distance"]) ** 2
-    cells: tuple[Cell, ...] = (
-        Cell.count(line["triangles"]) if line["triangles"] else Cell(""),
-        Cell.number(line["edge_length"]),
-        Cell.number(line["distance"], distance.value, mark if line["resolved"] else "below its error"),
-        Cell.number(line["error"], distance.error),
-        Cell.number(line["relative"], relative.together),
-        Cell.number(line["rate"], rate.together),
-        Cell.number(area, f"{100 * area:.1f} %"),
-    )
-    if "hausdorff" in line:
-        chamfer = Digits.of(line["chamfer"], line["chamfer_error"])
-        cells = (
-            *cells,
-            Cell.number(line["hausdorff"], f"{line['hausdorff']:.3g}"),
-            Cell.number(line["chamfer"], chamfer.together),
+        OrderTable(
+            minus(f"{order:g}"), tuple(_convergence_row(row, families) for row in rows[:most].to_dict(orient="records"))
         )
-    return Line(*about, cells)
+        for order, rows in groups
+    )
+    return tables, max((len(rows) - most for _, rows in groups if len(rows) > most), default=0)
 
 
-def _mesh_lines(meshes: xr.Dataset, families: tuple[str, ...]) -> Iterator[Line]:
-    columns = {name: meshes[name].values.tolist() for name in meshes.data_vars}
-    for i, label in enumerate(meshes["mesh"].values.tolist()):
-        about = {name: values[i] for name, values in columns.items()}
-        is_mesh = about["triangles"] > 0
+def _convergence_row(row: Mapping[str, Any], families: tuple[str, ...]) -> TableRow:
+    mesh = row["mesh"], families.index(row["family"]), row["status"]
+    if row["status"] != "complete":
+        return TableRow(*mesh, (Cell(row["status"]),))
+    distance = Digits.of(row["distance"], row["error"])
+    mark = "" if row["within"] else "above rtol"
+    area = math.nan if not row["distance"] else (row["area_part"] / row["distance"]) ** 2
+    cells: tuple[Cell, ...] = (
+        Cell.of_count(row["triangles"]) if row["triangles"] else Cell(""),
+        Cell.of_number(row["edge_length"]),
+        Cell.of_number(row["distance"], distance.value, mark if row["resolved"] else "below its error"),
+        Cell.of_number(row["error"], distance.error),
+        Cell.of_number(row["relative"], Digits.of(row["relative"], row["relative_error"]).together),
+        Cell.of_number(row["rate"], Digits.of(row["rate"], row["rate_error"]).together),
+        Cell.of_number(area, f"{100 * area:.1f} %"),
+    )
+    if "hausdorff" in row:
+        cells += (
+            Cell.of_number(row["hausdorff"], f"{row['hausdorff']:.3g}"),
+            Cell.of_number(row["chamfer"], Digits.of(row["chamfer"], row["chamfer_error"]).together),
+        )
+    return TableRow(*mesh, cells)
+
+
+def _mesh_rows(meshes: xr.Dataset, families: tuple[str, ...]) -> Iterator[TableRow]:
+    for row in meshes.reset_coords().to_dataframe().reset_index().to_dict(orient="records"):
         counts = {
-            name: Cell.count(about[name]) if is_mesh else Cell("")
+            name: Cell.of_count(row[name]) if row["triangles"] > 0 else Cell("")
             for name in ("vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges")
         }
         cells = (
             counts["vertices"],
             counts["triangles"],
-            Cell.number(about["seconds"], f"{about['seconds']:.2f}"),
-            Cell.words(about["backend"]),
-            Cell.number(about["area"]),
+            Cell.of_number(row["seconds"], f"{row['seconds']:.2f}"),
+            Cell.of_text(row["backend"]),
+            Cell.of_number(row["area"]),
             counts["boundary_edges"],
             counts["nonmanifold_edges"],
             counts["points"],
-            Cell.words(about["worker"]),
-            Cell.words(moment(about["finished"])),
+            Cell.of_text(row["worker"]),
+            Cell.of_text(utc_text(row["finished"])),
         )
-        yield Line(label, families.index(about["family"]), about["status"], cells)
+        yield TableRow(row["mesh"], families.index(row["family"]), row["status"], cells)
 
 
 def _failures(meshes: xr.Dataset) -> dict[str, str]:
@@ -261,35 +240,26 @@ def _summary(meshes: xr.Dataset, convergence: xr.Dataset, orders: tuple[str, ...
     done = int((status[others] == "complete").sum())
     yield "meshes compared", f"{done:,} of {int(others.sum()):,}"
     yield "orders" if len(orders) > 1 else "order", ", ".join(orders) if len(orders) < 5 else f"{len(orders)}"
-    triangles = int(meshes["triangles"].values.sum())
-    yield "triangles in all", _rounded(triangles)
-    yield "computing time", _span(float(np.nansum(meshes["seconds"].values)))
+    yield "triangles in all", _large_count(int(meshes["triangles"].values.sum()))
+    yield "computing time", duration(float(np.nansum(meshes["seconds"].values)))
 
 
-def _rounded(count: int) -> str:
+def _large_count(count: int) -> str:
     for size, unit in ((1e9, "billion"), (1e6, "million")):
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count:,}"
 
 
-def _span(seconds: float) -> str:
-    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds:.3g} s"
-
-
-def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[str, str]]:
+def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[str, str]]:
     study, table = attributes["study"], attributes["study"]["table"]
-    similarity = attributes["similarity"]
     lattice = Lattice(**study["lattice"])
-    own = 1 / similarity["scale"]
-    of = meshes["family"].values.tolist()
+    families = meshes["family"].values.tolist()
     for family in table["family"]:
-        yield f"family {family['name']}", f"{_counted(of.count(family['name']))}: {_described(family)}"
-    described = _described(table["reference"])
-    yield "reference", described if study["reference"] == REFERENCE_LABEL else f"{study['reference']}: {described}"
+        count = families.count(family["name"])
+        yield f"family {family['name']}", f"{count:,} {'mesh' if count == 1 else 'meshes'}: {_source_text(family)}"
+    reference = _source_text(table["reference"])
+    yield "reference", reference if study["reference"] == REFERENCE_LABEL else f"{study['reference']}: {reference}"
     if "accuracy" in table:
         yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
         for reason in (study.get("choice") or {}).get("reasons", ()):
@@ -299,42 +269,37 @@ def _asked(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[
         f"frequencies up to {lattice.xi_max:.6g} cycles per unit length on each axis, {lattice.M} intervals "
         f"(spacing {lattice.spacing:.4g}): wavelengths down to {1 / lattice.xi_max:.4g} units",
     )
-    eps = "" if study["eps"] is None else f", accuracy {study['eps']:g} of the nonuniform FFT"
     if table.get("witness") is not None:
         chosen = table["witness"].get("orders") or study["orders"]
-        yield "witness", f"of order {minus(', '.join(f'{order:g}' for order in chosen))}, at the vertices of every mesh"
+        yield "witness", f"at the vertices of every mesh, order {minus(', '.join(f'{order:g}' for order in chosen))}"
     if table.get("proximity") is not None:
         yield "proximity", "Hausdorff and Chamfer distances of every mesh to the reference"
     dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]
+    eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
     yield "arithmetic", f"{dtype} precision{eps}"
-    origin = ", ".join(f"{x:.6g}" for x in similarity["origin"])
-    if own == 1 and not any(similarity["origin"]):
-        yield "similarity", "none: lengths are in the meshes' own unit"
-    else:
-        yield (
-            "similarity",
-            minus(
-                f"x ↦ {similarity['scale']:.6g} (x - ({origin})): one unit of length is {own:.6g} of the meshes' own"
-            ),
-        )
+    yield "similarity", _similarity_text(attributes["similarity"])
 
 
-def _counted(count: int) -> str:
-    return "1 mesh" if count == 1 else f"{count:,} meshes"
+def _similarity_text(similarity: Mapping[str, Any]) -> str:
+    scale, origin = similarity["scale"], similarity["origin"]
+    if scale == 1 and not any(origin):
+        return "none: lengths are in the meshes' own unit"
+    point = ", ".join(f"{x:.6g}" for x in origin)
+    return minus(f"x ↦ {scale:.6g} (x - ({point})): one unit of length is {1 / scale:.6g} of the meshes' own")
 
 
-def _described(entry: Mapping[str, Any]) -> str:
-    """A source and its parameters, on one line."""
-    parts = [f"{key} {_value(value)}" for key, value in entry.items() if key not in ("name", "source")]
-    text = ", ".join([str(entry.get("source", "")), *parts])
+def _source_text(entry: Mapping[str, Any]) -> str:
+    """Return a source and its parameters on one line."""
+    parameters = [f"{key} {_value_text(value)}" for key, value in entry.items() if key not in ("name", "source")]
+    text = ", ".join([str(entry.get("source", "")), *parameters])
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
 
 
-def _value(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, Mapping):
-        return f"({_described(value)})"
+        return f"({_source_text(value)})"
     if isinstance(value, list):
-        return ", ".join(map(_value, value))
+        return ", ".join(map(_value_text, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -344,7 +309,7 @@ def _run(status: Status) -> Iterator[tuple[str, str]]:
     if status.run is not None:
         yield "state", status.run.state
         yield "driver", status.run.driver
-        yield "begun", moment(status.run.started)
-        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", moment(status.run.seen)
+        yield "begun", utc_text(status.run.started)
+        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", utc_text(status.run.seen)
         if status.run.error:
             yield "error", status.run.error

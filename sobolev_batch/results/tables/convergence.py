@@ -1,21 +1,18 @@
-"""Convergence tables: per family and level, the distance to the reference and the observed rate."""
+"""Convergence tables: for each family and level, the distance to the reference and the observed rate."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
-import numpy as np
 import pandas as pd
 import xarray as xr
-from tabulate import tabulate
 
-from sobolev_batch.errors import InputError
-
-Format = Literal["text", "csv", "json", "markdown", "latex"]
-FORMATS: tuple[Format, ...] = get_args(Format)
+from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables.groups import chosen_orders, finished_group, has_proximity
+from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
+from sobolev_batch.spectral.shells import Orders
 
 _ABOUT = ("family", "name", "level", "status", "reason", "triangles")
 _NUMBERS = (
@@ -34,163 +31,134 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-# In the study's unit of length, where the study asks for them.
+# Where the study asks for them.
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
-TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 _HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
 _PROXIMITY_HEADERS = ("Hausdorff ≥", "Chamfer ± s.e.")
 _NOTE = """\
-The true distance lies within its error: truncation (beyond xi_max; it can only
-raise the distance), aliasing (spacing of the lattice) and discretisation
-(quadrature and NUFFT) together. Lengths are in the study's unit. A distance
-marked * is not larger than its error; no rate is taken from it. The column area
-tells which part of the squared distance a pure change of total area explains."""
+The true distance lies within its error, the sum of truncation (frequencies beyond
+xi_max; they can only add to the distance), aliasing (spacing of the lattice) and
+discretisation (quadrature and NUFFT). Lengths are in the study's unit. A distance
+marked * is not larger than its error, and gives no rate. The column "area" is the
+fraction of the squared distance that a change of total area alone explains."""
 _PROXIMITY_NOTE = """\
-Hausdorff (at least: the largest distance found, from vertices and drawn points
-to the other mesh) and Chamfer (mean distances of drawn points, both ways, with their
-standard error) are for orientation; they know no order."""
+Hausdorff and Chamfer distances are for orientation, and the same at all orders.
+Hausdorff is a lower bound: the largest distance from any vertex or sampled point to
+the other mesh. Chamfer is the mean distance of sampled points, both ways, with its
+standard error."""
 _ACCURACY_NOTE = """\
-The study asks for an error of at most {rtol:g} of each distance; where it is
-larger, the distance is marked !."""
+The study asks for an error of at most {rtol:g} of each distance; a distance
+marked ! has a larger one."""
 
 
-def convergence_frame(tree: xr.DataTree, orders: Sequence[float] | None = None) -> pd.DataFrame:
-    """The convergence table of a store in long form: one line per mesh and order.
+def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
+    """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
-        tree: an open store.
-        orders: which of the store's orders; default all.
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders, or several; default all.
 
     Returns:
-        Columns order, mesh, family, name, level, status, reason, triangles, edge_length, distance,
-        error, truncation, aliasing, discretisation, relative, relative_error, area_part
-        and shape_part (of the distance: what a pure change of total area explains, and the rest; their
-        squares add up to its square), rate, rate_error, resolved (whether the distance exceeds its
-        error), within (whether the error is as small as the study asks for); where the study asks for
-        [proximity] also hausdorff, chamfer and chamfer_error. Lengths are in the study's unit. A mesh that
-        failed has NaN, never a number; so do the parts in a store whose tables were made before there were any.
+        Columns order, mesh, family, name, level, status, reason, triangles, edge_length (mean), distance (to the
+        reference), error and its parts truncation, aliasing and discretisation, relative and relative_error (over the
+        norm of the reference), area_part and shape_part (what a change of total area alone explains of the distance,
+        and the rest: their squares add up to its square), rate (observed order of convergence in the edge length) and
+        rate_error, resolved (the distance exceeds its error), within (the error is as small as the study asks
+        for); where the study asks for [proximity] also hausdorff, chamfer and chamfer_error. Lengths are in
+        the study's unit. Numbers of a mesh that failed are NaN; so are the parts in old stores that lack them. The
+        frame's ``attrs`` have the reference's label and the study's rtol, if it has one.
 
     Raises:
-        InputError: no tables in the store yet, or an order that it was not reduced for.
+        InputError: The store has no tables yet, or lacks an order.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> frame = sb.table("storage/icosphere.zarr", order=-10)
+    >>> frame.attrs["reference"]
+    'reference'
+    >>> frame.set_index("mesh")["rate"].round(1).to_dict()
+    {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
+    tree = as_tree(store)
     convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
     labels = convergence["mesh"].values
     others = labels != convergence.attrs["reference"]
-    about = {key: meshes[key].values[others] for key in _ABOUT}
+    columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in _ABOUT}}
     nearness = {}
     if has_proximity(tree):
-        found = finished_group(tree, "proximity")
-        nearness = {key: found[key].values[others] for key in _PROXIMITIES}
-    parts = []
-    for order in chosen_orders(convergence, orders):
-        here = convergence.sel(order=order)
-        numbers = {key: here[key].values[others] if key in here else math.nan for key in _NUMBERS}
-        parts.append(pd.DataFrame({"order": order, "mesh": labels[others], **about, **numbers, **nearness}))
-    return pd.concat(parts, ignore_index=True)
+        proximity = finished_group(tree, "proximity")
+        nearness = {key: proximity[key].values[others] for key in _PROXIMITIES}
+    frames = []
+    for s in chosen_orders(convergence, order):
+        row = convergence.sel(order=s)
+        numbers = {key: row[key].values[others] if key in row else math.nan for key in _NUMBERS}
+        frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
+    frame = pd.concat(frames, ignore_index=True)
+    frame.attrs = {key: convergence.attrs[key] for key in ("reference", "rtol") if key in convergence.attrs}
+    return frame
 
 
 def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """The convergence table of a store as text for people (text, markdown, latex) or programs (csv, json).
-
-    Raises:
-        InputError: as for `convergence_frame`.
-    """
-    frame = convergence_frame(tree, orders)
-    if style == "csv":
-        return str(frame.to_csv(index=False, lineterminator="\n")).rstrip("\n")
-    if style == "json":
-        records = frame.replace({np.nan: None}).to_dict(orient="records")
-        return json.dumps(records, indent=2, allow_nan=False)
-    reference = tree["convergence"].attrs["reference"]
+    """Return the convergence table of an open store as text; see `table`."""
+    frame = table(tree, orders)
+    if style in ("csv", "json"):
+        return machine_table(frame, style)
     headers = (*_HEADERS, *_PROXIMITY_HEADERS) if has_proximity(tree) else _HEADERS
-    parts = []
-    for order, group in frame.groupby("order", sort=False):
-        cells = [_cells(line)[: len(headers)] for line in group.to_dict(orient="records")]
-        caption = f"Sobolev distance of order {order:g} to {reference}"
-        table = tabulate(
-            cells,
-            headers=headers,
-            tablefmt=TABULATE_FORMATS[style],
-            disable_numparse=True,
-            colalign=("left", *["right"] * (len(headers) - 1)),
-        )
-        parts.append(f"% {caption}\n{table}" if style == "latex" else f"{caption}\n\n{table}")
-    note = _NOTE
+    sections = []
+    for order, rows in frame.groupby("order", sort=False):
+        cells = [_cells(row)[: len(headers)] for row in rows.to_dict(orient="records")]
+        caption = prose(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", style)
+        separator = "\n" if style == "latex" else "\n\n"
+        sections.append(f"{caption}{separator}{printed_table(cells, headers, style)}")
+    sections.append(prose("\n".join(_notes(tree, frame)), style))
+    failures = "\n".join(_failures(tree, frame))
+    return "\n\n".join([*sections, prose(failures, style)] if failures else sections)
+
+
+def _notes(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+    notes = [_NOTE]
     if has_proximity(tree):
-        note += "\n" + _PROXIMITY_NOTE
-    if "rtol" in tree["convergence"].attrs:
-        note += "\n" + _ACCURACY_NOTE.format(rtol=tree["convergence"].attrs["rtol"])
-    parts.append("\n".join(f"% {line}" if style == "latex" else line for line in note.split("\n")))
-    failures = frame.drop_duplicates("mesh").query("status != 'complete'")
-    notes = [f"{line.mesh} is {line.status}: {line.reason}" for line in failures.itertuples(index=False)]
+        notes.append(_PROXIMITY_NOTE)
+    if "rtol" in frame.attrs:
+        notes.append(_ACCURACY_NOTE.format(rtol=frame.attrs["rtol"]))
+    return notes
+
+
+def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+    rows = frame.drop_duplicates("mesh").query("status != 'complete'")
+    failures = [f"{row.mesh} is {row.status}: {row.reason}" for row in rows.itertuples(index=False)]
     if has_proximity(tree):
         reasons = finished_group(tree, "proximity")["reason"].to_series()
-        notes += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
-    if notes:
-        parts.append("\n".join(f"% {note}" if style == "latex" else note for note in notes))
-    return "\n\n".join(parts)
+        failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
+    return failures
 
 
-def has_proximity(tree: xr.DataTree) -> bool:
-    """Whether a store has Hausdorff and Chamfer distances."""
-    return "proximity" in tree.children
-
-
-def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
-    """A table of an open store, in memory unless it may stay where it is.
-
-    Raises:
-        InputError: there are no tables in the store yet.
-    """
-    if name not in tree.children:
-        raise InputError("the store has no tables yet: run the study to its end")
-    found = tree[name].to_dataset()
-    return found.load() if load else found
-
-
-def chosen_orders(table: xr.Dataset, orders: Sequence[float] | None) -> list[float]:
-    """Those of a table's orders that are asked for; all of them by default.
-
-    Raises:
-        InputError: one is not there.
-    """
-    there: list[float] = table["order"].values.tolist()
-    if orders is None:
-        return there
-    for order in orders:
-        if order not in there:
-            known = ", ".join(f"{s:g}" for s in there)
-            raise InputError(f"the store has no order {order:g}, only {known}; add it to the study and run it again")
-    return list(orders)
-
-
-def _cells(line: dict[str, Any]) -> list[str]:
-    if line["status"] != "complete":
-        return [line["mesh"], *["missing"] * (len(_HEADERS) + len(_PROXIMITY_HEADERS) - 1)]
+def _cells(row: dict[str, Any]) -> list[str]:
+    if row["status"] != "complete":
+        return [row["mesh"], *["missing"] * (len(_HEADERS) + len(_PROXIMITY_HEADERS) - 1)]
     return [
-        line["mesh"],
-        f"{line['triangles']:,}" if line["triangles"] else "",
-        _number(line["edge_length"], ".4g"),
-        _with_error(line["distance"], line["error"], ".6e", ".0e") + _mark(line),
-        _number(line["relative"], ".5e"),
-        _with_error(line["rate"], line["rate_error"], ".3f", ".0e"),
-        _area_share(line),
-        _number(line.get("hausdorff", math.nan), ".2e"),
-        _with_error(line.get("chamfer", math.nan), line.get("chamfer_error", math.nan), ".4e", ".0e"),
+        row["mesh"],
+        f"{row['triangles']:,}" if row["triangles"] else "",
+        _number(row["edge_length"], ".4g"),
+        _with_error(row["distance"], row["error"], ".6e", ".0e") + _mark(row),
+        _number(row["relative"], ".5e"),
+        _with_error(row["rate"], row["rate_error"], ".3f", ".0e"),
+        _area_fraction(row),
+        _number(row.get("hausdorff", math.nan), ".2e"),
+        _with_error(row.get("chamfer", math.nan), row.get("chamfer_error", math.nan), ".4e", ".0e"),
     ]
 
 
-def _area_share(line: dict[str, Any]) -> str:
-    """Of a distance that is larger than its error, in per cent."""
-    if not line["resolved"] or math.isnan(line["area_part"]):
+def _area_fraction(row: dict[str, Any]) -> str:
+    if not row["resolved"] or math.isnan(row["area_part"]):
         return ""
-    return f"{100 * (line['area_part'] / line['distance']) ** 2:.1f} %"
+    return f"{100 * (row['area_part'] / row['distance']) ** 2:.1f} %"
 
 
-def _mark(line: dict[str, Any]) -> str:
-    if not line["resolved"]:
+def _mark(row: dict[str, Any]) -> str:
+    if not row["resolved"]:
         return "*"
-    return "" if line["within"] else "!"
+    return "" if row["within"] else "!"
 
 
 def _with_error(value: float, error: float, spec: str, error_spec: str) -> str:

@@ -1,11 +1,11 @@
-"""Numbers as people read them: with the digits that their errors leave them."""
+"""Numbers and durations as people read them; a number has the digits that its error leaves it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-# More are of no use to anybody who reads, whatever the error.
+# More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7
 _DIGITS_WITHOUT_ERROR = 4
 # Beyond these, powers of ten are easier to read.
@@ -16,12 +16,12 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Digits:
-    """A number and its error in words, empty where there is none.
+    """A number and its error as text, which is empty for NaN.
 
     Attributes:
-        value: with as many digits as the error leaves it.
-        error: with two digits, rounded up: the true value still lies within it.
-        together: both, in units of the same power of ten.
+        value: Number with as many digits as the error leaves it.
+        error: Error with two digits, rounded up, so that the true value still lies within it.
+        together: Both, in units of the same power of ten.
     """
 
     value: str
@@ -30,13 +30,13 @@ class Digits:
 
     @classmethod
     def of(cls, value: float, error: float = math.nan) -> Digits:
-        """The digits of a value whose error may be unknown (NaN)."""
+        """Return the digits of a value whose error may be unknown (NaN)."""
         if not math.isfinite(value):
             return cls("")
         if not math.isfinite(error) or error == 0:
-            digits, word = (_MOST_DIGITS, "0") if error == 0 else (_DIGITS_WITHOUT_ERROR, "")
+            digits, shown_error = (_MOST_DIGITS, "0") if error == 0 else (_DIGITS_WITHOUT_ERROR, "")
             shown = _shown(value, _magnitude(value) - digits + 1)
-            return cls(shown, word, f"{shown} ± {word or '?'}")
+            return cls(shown, shown_error, f"{shown} ± {shown_error or '?'}")
         rounded = _rounded_up(error, 2)
         # A value below its error keeps a digit, to be told from zero.
         top = _magnitude(value or rounded)
@@ -51,9 +51,12 @@ class Digits:
 
 
 def concise(value: float, error: float) -> str:
-    """A number with its error in brackets, in units of the last digit: 1.234(5)e-02 is 0.01234 ± 0.00005.
+    """Return a number with its error in brackets, in units of the last digit.
 
-    The error is rounded up. Empty where there is no number; "?" stands for an unknown error.
+    The error is rounded up. NaN gives an empty text; "?" stands for an unknown error.
+
+    >>> concise(0.012341, 0.00005)
+    '1.234(5)e-02'
     """
     if not math.isfinite(value):
         return ""
@@ -72,8 +75,30 @@ def concise(value: float, error: float) -> str:
     return f"{value / 10.0**power:.{power - last}f}({shown})e{power:+03d}"
 
 
+def duration(seconds: float) -> str:
+    """Return a duration in the largest unit of which it has two or more.
+
+    >>> duration(42), duration(5400), duration(1e6)
+    ('42 s', '90 min', '11.6 days')
+    """
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{max(seconds, 0):.3g} s"
+
+
+def minus(text: str) -> str:
+    """Return numbers with minus signs as wide as a digit."""
+    return text.replace("-", "−")
+
+
+def middle_cut(label: str, longest: int) -> str:
+    """Return a label that is cut in its middle: labels of one family differ at their ends."""
+    return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
+
+
 def _magnitude(value: float) -> int:
-    """The power of ten of the first digit."""
+    """Return the power of ten of the first digit."""
     return 0 if value == 0 else int(f"{abs(value):e}".partition("e")[2])
 
 
@@ -83,7 +108,7 @@ def _rounded_up(value: float, digits: int) -> float:
 
 
 def _shown(value: float, last: int) -> str:
-    """A value down to a power of ten."""
+    """Return a value down to a power of ten."""
     value = round(value, -last)
     if value == 0:
         return "0"

@@ -1,43 +1,44 @@
-"""The distances of every mesh to every other and to the reference, order by order."""
+"""Distances of every mesh to every other and to the reference, order by order."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
-from tabulate import tabulate
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.tables.convergence import TABULATE_FORMATS, Format, chosen_orders, finished_group
+from sobolev_batch.results.open import AnyStore, as_tree
 from sobolev_batch.results.tables.formatting import concise
+from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
 
 Reals = NDArray[np.float64]
 
 _COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation")
-# As text; beyond, nobody finds anything.
+# A longer printed matrix cannot be read.
 _MOST_MESHES = 20
-_WIDTH = 100
+_LINE_LENGTH = 100
 _LONGEST_LABEL = 30
 _NOTE = """\
 Digits in brackets are the error in units of the last digit: 1.234(5)e-02 is
-0.01234 ± 0.00005, and the true distance lies within that. Columns have the
-numbers of rows; the matrix is symmetric. Lengths are in the study's unit."""
+0.01234 ± 0.00005, and the true distance lies within that. The columns have the
+numbers of the rows; the matrix is symmetric. Lengths are in the study's unit."""
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """The distances of one order between the meshes that have any.
+    """Distances of one order between all meshes that are computed.
 
     Attributes:
-        order: s.
-        labels: of the meshes, in the study's order.
-        values: (meshes, meshes), symmetric.
-        errors: likewise.
+        order: Order s.
+        labels: Labels of the meshes, in the study's order.
+        values: Distances (meshes, meshes), symmetric.
+        errors: Errors of these.
     """
 
     order: float
@@ -47,121 +48,150 @@ class Matrix:
 
     @classmethod
     def of(cls, tree: xr.DataTree, order: float, most: int | None = None) -> Matrix | None:
-        """The matrix of an open store without its failed meshes; None where the study asked for no such distances.
+        """Return the matrix of an open store; None where the study asks for distances to the reference alone.
 
         Args:
-            tree: an open store.
-            order: one of its orders.
-            most: so many meshes, the first ones and the reference; default all.
+            tree: Open store.
+            order: One of its orders.
+            most: Number of meshes to keep: the first ones and the reference; default all.
         """
-        distances = _distances(tree)
-        (order,) = chosen_orders(distances, [order])
+        distances = finished_group(tree, "distances", load=False)
+        (order,) = chosen_orders(distances, order)
         if distances.sizes["other"] != distances.sizes["mesh"]:
             return None
-        reference = tree["convergence"].attrs["reference"]
-        labels = distances["mesh"].values.tolist()
-        complete = finished_group(tree, "meshes")["status"].values == "complete"
-        kept = [i for i, label in enumerate(labels) if complete[i] and label != reference]
-        place = labels.index(reference)
-        kept = [*kept[: None if most is None else max(0, most - 1)], *([place] if complete[place] else [])]
-        here = distances.sel(order=order).isel(mesh=kept, other=kept).load()
-        return cls(order, tuple(labels[i] for i in kept), here["distance"].values, here["error"].values)
+        reference, complete = reference_of(tree), complete_meshes(tree)
+        others = [label for label in complete if label != reference]
+        kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
+        chosen = distances.sel(order=order, mesh=kept, other=kept).load()
+        return cls(order, tuple(kept), chosen["distance"].values, chosen["error"].values)
+
+
+def matrix(
+    store: AnyStore,
+    order: float,
+    values: Literal["distance", "error", "truncation", "aliasing", "discretisation"] = "distance",
+) -> pd.DataFrame:
+    """Return the distances of every mesh to every other as a matrix.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders.
+        values: Content of the matrix: the distances, their errors, or a part of the errors.
+
+    Returns:
+        A symmetric frame of float64 in the study's unit of length, with the labels of meshes as index "mesh" and
+        columns "other". The columns are the reference alone where the study asks for no more. NaN where a
+        mesh failed. The frame's ``attrs`` have the order and the reference's label.
+
+    Raises:
+        InputError: The store has no tables yet, or lacks the order.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> distances = sb.matrix("storage/icosphere.zarr", order=-10)
+    >>> distances.shape, distances.attrs["reference"]
+    ((5, 5), 'reference')
+    >>> bool((distances == distances.T).all(axis=None))
+    True
+    >>> distances["icosphere/0"].idxmax()
+    'reference'
+    """
+    tree = as_tree(store)
+    distances = finished_group(tree, "distances", load=False)
+    if values not in _COLUMNS:
+        raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
+    (order,) = chosen_orders(distances, order)
+    frame: pd.DataFrame = distances[values].sel(order=order).transpose("mesh", "other").to_pandas()
+    frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
+    return frame
 
 
 def matrix_frame(tree: xr.DataTree, order: float) -> pd.DataFrame:
-    """The distances of one order in long form: one line per mesh and other mesh, itself included.
+    """Return the distances of one order in long form: one row for each pair of meshes.
 
-    ``frame.pivot(index="mesh", columns="other", values="distance")`` is the matrix.
-
-    Args:
-        tree: an open store.
-        order: one of the store's orders.
-
-    Returns:
-        Columns order, mesh, other, distance, error, truncation, aliasing, discretisation, in the study's
-        unit of length. Distances of a mesh that failed are NaN. The others are the reference alone where the
-        study asks for no more.
-
-    Raises:
-        InputError: no tables in the store yet, or an order that it was not reduced for.
+    Columns order, mesh, other, distance, error, truncation, aliasing, discretisation.
     """
-    distances = _distances(tree)
-    here = distances[list(_COLUMNS)].sel(order=chosen_orders(distances, [order])[0]).load()
-    frame = here.to_dataframe(dim_order=["mesh", "other"]).reset_index()
+    distances = finished_group(tree, "distances", load=False)
+    chosen = distances[list(_COLUMNS)].sel(order=chosen_orders(distances, order)[0]).load()
+    frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
     return frame[["order", "mesh", "other", *_COLUMNS]]
 
 
 def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """The distance matrices of a store as text for people (text, markdown, latex) or programs (csv, json).
+    """Return the distance matrices of an open store as text.
 
     Raises:
-        InputError: as for `matrix_frame`; more meshes than people can read, for people.
+        InputError: The store has no tables yet, lacks an order, or has more meshes than a printed matrix can show.
     """
-    distances = _distances(tree)
+    distances = finished_group(tree, "distances", load=False)
     chosen = chosen_orders(distances, orders)
     if style in ("csv", "json"):
-        frame = pd.concat([matrix_frame(tree, order) for order in chosen])
-        if style == "csv":
-            return str(frame.to_csv(index=False, lineterminator="\n")).rstrip("\n")
-        records = frame.astype(object).where(frame.notna(), None).to_dict(orient="records")
-        return json.dumps(records, indent=2, allow_nan=False)
+        return machine_table(pd.concat([matrix_frame(tree, order) for order in chosen]), style)
     count = distances.sizes["mesh"]
     if count > _MOST_MESHES:
         raise InputError(
             f"a matrix of {count} meshes is too large to be read as {style}, which goes up to {_MOST_MESHES}: "
             "take --format csv or json"
         )
-    parts = []
+    sections = []
     for order in chosen:
-        here = distances.sel(order=order).load()
-        caption = f"Sobolev distances of order {order:g}"
-        tables = [_table(here, columns, style) for columns in _groups(here, style)]
-        parts.append("\n\n".join([f"% {caption}" if style == "latex" else caption, *tables]))
-    parts.append("\n".join(f"% {line}" if style == "latex" else line for line in _NOTE.split("\n")))
-    return "\n\n".join(parts)
+        rows = _Rows.of(distances.sel(order=order).load())
+        caption = prose(f"Sobolev distances of order {order:g}", style)
+        tables = [rows.table(columns, style) for columns in rows.column_groups(style)]
+        sections.append("\n\n".join([caption, *tables]))
+    return "\n\n".join([*sections, prose(_NOTE, style)])
 
 
-def _distances(tree: xr.DataTree) -> xr.Dataset:
-    return finished_group(tree, "distances", load=False)
+@dataclass(frozen=True)
+class _Rows:
+    """Cells of a printed matrix, of which a symmetric one has only those below the diagonal.
 
+    Attributes:
+        names: Number and label of each row.
+        cells: Text of each cell, row by row; empty on and above the diagonal of a symmetric matrix.
+        numbers: Number of the row that has the label of each column.
+        is_symmetric: True if rows and columns are the same meshes.
+    """
 
-def _groups(here: xr.Dataset, style: Format) -> list[list[int]]:
-    """Columns that stand beside each other: as many as a line of text has room for."""
-    columns = [j for j in range(here.sizes["other"]) if any(row[1] for row in _rows(here, [j]))]
-    if style != "text":
-        return [columns]
-    taken = max(len(row[0]) for row in _rows(here, [])) + 2
-    widths = [max(len(row[1]) for row in _rows(here, [column])) + 2 for column in columns]
-    each = max(1, (_WIDTH - taken) // max(widths))
-    return [columns[start : start + each] for start in range(0, len(columns), each)]
+    names: list[str]
+    cells: list[list[str]]
+    numbers: list[int]
+    is_symmetric: bool
 
-
-def _rows(here: xr.Dataset, columns: Sequence[int]) -> list[list[str]]:
-    labels, others = (here[name].values.tolist() for name in ("mesh", "other"))
-    values, errors = here["distance"].values, here["error"].values
-    square = labels == others
-    rows = []
-    for i, label in enumerate(labels):
-        short = label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
-        cells = [
-            "" if square and i <= j else concise(float(values[i, j]), float(errors[i, j])) or "missing" for j in columns
+    @classmethod
+    def of(cls, distances: xr.Dataset) -> _Rows:
+        labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
+        symmetric = labels == others
+        values, errors = distances["distance"].values.tolist(), distances["error"].values.tolist()
+        names = [
+            f"{i} {label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + '…'}"
+            for i, label in enumerate(labels, 1)
         ]
-        rows.append([f"{i + 1} {short}", *cells])
-    return rows
+        cells = [
+            [
+                "" if symmetric and i <= j else concise(values[i][j], errors[i][j]) or "missing"
+                for j in range(len(others))
+            ]
+            for i in range(len(labels))
+        ]
+        return cls(names, cells, [labels.index(other) + 1 for other in others], symmetric)
 
+    def column_groups(self, style: Format) -> list[list[int]]:
+        """Return the columns that stand beside each other: as many as a line of text has room for."""
+        columns = [j for j in range(len(self.numbers)) if any(row[j] for row in self.cells)]
+        if style != "text":
+            return [columns]
+        name_width = max(map(len, self.names)) + 2
+        cell_width = max(len(row[j]) for row in self.cells for j in columns) + 2
+        count = max(1, (_LINE_LENGTH - name_width) // cell_width)
+        return [columns[start : start + count] for start in range(0, len(columns), count)]
 
-def _table(here: xr.Dataset, columns: Sequence[int], style: Format) -> str:
-    """One table; of a symmetric matrix the part below the diagonal."""
-    labels, others = (here[name].values.tolist() for name in ("mesh", "other"))
-    # The mesh of the first column has no cells below the diagonal, and a name all the same.
-    named = columns[:1] if labels == others else []
-    rows = [row for i, row in enumerate(_rows(here, columns)) if any(row[1:]) or i in named]
-    return str(
-        tabulate(
-            rows,
-            headers=["", *(str(labels.index(others[j]) + 1) for j in columns)],
-            tablefmt=TABULATE_FORMATS[style],
-            disable_numparse=True,
-            colalign=("left", *["right"] * len(columns)),
-        )
-    )
+    def table(self, columns: Sequence[int], style: Format) -> str:
+        # The mesh of the first column has no cells below the diagonal, and is named all the same.
+        named = columns[:1] if self.is_symmetric else []
+        rows = [
+            [name, *(row[j] for j in columns)]
+            for i, (name, row) in enumerate(zip(self.names, self.cells, strict=True))
+            if i in named or any(row[j] for j in columns)
+        ]
+        return printed_table(rows, ["", *(str(self.numbers[j]) for j in columns)], style)

@@ -186,12 +186,12 @@ def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Pat
 
 def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
-    assert f"{url}, 0 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    assert f"{url}, 0 of 3 already stored" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
     done = call("run", "study.toml", "--store", url, "--workers", "2", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
     assert "botocore" not in done.stderr
-    assert f"{url}, 3 of 3 already there" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
+    assert f"{url}, 3 of 3 already stored" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
     status = call("status", url, folder=tmp_path).stdout.splitlines()
     assert status[0] == f"{url}: 3 of 3 complete, 0 failed, 0 to go"
     assert status[1].startswith("done; by process ")

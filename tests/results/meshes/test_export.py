@@ -74,7 +74,7 @@ def test_the_header_tells_what_the_numbers_are(spheres: Spheres, tmp_path: Path)
     ):
         assert comment in header
     assert "witness_minus_4" not in header
-    unit = re.search(r"one unit of the study has (\S+)", header)
+    unit = re.search(r"one unit of the study is (\S+)", header)
     assert unit is not None
     assert float(unit[1]) == pytest.approx(RADIUS)
 
@@ -179,7 +179,7 @@ def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
 def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
     place, folder = spheres
     exporter = Exporter.of(place, folder=folder)
-    scaled = exporter.remaker.make(LABELS[1]).scaled
+    scaled = exporter.rebuilder.rebuild(LABELS[1]).scaled
     mesh = sb.Mesh(np.vstack([scaled.vertices, [[1e6, 0, 0], [0, 0, 0]]]), scaled.triangles)
     values = witness_at_vertices(exporter.tree, LABELS[1], mesh, ORDERS)
     assert np.isnan(values[:, -2:]).all()
@@ -212,24 +212,26 @@ def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres:
     assert lost.startswith(f"{LABELS[0]}: ")
     assert "No such file" in lost
     assert changed == (
-        "files/beside: what the study makes here is not the mesh that was computed; its files may have changed"
+        "files/beside: the study makes another mesh here than the one that was computed; its files have changed"
     )
     assert [Path(line).name[:4] for line in done.stdout.splitlines()] == ["0003"]
     failed = call(place, "--output", tmp_path, "--folder", folder, "--mesh", "files/bad", "--mesh", "closed/sphere")
     assert failed.exit_code == 3
-    assert failed.stderr == "files/bad: it is failed\nclosed/sphere: a surface in closed form has no triangles\n"
+    assert (
+        failed.stderr == "files/bad: its status is 'failed'\nclosed/sphere: a surface in closed form has no triangles\n"
+    )
 
 
 def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place, folder = spheres
     refused: list[tuple[str, str, list[float] | None, str]] = [
         ("files/besides", "a.ply", None, "no mesh 'files/besides', did you mean 'files/beside'"),
-        ("nobody", "a.ply", None, "no mesh 'nobody', only such as 'files/"),
+        ("nobody", "a.ply", None, "no mesh 'nobody', its labels are such as 'files/"),
         ("reference", "a.ply", None, "'reference' is the reference"),
         ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),
         ("files/beside", "a.ply", [-0.5], "below -1/2, found -0.5"),
         ("files/beside", "a.ply", [], "at least one order"),
-        ("files/bad", "a.ply", None, "it is failed"),
+        ("files/bad", "a.ply", None, "its status is 'failed'"),
     ]
     for label, name, orders, message in refused:
         with pytest.raises(sb.InputError, match=message):
@@ -252,6 +254,6 @@ def test_without_a_reference_there_is_nothing_to_compare_with(
     place, folder = spheres
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    monkeypatch.setattr("sobolev_batch.results.meshes.export.open_store", lambda _: tree)
+    monkeypatch.setattr("sobolev_batch.results.meshes.export.as_tree", lambda _: tree)
     with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
         Exporter.of(place, folder=folder)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
-from sobolev_batch.results.figures.plots import plot_witnesses
+from sobolev_batch.results.figures.witness_plots import write_witness_plots
 from sobolev_batch.results.meshes import render as rendering
 from sobolev_batch.results.meshes.render import render
-from sobolev_batch.results.meshes.views import Portrait, make_gallery
+from sobolev_batch.results.meshes.views import MeshView, make_views
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
 
@@ -27,12 +27,12 @@ Spheres = tuple[str, Path]
 drawing = pytest.mark.skipif(obstacle() is not None, reason=str(obstacle()))
 
 
-def portrait(factors: tuple[float, ...] = (1.0,)) -> Portrait:
+def sphere_view(factors: tuple[float, ...] = (1.0,)) -> MeshView:
     """A sphere that is red to the right and blue to the left."""
     ball = icosphere(3)
     along = ball.vertices @ RIGHT
     values = np.outer(factors, along)
-    return Portrait("a", ball.vertices, ball.triangles.astype(np.int32), values, (-2.0, -4.0), len(ball.triangles))
+    return MeshView("a", ball.vertices, ball.triangles.astype(np.int32), values, (-2.0, -4.0), len(ball.triangles))
 
 
 def redness(picture: NDArray[Any]) -> NDArray[np.float64]:
@@ -44,7 +44,7 @@ def redness(picture: NDArray[Any]) -> NDArray[np.float64]:
 
 @drawing
 def test_red_where_the_witness_is_positive_and_blue_where_it_is_negative() -> None:
-    (pictures,) = render([portrait((1.0, -1e-6))], 6, side=200)
+    (pictures,) = render([sphere_view((1.0, -1e-6))], 6, side=200)
     assert pictures.shape == (2, 200, 200, 3)
     drawn = (pictures[0] < 250).any(axis=-1)
     # A disc, but for its margin and what is nearly white.
@@ -61,7 +61,7 @@ def test_red_where_the_witness_is_positive_and_blue_where_it_is_negative() -> No
 
 @drawing
 def test_one_scale_of_colours_for_all() -> None:
-    strong, weak = portrait((1.0,)), portrait((0.2,))
+    strong, weak = sphere_view((1.0,)), sphere_view((0.2,))
     own, common = (render([strong, weak], 1, side=200, common=common) for common in (False, True))
     assert redness(own[1][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
     assert redness(common[0][0])[100, 170] == pytest.approx(redness(own[0][0])[100, 170], abs=0.02)
@@ -74,7 +74,7 @@ def test_what_is_in_front_hides_what_is_behind() -> None:
     front, back = 0.5 * icosphere(2).vertices + eye, icosphere(2).vertices - eye
     triangles = np.vstack([icosphere(2).triangles + len(front), icosphere(2).triangles]).astype(np.int32)
     values = np.repeat([1.0, -1.0], len(front))[None]
-    (pictures,) = render([Portrait("a", np.vstack([front, back]), triangles, values, (-2.0,), 640)], 1, side=200)
+    (pictures,) = render([MeshView("a", np.vstack([front, back]), triangles, values, (-2.0,), 640)], 1, side=200)
     found = redness(pictures[0])
     assert found[100, 100] > 0.2
     assert found[100, 30] < -0.2
@@ -84,8 +84,8 @@ def test_what_is_in_front_hides_what_is_behind() -> None:
 def test_meshes_seen_from_their_edge_and_no_witness() -> None:
     up, towards = np.array([0.0, 0.0, 1.0]), np.array([1.25, -1.4, 0.0])
     corners = np.array([0 * up, up, towards])
-    edge = Portrait("edge", corners, np.array([[0, 1, 2]], np.int32), np.ones((1, 3)), (-2.0,), 1)
-    zero = Portrait("zero", portrait().vertices, portrait().triangles, np.zeros((1, 642)), (-2.0,), 1280)
+    edge = MeshView("edge", corners, np.array([[0, 1, 2]], np.int32), np.ones((1, 3)), (-2.0,), 1)
+    zero = MeshView("zero", sphere_view().vertices, sphere_view().triangles, np.zeros((1, 642)), (-2.0,), 1280)
     seen, white = render([edge, zero], 1, side=100)
     assert seen.shape[2] < seen.shape[1] == 100
     assert np.abs(redness(white[0])).max() < 0.02
@@ -95,7 +95,7 @@ def test_meshes_seen_from_their_edge_and_no_witness() -> None:
 @drawing
 def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
-    paths, _ = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
+    paths, _ = write_witness_plots(open_store(place), tmp_path, folder, LABELS[:2])
     assert [path.name for path in paths][-1] == "witness.png"
     assert len(paths) == 3
 
@@ -104,10 +104,7 @@ def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
 def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spheres) -> None:
     place, folder = spheres
     tree = open_store(place)
-    plain, turned = (
-        make_gallery(tree, tree.attrs["study"]["table"], folder, [LABELS[1]], up=axis).portraits[0].vertices
-        for axis in ("z", up)
-    )
+    plain, turned = (make_views(tree, folder, [LABELS[1]], up=axis).views[0].vertices for axis in ("z", up))
     assert (turned[:, 2] == plain[:, "xyz".index(up)]).all()
     # Turned, not mirrored.
     volumes = [np.linalg.det(vertices[[0, 100, 300]]) for vertices in (plain, turned)]
@@ -143,7 +140,7 @@ def test_plot_does_without_what_cannot_be_drawn(
     assert "No such file" in elsewhere.stderr
     assert not list(tmp_path.glob("witness-*"))
     monkeypatch.setattr(rendering, "find_spec", lambda _: None)
-    paths, absent = plot_witnesses(open_store(place), tmp_path, folder, LABELS[:2])
+    paths, absent = write_witness_plots(open_store(place), tmp_path, folder, LABELS[:2])
     assert paths == ()
     assert list(absent) == list(LABELS[:2])
     for reason in absent.values():
@@ -163,13 +160,11 @@ def test_plot_does_without_what_cannot_be_drawn(
 def test_whatever_happens_to_the_process_that_draws_is_said(
     program: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "easel.py").write_text(program)
-    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    (tmp_path / "program.py").write_text(program)
     monkeypatch.setattr(rendering, "find_spec", lambda _: True)
-    if "sleep" in program:
-        monkeypatch.setattr(rendering, "_PATIENCE_SECONDS", 0.5)
+    timeout = 0.5 if "sleep" in program else 60.0
     with pytest.raises(InputError, match=f"meshes cannot be drawn here: {reason}"):
-        render([portrait()], 1)
+        render([sphere_view()], 1, program=tmp_path / "program.py", timeout_seconds=timeout)
 
 
 @drawing
@@ -177,7 +172,7 @@ def test_whatever_happens_to_the_process_that_draws_is_said(
 def test_a_machine_without_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
     with pytest.raises(InputError, match=r"cannot be drawn here: VTK (crashed|failed) .*libgl1-mesa-dri libx11-6"):
-        render([portrait()], 1)
+        render([sphere_view()], 1)
 
 
 @drawing
@@ -185,9 +180,8 @@ def test_neither_a_display_that_is_gone_nor_what_lies_around_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DISPLAY", "203.0.113.1:0")
-    shutil.copy(rendering._EASEL, tmp_path)
-    monkeypatch.setattr(rendering, "_EASEL", tmp_path / "easel.py")
+    program = shutil.copy(rendering._PROGRAM, tmp_path)
     (tmp_path / "pyvista.py").write_text("raise ImportError('not the library')")
     monkeypatch.chdir(tmp_path)
-    render([portrait()], 1, side=50)
+    render([sphere_view()], 1, side=50, program=Path(program))
     assert capfd.readouterr() == ("", "")

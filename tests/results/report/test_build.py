@@ -14,12 +14,15 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 
+import sobolev_batch as sb
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.cli import cli
-from sobolev_batch.results.meshes.views import make_gallery
-from sobolev_batch.results.report.build import make_report, write_report
+from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.meshes.views import make_views
+from sobolev_batch.results.report import build
+from sobolev_batch.results.report.build import make_report
+from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import convergence_frame
 from tests.support.browser import Browser, browser
 
 SCRIPT = "<script>window.ran=1</script>"
@@ -133,7 +136,7 @@ def test_the_order_switches_tables_and_pictures(reader: Browser, store: str) -> 
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
-    frame = convergence_frame(open_store(store)).dropna(subset="distance")
+    frame = sb.table(store).dropna(subset="distance")
     for order, name in ((-10.0, "−10"), (-3.0, "−3")):
         assert reader.texts(".current-order b") == [name]
         shown = [float(x.split()[0]) for x in reader.texts("#table-convergence tbody:not([hidden]) td:nth-of-type(3)")]
@@ -221,37 +224,37 @@ def test_the_study_can_be_run_again(page: Path, folder: Path, reader: Browser) -
 
 def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> None:
     tree = open_store(store)
-    study = tree.attrs["study"]["table"]
-    gallery = make_gallery(tree, study, folder, ["files/good", "reference", "files/<b>bad<"])
-    assert [portrait.label for portrait in gallery.portraits] == ["files/good"]
-    assert gallery.absent == {"reference": "a surface in closed form has no triangles", "files/<b>bad<": "it is failed"}
-    (portrait,) = gallery.portraits
-    assert portrait.values.shape == (2, len(portrait.vertices))
+    made = make_views(tree, folder, ["files/good", "reference", "files/<b>bad<"])
+    assert made.missing == {
+        "reference": "a surface in closed form has no triangles",
+        "files/<b>bad<": "its status is 'failed'",
+    }
+    (view,) = made.views
+    assert view.label == "files/good"
+    assert view.values.shape == (2, len(view.vertices))
     # An inscribed mesh has less area than the sphere everywhere.
-    assert (portrait.values < 0).all()
-    elsewhere = make_gallery(tree, study, folder / "results.zarr", ["files/good"])
-    assert "cannot be listed here" in elsewhere.absent["files/good"]
+    assert (view.values < 0).all()
+    elsewhere = make_views(tree, folder / "results.zarr", ["files/good"])
+    assert "cannot be listed here" in elsewhere.missing["files/good"]
+    study = tree.attrs["study"]["table"]
     changed = {**study, "family": [study["family"][0], {**study["family"][1], "source": "icosphere", "levels": [1]}]}
     changed["family"][1].pop("paths")
-    renamed = make_gallery(tree, changed, folder, [f"{FAMILY}/0", "files/good"])
-    assert list(renamed.absent) == ["files/good"]
+    tree.attrs = {**tree.attrs, "study": {**tree.attrs["study"], "table": changed}}
+    renamed = make_views(tree, folder, [f"{FAMILY}/0", "files/good"])
+    assert list(renamed.missing) == ["files/good"]
     with pytest.raises(InputError, match="no mesh 'nobody'"):
-        make_gallery(tree, study, folder, ["nobody"])
+        make_views(tree, folder, ["nobody"])
 
 
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_LINES", 6)
-    monkeypatch.setattr("sobolev_batch.results.report.content._MOST_MESHES", 2)
-    monkeypatch.setattr("sobolev_batch.results.report.charts.MOST_MESHES", 3)
-    monkeypatch.setattr("sobolev_batch.results.figures.spectra._MOST_MESHES", 2)
     nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
-    monkeypatch.setattr("sobolev_batch.results.report.build._stills", lambda *_: nothing)
-    text = make_report(store, folder=folder)
+    monkeypatch.setattr(build, "_pictures", lambda *_: nothing)
+    text = make_report(store, folder=folder, limits=ReportLimits(convergence_rows=6, mesh_rows=2, pairs=3, spectra=2))
     for note in (
-        "2 more meshes are left out here; <code>sobolev-batch table --format csv</code>",
-        "4 more meshes are left out here.",
-        "Of 5 meshes the first 3 are shown, the reference among them",
-        "Of 4 meshes 2 are shown, evenly through the study",
+        "2 more meshes are not shown here; <code>sobolev-batch table --format csv</code>",
+        "4 more meshes are not shown here.",
+        "The first 3 of 5 meshes are shown, including the reference",
+        "2 of 4 meshes are shown, spread evenly through the study",
     ):
         assert note in text
 
@@ -259,13 +262,13 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
 def test_a_page_without_rendered_pictures_says_why(
     store: str, folder: Path, page: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    note = "No pictures here: meshes cannot be drawn here: no &lt;OpenGL&gt;</p>"
+    note = "No picture: meshes cannot be drawn here: no &lt;OpenGL&gt;</p>"
     assert note not in page.read_text(encoding="utf-8")
 
     def nothing(*_: object) -> None:
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
-    monkeypatch.setattr("sobolev_batch.results.report.build.render", nothing)
+    monkeypatch.setattr(build, "render", nothing)
     assert make_report(store, folder=folder).count(note) == 1
 
 
@@ -280,15 +283,15 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
     }
     place, path = "memory://near.zarr", tmp_path / "report.html"
     run(Study.from_table(study), place)
-    write_report(place, path)
+    assert sb.report(place, path) == path
     with browser(tmp_path / "profile") as reader:
         reader.open(path)
         assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff ≥", "Chamfer"]
         cells = reader.texts("#table-convergence tbody:not([hidden]) tr:last-child td")
         assert len(cells) == 9
         assert "±" in cells[-1]
-        assert "Chamfer the mean distance" in reader.texts("#convergence")[0]
-        assert "proximity" in reader.texts("#asked dt")
+        assert "Chamfer is the mean distance" in reader.texts("#convergence")[0]
+        assert "proximity" in reader.texts("#study-settings dt")
 
 
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,10 +304,10 @@ def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatc
 
 
 def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def damaged(tree: xr.DataTree) -> None:
+    def damaged(*_: object, **__: object) -> None:
         raise ValueError("Stored and computed checksum do not match.")
 
-    monkeypatch.setattr("sobolev_batch.results.report.build.Wavelengths.of_store", damaged)
+    monkeypatch.setattr(Spectra, "of", damaged)
     with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
         make_report(store)
 
@@ -312,16 +315,16 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="no store of a study is there"):
         make_report(tmp_path)
-    monkeypatch.setattr("sobolev_batch.results.report.build.make_report", lambda *_, **__: "")
+    monkeypatch.setattr(build, "make_report", lambda *_, **__: "")
     with pytest.raises(StoreError, match="cannot be written there"):
-        write_report(store, tmp_path / "nowhere" / "a.html")
+        sb.report(store, tmp_path / "nowhere" / "a.html")
 
 
 def test_what_is_missing_is_said(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     empty = xr.DataTree()
     empty.attrs = open_store(store).attrs
     with monkeypatch.context() as patch:
-        patch.setattr("sobolev_batch.results.report.build.open_store", lambda place: empty)
+        patch.setattr(build, "as_tree", lambda store: empty)
         with pytest.raises(InputError, match="no tables yet: run the study to its end"):
             make_report(store)
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)

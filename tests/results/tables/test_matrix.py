@@ -6,12 +6,13 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
-from sobolev_batch import InputError
-from sobolev_batch.results.tables.convergence import Format
+from sobolev_batch import InputError, matrix
 from sobolev_batch.results.tables.matrix import Matrix, format_matrix, matrix_frame
+from sobolev_batch.results.tables.text import Format
 
 ORDERS = [-4.0, -2.0]
 
@@ -46,12 +47,18 @@ def made(count: int, failed: int = 1, others: str = "all") -> xr.DataTree:
 def test_frame_becomes_the_matrix() -> None:
     frame = matrix_frame(made(4), -2.0)
     assert frame.columns.tolist()[:4] == ["order", "mesh", "other", "distance"]
-    matrix = frame.pivot(index="mesh", columns="other", values="distance")
-    assert matrix.loc["f/0", "f/3"] == matrix.loc["f/3", "f/0"] == 30.0
-    assert matrix.loc["reference", "f/2"] == 30.0
-    assert matrix.loc["f/0", "f/0"] == 0.0
-    assert matrix["f/1"].isna().all()
+    pivoted = frame.pivot(index="mesh", columns="other", values="distance")
+    public = matrix(made(4), -2.0)
+    pd.testing.assert_frame_equal(public, pivoted.loc[public.index, public.columns], check_dtype=True)
+    assert public.attrs == {"order": -2.0, "reference": "reference", "values": "distance"}
+    assert public.loc["f/0", "f/3"] == public.loc["f/3", "f/0"] == 30.0
+    assert public.loc["reference", "f/2"] == 30.0
+    assert public.loc["f/0", "f/0"] == 0.0
+    assert public["f/1"].isna().all()
     assert (frame["order"] == -2).all()
+    assert matrix(made(4), -2.0, "error").loc["f/0", "f/3"] == 0.3
+    with pytest.raises(InputError, match=r"values must be one of distance, error, .*, found 'rate'"):
+        matrix(made(4), -2.0, "rate")  # type: ignore[arg-type]
 
 
 def test_text_has_brackets_and_fits_a_terminal() -> None:
@@ -103,10 +110,10 @@ def test_distances_to_the_reference_alone() -> None:
 
 
 def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
-    matrix = Matrix.of(made(5), -4.0)
-    assert matrix is not None
-    assert matrix.labels == ("f/0", "f/2", "f/3", "f/4", "reference")
-    assert np.isfinite(matrix.values).all()
+    whole = Matrix.of(made(5), -4.0)
+    assert whole is not None
+    assert whole.labels == ("f/0", "f/2", "f/3", "f/4", "reference")
+    assert np.isfinite(whole.values).all()
     cut = Matrix.of(made(5), -4.0, most=3)
     assert cut is not None
     assert cut.labels == ("f/0", "f/2", "reference")

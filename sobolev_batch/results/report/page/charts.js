@@ -1,15 +1,15 @@
 "use strict";
-// Pictures of a report, drawn by plotly.js from the page's data, in the colours of its style sheet.
+// Charts of a report, drawn by plotly.js from the page's data in the colours of its style sheet.
 (() => {
   const data = JSON.parse(document.getElementById("data").textContent);
   const symbols = ["circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x"];
-  // Named one by one: others would hand data to a service.
+  // Named one by one: other buttons would send data to a service.
   const flat = [["toImage", "zoomIn2d", "zoomOut2d", "resetScale2d"]];
   const space = [["toImage", "resetCameraDefault3d"]];
   const viridis = [[0, "#440154"], [0.25, "#3b528b"], [0.5, "#21918c"], [0.75, "#5ec962"], [1, "#fde725"]];
-  const state = { order: 0, portrait: 0, alike: true };
+  const state = { order: 0, view: 0, clustered: true };
 
-  // Plotly takes a few tags in any text; names are shown as they are.
+  // Plotly interprets a few tags in any text; names must be shown unchanged.
   const plain = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
   // Cut in their middle: labels of one family differ at their ends.
   const short = (text, most) => plain(
@@ -44,16 +44,16 @@
     Plotly.react(place, traces, layout({ height: Number(place.dataset.height), ...changes }), config);
   };
 
-  // Of a logarithmic axis: powers of ten, and 2 and 5 between them where there are few of these.
+  // Ticks of a logarithmic axis: powers of ten, with 2 and 5 between them where these are few.
   const ticks = (values) => {
     const [low, high] = [Math.log10(Math.min(...values)), Math.log10(Math.max(...values))];
     const steps = high - low > 2.5 ? [1] : [1, 2, 5];
-    const found = [];
+    const tickvals = [];
     for (let power = Math.floor(low) - 1; power <= Math.ceil(high); power += 1) {
-      for (const step of steps) found.push(Number(`${step}e${power}`));
+      for (const step of steps) tickvals.push(Number(`${step}e${power}`));
     }
     const plainly = low > -4 && high < 5;
-    return { tickvals: found, ticktext: found.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
+    return { tickvals, ticktext: tickvals.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
   };
 
   const convergence = () => {
@@ -91,19 +91,19 @@
 
   const matrix = () => {
     const { labels } = data.matrix;
-    const { values, errors, alike } = data.matrix.orders[state.order];
+    const { values, errors, clustered } = data.matrix.orders[state.order];
     const at = (table, i, j) => (i > j ? table[i][j] : table[j][i]);
-    const arranged = state.alike ? alike : labels.map((_, i) => i);
+    const arranged = state.clustered ? clustered : labels.map((_, i) => i);
     const cells = (of) => arranged.map((i) => arranged.map((j) => (i === j ? null : of(i, j))));
     const z = cells((i, j) => (at(values, i, j) > 0 ? Math.log10(at(values, i, j)) : null));
     const text = cells((i, j) =>
       `${plain(labels[i])}<br>${plain(labels[j])}<br>${number(at(values, i, j))} ± ${at(errors, i, j) ?? "?"}`);
-    const seen = z.flat().filter((value) => value !== null);
-    const [low, high] = seen.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+    const shown = z.flat().filter((value) => value !== null);
+    const [low, high] = shown.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
     const powers = [];
     for (let power = Math.ceil(low); power <= high; power += 1) powers.push(power);
-    // Within one power of ten, its ends say more.
-    if (powers.length < 2 && seen.length) powers.splice(0, 1, low, high);
+    // Within one power of ten, ticks at both ends are clearer.
+    if (powers.length < 2 && shown.length) powers.splice(0, 1, low, high);
     const room = narrow() ? 14 : 28;
     const named = labels.length <= 60;
     const axis = {
@@ -128,7 +128,7 @@
 
   const map = () => {
     const { labels, families, orders } = data.matrix;
-    const { places: [x, y], share } = orders[state.order];
+    const { points: [x, y], explained } = orders[state.order];
     const traces = [...new Set(families)].map((family) => {
       const chosen = labels.flatMap((label, i) => (families[i] === family && label !== data.reference ? [i] : []));
       return {
@@ -144,7 +144,7 @@
         text: [plain(data.reference)], hoverinfo: "text", marker: { color: color("ink"), symbol: "star", size: 14 },
       });
     }
-    document.getElementById("share").textContent = share === null ? "" : `${(100 * share).toFixed(1)} %, `;
+    document.getElementById("explained").textContent = explained === null ? "" : `: ${(100 * explained).toFixed(1)} %`;
     draw("map", traces, {
       height: narrow() ? 380 : 480, xaxis: { title: { text: "in the unit of distances" } },
       yaxis: { scaleanchor: "x", scaleratio: 1 },
@@ -176,7 +176,7 @@
   };
 
   const witness = () => {
-    const { label, places: [x, y, z], corners: [i, j, k], values, triangles, shown } = data.witness[state.portrait];
+    const { label, points: [x, y, z], corners: [i, j, k], values, triangles, shown } = data.witness[state.view];
     const whole = triangles.toLocaleString("en");
     document.getElementById("size").textContent = shown < triangles
       ? `Shown with ${shown.toLocaleString("en")} of ${whole} triangles.`
@@ -203,12 +203,12 @@
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
   document.addEventListener("order", ({ detail }) => { state.order = detail; redraw(); });
-  document.getElementById("alike")?.addEventListener("change", (event) => {
-    state.alike = event.target.checked;
+  document.getElementById("clustered")?.addEventListener("change", (event) => {
+    state.clustered = event.target.checked;
     matrix();
   });
-  document.getElementById("portrait")?.addEventListener("change", (event) => {
-    state.portrait = Number(event.target.value);
+  document.getElementById("view")?.addEventListener("change", (event) => {
+    state.view = Number(event.target.value);
     witness();
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);

@@ -1,5 +1,5 @@
 "use strict";
-// Tables that sort by any column, the order that tables and pictures show, and the copy button.
+// Sortable tables, the choice of the order that tables and charts show, and the copy button.
 (() => {
   document.documentElement.classList.add("js");
 
@@ -20,7 +20,7 @@
       const rows = [...body.rows].filter((row) => !row.classList.contains("of-order"));
       const keyed = rows.map((row) => [keyOf(row, column), row]);
       keyed.sort(([a], [b]) => {
-        // What is missing comes last in either direction.
+        // Missing values come last in either direction.
         if (a === null || b === null) return (a === null) - (b === null);
         return descending ? compare(b, a) : compare(a, b);
       });
@@ -45,14 +45,14 @@
     for (const body of document.querySelectorAll("tbody[data-order]")) {
       body.hidden = Number(body.dataset.order) !== order;
     }
-    for (const place of document.querySelectorAll(".current-order b")) place.textContent = names[order];
+    for (const name of document.querySelectorAll(".current-order b")) name.textContent = names[order];
     document.dispatchEvent(new CustomEvent("order", { detail: order }));
   };
 
   for (const control of document.querySelectorAll("input[name=order], #order")) {
     control.addEventListener("change", () => show(Number(control.value)));
   }
-  // A browser that comes back to the page may have kept another choice than the first.
+  // A browser that returns to the page may have kept another choice than the first.
   const chosen = document.querySelector("input[name=order]:checked, #order");
   show(chosen ? Number(chosen.value) : 0);
 

@@ -1,0 +1,61 @@
+"""Groups of an open store, and the orders that they have."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.shells import Orders
+
+
+def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
+    """Return a table of an open store, in memory unless it may stay on disk.
+
+    Raises:
+        InputError: The store has no tables yet.
+    """
+    if name not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    dataset = tree[name].to_dataset()
+    return dataset.load() if load else dataset
+
+
+def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
+    """Return one order or several of a table as a list; all of them by default.
+
+    Raises:
+        InputError: The table lacks one of them.
+    """
+    stored: list[float] = dataset["order"].values.tolist()
+    if order is None:
+        return stored
+    chosen: list[float] = np.atleast_1d(np.asarray(order, dtype=np.float64)).tolist()
+    for s in chosen:
+        if s not in stored:
+            listed = ", ".join(f"{s:g}" for s in stored)
+            raise InputError(f"the store has no order {s:g}, only {listed}; add it to the study and run it again")
+    return chosen
+
+
+def has_proximity(tree: xr.DataTree) -> bool:
+    """Return True if the store has Hausdorff and Chamfer distances."""
+    return "proximity" in tree.children
+
+
+def reference_of(tree: xr.DataTree) -> str:
+    """Return the label of the study's reference."""
+    return str(finished_group(tree, "convergence", load=False).attrs["reference"])
+
+
+def families_of(tree: xr.DataTree) -> dict[str, str]:
+    """Return the family of each mesh by its label, in the order of the study."""
+    meshes = finished_group(tree, "meshes", load=False)
+    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
+
+
+def complete_meshes(tree: xr.DataTree) -> list[str]:
+    """Return the labels of all meshes that are computed, the reference among them."""
+    meshes = finished_group(tree, "meshes", load=False)
+    labels: list[str] = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
+    return labels

@@ -1,0 +1,67 @@
+"""Open stores that are put together by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
+
+
+@pytest.fixture
+def tree() -> xr.DataTree:
+    """Two levels, a failed one, and the reference; distances 0.4 and 0.1 at edge lengths 0.2 and 0.1."""
+    distance = np.array([[0.4, 0.8], [0.1, 0.2], [np.nan, np.nan], [0.0, 0.0]])
+    rate = np.array([[np.nan, np.nan], [2.0, 2.0], [np.nan, np.nan], [np.nan, np.nan]])
+    convergence = xr.Dataset(
+        {
+            "distance": (("mesh", "order"), distance),
+            **dict.fromkeys(("error", "truncation"), (("mesh", "order"), distance / 1000)),
+            **dict.fromkeys(("aliasing", "discretisation"), (("mesh", "order"), 0 * distance)),
+            "relative": (("mesh", "order"), distance / 4),
+            "relative_error": (("mesh", "order"), distance / 4000),
+            "area_part": (("mesh", "order"), 0.6 * distance),
+            "shape_part": (("mesh", "order"), 0.8 * distance),
+            "rate": (("mesh", "order"), rate),
+            "rate_error": (("mesh", "order"), 0.01 * rate),
+            "resolved": (("mesh", "order"), np.array([[True, True], [True, False], [False, False], [False, False]])),
+            "within": (("mesh", "order"), np.array([[True, False], [True, False], [False, False], [True, True]])),
+            "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan]),
+        },
+        coords={"mesh": MESHES, "order": [-10.0, -2.5]},
+        attrs={"reference": "reference"},
+    )
+    meshes = xr.Dataset(
+        {
+            "family": ("mesh", ["f_1", "f_1", "f_1", "reference"]),
+            "name": ("mesh", ["0", "1", "2", "reference"]),
+            "level": ("mesh", [0, 1, 2, -1]),
+            "status": ("mesh", ["complete", "complete", "failed", "complete"]),
+            "reason": ("mesh", ["", "", "no 50% of it | is <there>", ""]),
+            "triangles": ("mesh", [20, 1280, 0, 0]),
+        },
+        coords={"mesh": MESHES},
+    )
+    axis = np.linspace(-2, 2, 5)
+    values = np.arange(4 * 5 * 5 * 3).reshape(4, 5, 5, 3) + 0j
+    fourier = xr.Dataset(
+        {"fourier": (("mesh", "xi_x", "xi_y", "xi_z"), values)},
+        coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:]},
+    )
+    return xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
+
+
+@pytest.fixture
+def near(tree: xr.DataTree) -> xr.DataTree:
+    """The same, with Hausdorff and Chamfer distances of one mesh; the other's could not be measured."""
+    nan = np.nan
+    columns = {
+        "hausdorff": [0.25, nan, nan, nan],
+        "chamfer": [0.125, nan, nan, nan],
+        "chamfer_error": [1e-3, nan, nan, nan],
+    }
+    reason = ["", "its file has changed", "", ""]
+    variables = {name: ("mesh", values) for name, values in {**columns, "reason": reason}.items()}
+    proximity = xr.Dataset(variables, coords={"mesh": MESHES})
+    return xr.DataTree.from_dict({**tree.to_dict(), "/proximity": proximity})

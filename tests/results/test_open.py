@@ -1,0 +1,35 @@
+"""Opening stores, and what functions for their readers take for one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+import sobolev_batch as sb
+
+
+def test_opening_nothing(tmp_path: Path) -> None:
+    with pytest.raises(sb.StoreError, match="no store of a study is there"):
+        sb.open_store(tmp_path)
+
+
+def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
+    tree = sb.open_store(finished_store)
+    for function in (sb.table, sb.status, lambda store: sb.matrix(store, -10)):
+        result = function(finished_store)
+        assert function(tree) is not result
+        assert str(function(tree)) == str(result)
+
+
+def test_a_tree_from_nowhere_has_no_status(tree: xr.DataTree) -> None:
+    with pytest.raises(
+        sb.InputError, match=r"does not say where it was opened; open it with sobolev_batch\.open_store"
+    ):
+        sb.status(tree)
+
+
+def test_the_old_name_of_a_parameter_works_for_now(finished_store: Path) -> None:
+    with pytest.warns(DeprecationWarning, match="'place' of open_store"):
+        assert "norms" in sb.open_store(place=finished_store)  # type: ignore[call-arg]
