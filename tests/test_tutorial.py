@@ -27,17 +27,17 @@ def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypa
         assert done.exit_code == 0, done.output
     assert {path.name for path in tmp_path.iterdir()} >= {"pictures", "report.html"}
 
-    found = run_blocks("docs/tutorial.md")
-    assert found["certain"] is True
-    assert found["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
-    assert found["rates"].to_numpy() == pytest.approx(2, abs=0.05)
-    assert found["excess"] < 0
-    assert 0.5 < found["longest"] < 1
-    assert (found["w"].values < 0).all()
+    results = run_blocks("docs/tutorial.md")
+    assert results["certain"] is True
+    assert results["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
+    assert results["rates"].to_numpy() == pytest.approx(2, abs=0.05)
+    assert results["excess"] < 0
+    assert 0.5 < results["longest"] < 1
+    assert (results["w"].values < 0).all()
 
     # Every group and every variable of a store has its place in the description of stores.
     text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
-    for group in found["tree"].subtree:
+    for group in results["tree"].subtree:
         for name in (*group.data_vars, *group.coords, *group.attrs):
             assert f"`{name}`" in text, (group.path, name)
 
