@@ -1,4 +1,4 @@
-"""SLURM and PBS: what would be submitted, and studies on jobs that are processes of this machine."""
+"""SLURM and PBS: scripts of jobs, and studies on jobs that are processes of this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.recipes import FOLDER, TABLE, add_command, documented, enviro
 
 SETTINGS = FOLDER / "jobqueue.yaml"
 
-# SLURM's commands, for which every job runs at once and here.
+# Stand-ins for the commands of SLURM: every job runs at once on this machine.
 SBATCH = """
 if [ -n "$REFUSE" ]; then echo "sbatch: error: Invalid account" >&2; exit 1; fi
 cp "$1" "$HOME/job-$$"
@@ -27,7 +27,7 @@ SCANCEL = 'kill -- "-$1"'
 def jobqueue(
     home: Path, *options: str, settings: Path = SETTINGS, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """The documented command, with further options."""
+    """Run the documented command with further options."""
     command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
     script, study = FOLDER / Path(command[0]).name, command[1]
     return subprocess.run(
@@ -92,7 +92,7 @@ def test_a_study_on_local_jobs(tmp_path: Path) -> None:
 
 @pytest.fixture
 def slurm(tmp_path: Path) -> Path:
-    """A home with SLURM's commands and settings for them: two workers a job."""
+    """Return a home with SLURM's commands and settings for two workers a job."""
     add_command(tmp_path, "sbatch", SBATCH)
     add_command(tmp_path, "scancel", SCANCEL)
     settings = yaml.safe_load(SETTINGS.read_text())
@@ -116,7 +116,7 @@ if __name__ == "__main__":
         first = set(client.scheduler_info(n_workers=-1)["workers"])
         assert all(worker.startswith("tls://127.0.0.1") for worker in first)
         while not all(getattr(job, "had_workers", False) for job in cluster.workers.values()):
-            time.sleep(0.05)  # until it was looked at
+            time.sleep(0.05)  # until the job has been checked
         client.retire_workers(list(first))
         client.wait_for_workers(2)
         assert not first & set(client.scheduler_info(n_workers=-1)["workers"])
@@ -153,8 +153,8 @@ def test_settings_that_cannot_serve(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "jobqueue.slurm.cores is not set: copy jobqueue.yaml" in done.stderr
     done = jobqueue(tmp_path, "--system", "slurm", PATH=str(tmp_path))
-    assert "there is no sbatch here" in done.stderr
+    assert "sbatch is not on the PATH" in done.stderr
     everywhere = tmp_path / "everywhere.yaml"
     everywhere.write_text(SETTINGS.read_text().replace("    interface: ib0", "    interface: null"))
     done = jobqueue(tmp_path, "--system", "pbs", "--print-script", settings=everywhere)
-    assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all" in done.stderr
+    assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all networks" in done.stderr

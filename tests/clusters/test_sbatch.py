@@ -1,4 +1,4 @@
-"""One allocation of SLURM: the script with an srun that starts its tasks here."""
+"""One allocation of SLURM: the script, with an srun that starts its tasks on this machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
         ["bash", FOLDER / Path(script).name, study, "--store", "results.zarr"],
         env=environment(
             tmp_path,
-            INTERFACE=next(name for name, found in psutil.net_if_addrs().items() if found[0].address == "127.0.0.1"),
+            INTERFACE=next(
+                name for name, addresses in psutil.net_if_addrs().items() if addresses[0].address == "127.0.0.1"
+            ),
             RECIPES=str(FOLDER),
             SLURM_SUBMIT_DIR=str(tmp_path),
             SLURM_NTASKS="1",
