@@ -105,6 +105,19 @@ def test_the_versions_of_stored_results_are_those_of_the_code() -> None:
         assert f"- **{name} version**, {version} now:" in text
 
 
+def test_every_deprecated_parameter_is_listed() -> None:
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    renamed = {
+        pair
+        for names in re.findall(r"@renamed_parameters\((.*?)\)", sources, re.DOTALL)
+        for pair in re.findall(r'(\w+)="(\w+)"', names)
+    }
+    assert renamed
+    text = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
+    for old, new in sorted(renamed):
+        assert f"| `{old}` | `{new}` |" in text, (old, new)
+
+
 def test_the_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
