@@ -1,6 +1,6 @@
-"""The API from its docstrings, and the pages of this folder, as HTML: python docs/build.py site.
+"""Build the API from its docstrings, and the pages of this folder, as HTML: python docs/build.py site.
 
-Pages are opened from disk and ask nobody for anything. A link to a file that is not there ends it.
+The pages open from disk and make no requests. A link to a file that does not exist ends the build.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pdoc.render_helpers import to_html
 
 ROOT = Path(__file__).resolve().parents[1]
 API = "sobolev_batch"
-# Addresses of pages by their sources, in the order in which they are listed.
+# Addresses of the pages by their sources, in the order of the contents.
 PAGES = {
     "README.md": "index.html",
     **{
@@ -37,7 +37,7 @@ PAGES = {
 
 
 def build(output: Path) -> None:
-    """Write all pages into a folder, which is made where it is not there."""
+    """Write all pages into a folder, which is created if necessary."""
     output.mkdir(parents=True, exist_ok=True)
     texts = {source: (ROOT / source).read_text(encoding="utf-8") for source in PAGES}
     titles = {source: re.match(r"# (.+)", text) for source, text in texts.items()}
@@ -50,32 +50,32 @@ def build(output: Path) -> None:
     write(output / f"{API}.html", pdoc.render.html_module(module, {API: module}))
     page = env.get_template("page.html.jinja2")
     for source, text in texts.items():
-        found, address = to_html(text), PAGES[source]
-        body = re.sub(r'(href|src)="([^"]+)"', partial(located, source, output), str(found))
-        contents = getattr(found, "toc_html", None)
+        rendered, address = to_html(text), PAGES[source]
+        body = re.sub(r'(href|src)="([^"]+)"', partial(relocated, source, output), str(rendered))
+        contents = getattr(rendered, "toc_html", None)
         write(output / address, page.render(title=pages[address], body=body, contents=contents))
     shutil.copytree(ROOT / "docs" / "pictures", output / "pictures", dirs_exist_ok=True)
 
 
-def located(source: str, output: Path, link: re.Match[str]) -> str:
-    """A link of a page as it is from its place among the others, or to the file in the repository."""
+def relocated(source: str, output: Path, link: re.Match[str]) -> str:
+    """Return a link of a page with its address in the output folder, or that of the file in the repository."""
     kind, address = link.groups()
     if re.match(r"[a-z]+:|#", address):
         return link[0]
     target, _, section = address.partition("#")
     path = (ROOT / source).parent.joinpath(target).resolve()
     if not path.exists():
-        raise FileNotFoundError(f"{source} has a link to {target}, which is not there")
+        raise FileNotFoundError(f"{source} has a link to {target}, which does not exist; correct the link")
     name = path.relative_to(ROOT).as_posix()
     if name.startswith("docs/pictures/"):
-        there = name.removeprefix("docs/")
+        relocation = name.removeprefix("docs/")
     else:
-        there = PAGES.get(name) or relpath(path, output)
-    return f'{kind}="{there}{"#" * bool(section)}{section}"'
+        relocation = PAGES.get(name) or relpath(path, output)
+    return f'{kind}="{relocation}{"#" * bool(section)}{section}"'
 
 
 def write(path: Path, text: str) -> None:
-    """One page."""
+    """Write one page."""
     path.write_text(text, encoding="utf-8")
 
 

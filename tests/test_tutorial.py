@@ -1,4 +1,4 @@
-"""What docs/tutorial.md shows runs as it stands, and what it says of formulas and stores is so."""
+"""The examples of docs/tutorial.md run as printed, and its statements about formulas and stores are true."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypa
     for line in commands.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "sobolev-batch"
-        done = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
     assert {path.name for path in tmp_path.iterdir()} >= {"pictures", "report.html"}
 
     results = run_blocks("docs/tutorial.md")
@@ -35,7 +35,7 @@ def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypa
     assert 0.5 < results["longest"] < 1
     assert (results["w"].values < 0).all()
 
-    # Every group and every variable of a store has its place in the description of stores.
+    # The description of stores has every group and every variable of a store.
     text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
     for group in results["tree"].subtree:
         for name in (*group.data_vars, *group.coords, *group.attrs):

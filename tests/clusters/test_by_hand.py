@@ -118,9 +118,9 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     ],
 )
 def test_certificates_are_not_made(arguments: list[str], message: str, tmp_path: Path) -> None:
-    done = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 2
-    assert message in done.stderr
+    completed = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert completed.returncode == 2
+    assert message in completed.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -128,7 +128,7 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
     write_study(tmp_path)
     (run,) = documented("sobolev-batch run")
     words = [cluster.address if word == "tls://HOST:8786" else word for word in run[1:]]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", "sobolev_batch", *words],
         env=environment(home, DASK_CONFIG=str(certificates / "tls.yaml")),
         cwd=tmp_path,
@@ -136,8 +136,8 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(TABLE, done.stdout)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
     meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
     assert all(worker.startswith("tls://") for worker in meshes["worker"].values.tolist())
 
@@ -225,7 +225,7 @@ def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says:
 
 def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
     """As when DASK_CONFIG names a file that is not there."""
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", "dask", "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0"],
         env=environment(home, DASK_CONFIG=str(home / "nothing.yaml")),
         capture_output=True,
@@ -233,5 +233,5 @@ def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
         timeout=60,
         check=False,
     )
-    assert done.returncode != 0
-    assert "TLS expects a `ssl_context`" in done.stderr
+    assert completed.returncode != 0
+    assert "TLS expects a `ssl_context`" in completed.stderr

@@ -24,7 +24,7 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     add_command(tmp_path, "srun", SRUN)
     write_study(tmp_path)
     script, study = documented("sbatch workflows")[0][1:]
-    done = subprocess.run(
+    completed = subprocess.run(
         ["bash", FOLDER / Path(script).name, study, "--store", "results.zarr"],
         env=environment(
             tmp_path,
@@ -42,8 +42,8 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(TABLE, done.stdout)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
     log = (tmp_path / "workers.log").read_text()
     assert len(re.findall(r"Start worker at: +tls://127\.0\.0\.1", log)) == 1
     assert log.count("Memory:                   2.00 GiB") == 1
