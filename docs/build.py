@@ -21,14 +21,14 @@ from pdoc.render_helpers import to_html
 
 ROOT = Path(__file__).resolve().parents[1]
 API = "sobolev_batch"
-# Addresses of pages by their sources, in the order of the menu.
+
 PAGES = {
     "README.md": "index.html",
     **{
         f"docs/{name}.md": f"{name}.html"
         for name in (
             *("tutorial", "studies", "surfaces", "queries", "store", "numerics"),
-            *("clusters", "scale", "reliability", "design"),
+            *("clusters", "scale", "reliability", "stability", "design"),
         )
     },
     "workflows/README.md": "workflows.html",
@@ -52,25 +52,27 @@ def build(output: Path) -> None:
     page = env.get_template("page.html.jinja2")
     for source, text in texts.items():
         rendered, address = to_html(text), PAGES[source]
-        body = re.sub(r'(href|src)="([^"]+)"', partial(located, source, output), str(rendered))
+        body = re.sub(r'(href|src)="([^"]+)"', partial(relocated, source, output), str(rendered))
         contents = getattr(rendered, "toc_html", None)
         write(output / address, page.render(title=pages[address], body=body, contents=contents))
     shutil.copytree(ROOT / "docs" / "pictures", output / "pictures", dirs_exist_ok=True)
 
 
-def located(source: str, output: Path, link: re.Match[str]) -> str:
-    """Return a link to another page as the site has it, or to a file of the repository."""
+def relocated(source: str, output: Path, link: re.Match[str]) -> str:
+    """Return a link of a page with its address in the output folder, or that of the file in the repository."""
     kind, address = link.groups()
     if re.match(r"[a-z]+:|#", address):
         return link[0]
     target, _, section = address.partition("#")
     path = (ROOT / source).parent.joinpath(target).resolve()
     if not path.exists():
-        raise FileNotFoundError(f"{source} links to {target}, which does not exist")
+        raise FileNotFoundError(f"{source} has a link to {target}, which does not exist; correct the link")
     name = path.relative_to(ROOT).as_posix()
-    is_picture = name.startswith("docs/pictures/")
-    url = name.removeprefix("docs/") if is_picture else PAGES.get(name) or relpath(path, output)
-    return f'{kind}="{url}{"#" * bool(section)}{section}"'
+    if name.startswith("docs/pictures/"):
+        relocation = name.removeprefix("docs/")
+    else:
+        relocation = PAGES.get(name) or relpath(path, output)
+    return f'{kind}="{relocation}{"#" * bool(section)}{section}"'
 
 
 def write(path: Path, text: str) -> None:

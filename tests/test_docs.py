@@ -1,4 +1,4 @@
-"""`make docs` builds: every public name with its text, every page, no link that leads nowhere."""
+"""`make docs` builds every page without a broken link; the map of the code and the citation match the package."""
 
 from __future__ import annotations
 
@@ -7,32 +7,34 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 import sobolev_batch as sb
-from tests.support.repository import ROOT
+from tests.support.repository import PACKAGE, ROOT
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-W", "error", str(ROOT / "docs" / "build.py"), str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stderr == ""
     return folder
 
 
 def words(text: str) -> list[str]:
-    """Without what Markdown makes of them."""
+    """Return the words of a text, without its markup."""
     return re.findall(r"\w+", html.unescape(re.sub("<[^>]+>", " ", text)))
 
 
 def documented(value: Any) -> list[str]:
-    """The docstring of a function, or those of a class and its public methods and properties."""
+    """Return the docstring of a function, or those of a class and its public methods and properties."""
     members = vars(value).items() if inspect.isclass(value) else ()
     public = [member for name, member in members if not name.startswith("_")]
     found = [value, *(m for m in public if inspect.isroutine(m) or isinstance(m, property))]
@@ -68,3 +70,65 @@ def test_every_page_is_there_and_asks_nobody(site: Path) -> None:
             if not link.startswith(("https:", "data:")):
                 assert (site / link).exists(), (name, link)
                 assert not section or f'id="{section}"' in pages[link or name], (name, link, section)
+
+
+def design() -> str:
+    return (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+
+
+def test_the_map_names_every_module_and_no_other() -> None:
+    rows = re.findall(r"^\| `([\w/]+)` \| .* \| (.+) \|$", design(), re.MULTILINE)
+    mapped = [f"{folder}/{module}" for folder, names in rows for module in re.findall(r"`(\w+)`", names)]
+    # The package's own modules are in the row of its name.
+    mapped = [name.removeprefix(f"{PACKAGE.name}/") for name in mapped]
+    files = [path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if not path.stem.startswith("__")]
+    modules = {path.with_suffix("").as_posix() for path in files}
+    lacking, invented = sorted(modules - set(mapped)), sorted(set(mapped) - modules)
+    assert not lacking, f"modules that the map lacks: {lacking}"
+    assert not invented, f"modules of the map that do not exist: {invented}"
+    assert len(mapped) == len(set(mapped))
+
+
+def test_paths_in_the_design_exist() -> None:
+    paths = re.findall(r"`([\w.]+/[\w./]+)`", design())
+    assert len(paths) > 40
+    places = {path: (ROOT / path, PACKAGE / path, PACKAGE / f"{path}.py") for path in paths}
+    missing = [path for path, candidates in places.items() if not any(place.exists() for place in candidates)]
+    assert not missing
+
+
+def test_the_versions_of_stored_results_are_those_of_the_code() -> None:
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    text = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
+    for name in ("Schema", "Numerics"):
+        (version,) = re.findall(rf"^{name.upper()}_VERSION = (\d+)$", sources, re.MULTILINE)
+        assert f"- **{name} version**, {version} now:" in text
+
+
+def test_every_deprecated_parameter_is_listed() -> None:
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    renamed = {
+        pair
+        for names in re.findall(r"@renamed_parameters\((.*?)\)", sources, re.DOTALL)
+        for pair in re.findall(r'(\w+)="(\w+)"', names)
+    }
+    assert renamed
+    text = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
+    for old, new in sorted(renamed):
+        assert f"| `{old}` | `{new}` |" in text, (old, new)
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["message"]
+    assert citation["title"] == project["name"]
+    assert citation["version"] == project["version"]
+    assert citation["license"] == project["license"]
+    assert citation["authors"] == project["authors"]
+    (paper,) = citation["references"]
+    assert {"type", "title", "authors"} <= paper.keys()
+    assert paper["authors"][0]["family-names"] == "Koga"
+    numerics = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
+    assert paper["title"] in " ".join(numerics.split())

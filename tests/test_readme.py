@@ -1,4 +1,4 @@
-"""The README's examples run as they stand."""
+"""The examples of the README run as printed."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
     (tmp_path / "workflows").mkdir()
     (tmp_path / "storage").mkdir()
     (tmp_path / "workflows" / "icosphere.toml").write_text(small.replace("3, 4, 5, 6, 7]", "3]"))
-    # The first block of store.md opens the store, the others query it.
+    # The first block of docs/store.md opens the store, the others query it.
     queries = "".join(blocks("docs/store.md", "python"))
     indented = "".join(f"    {line}\n" for line in queries.splitlines())
     (tmp_path / "example.py").write_text(example + indented)
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-W", "error", "example.py"],
         cwd=tmp_path,
         capture_output=True,
@@ -38,5 +38,5 @@ def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
         timeout=200,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"icosphere/3 +0\.00", done.stdout)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(r"icosphere/3 +0\.00", completed.stdout)

@@ -1,4 +1,4 @@
-"""What docs/tutorial.md shows runs as it stands, and what it says of formulas and stores is so."""
+"""The examples of docs/tutorial.md run as printed, and its statements about formulas and stores are true."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypa
     for line in commands.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "sobolev-batch"
-        done = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
     assert {path.name for path in tmp_path.iterdir()} >= {"pictures", "report.html"}
 
-    found = run_blocks("docs/tutorial.md")
-    assert found["certain"] is True
-    assert found["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
-    assert found["rates"].to_numpy() == pytest.approx(2, abs=0.05)
-    assert found["excess"] < 0
-    assert 0.5 < found["longest"] < 1
-    assert (found["w"].values < 0).all()
+    results = run_blocks("docs/tutorial.md")
+    assert results["certain"] is True
+    assert results["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
+    assert results["rates"].to_numpy() == pytest.approx(2, abs=0.05)
+    assert results["excess"] < 0
+    assert 0.5 < results["longest"] < 1
+    assert (results["w"].values < 0).all()
 
-    # Every group and every variable of a store has its place in the description of stores.
+    # The description of stores has every group and every variable of a store.
     text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
-    for group in found["tree"].subtree:
+    for group in results["tree"].subtree:
         for name in (*group.data_vars, *group.coords, *group.attrs):
             assert f"`{name}`" in text, (group.path, name)
 

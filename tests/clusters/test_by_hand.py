@@ -1,4 +1,4 @@
-"""Several machines by hand: certificates, scheduler, workers and study by the documented commands."""
+"""Several machines by hand: certificates, scheduler, workers and a study, by the documented commands."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def certificates(home: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def others(home: Path) -> Path:
-    """Certificates of somebody else."""
+    """Return certificates of somebody else."""
     assert make_certificates(home / "others", "2").returncode == 0
     return home / "others"
 
 
 def configured(folder: Path | None) -> Any:
-    """Dask's configuration as with DASK_CONFIG naming the tls.yaml of a folder."""
+    """Set Dask's configuration as if DASK_CONFIG named the tls.yaml of a folder."""
     settings = yaml.safe_load((folder / "tls.yaml").read_text()) if folder else {}
     return dask.config.set(dask.config.merge(dask.config.config, settings))
 
@@ -63,7 +63,7 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster(home: Path, certificates: Path) -> Iterator[Cluster]:
-    """A scheduler and two workers, started as documented but on loopback and at free ports."""
+    """Yield a scheduler and two workers, started as documented but on loopback and free ports."""
     (export,) = {tuple(words) for words in documented("export DASK_CONFIG=~/dask-tls")}
     variable, value = export[1].replace("~", str(home)).split("=")
     (scheduler,), (worker, *_) = documented("dask scheduler"), documented("dask worker")
@@ -82,7 +82,7 @@ def cluster(home: Path, certificates: Path) -> Iterator[Cluster]:
     try:
         lines = start(scheduler, subprocess.PIPE).stderr
         assert lines is not None
-        address = next(found[0] for line in lines if (found := re.search(r"tls://127\.0\.0\.1:\d+", line)))
+        address = next(match[0] for line in lines if (match := re.search(r"tls://127\.0\.0\.1:\d+", line)))
         start(worker, log, **{"tls://HOST:8786": address})
         with configured(certificates), Client(address) as client:
             client.wait_for_workers(2, timeout=60)
@@ -103,7 +103,7 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     before = {file: file.read_bytes() for file in files}
     again = make_certificates(certificates)
     assert again.returncode == 2
-    assert f"{certificates} is there already" in again.stderr
+    assert f"{certificates} already exists" in again.stderr
     assert before == {file: file.read_bytes() for file in files}
     assert not list(home.glob(".make-certificates*"))
 
@@ -113,14 +113,14 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     [
         ([], "call it as: make-certificates FOLDER"),
         (["new", "soon"], "DAYS is soon"),
-        (["nowhere/new"], "there is no folder nowhere"),
-        (['n"ew'], 'has one of " '),
+        (["nowhere/new"], "the folder nowhere for new does not exist"),
+        (['n"ew'], 'contains one of " '),
     ],
 )
 def test_certificates_are_not_made(arguments: list[str], message: str, tmp_path: Path) -> None:
-    done = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 2
-    assert message in done.stderr
+    completed = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert completed.returncode == 2
+    assert message in completed.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -128,7 +128,7 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
     write_study(tmp_path)
     (run,) = documented("sobolev-batch run")
     words = [cluster.address if word == "tls://HOST:8786" else word for word in run[1:]]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", "sobolev_batch", *words],
         env=environment(home, DASK_CONFIG=str(certificates / "tls.yaml")),
         cwd=tmp_path,
@@ -136,8 +136,8 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(TABLE, done.stdout)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
     meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
     assert all(worker.startswith("tls://") for worker in meshes["worker"].values.tolist())
 
@@ -201,7 +201,7 @@ def test_each_way_to_miss_an_encrypted_scheduler_has_its_words(
     ],
 )
 def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says: bytes, message: str) -> None:
-    """Dask's own client waits for ever for the first and runs out of memory at the third."""
+    """Dask's own client waits for ever in the first case and runs out of memory in the third."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         connections = []
 
@@ -225,7 +225,7 @@ def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says:
 
 def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
     """As when DASK_CONFIG names a file that is not there."""
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", "dask", "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0"],
         env=environment(home, DASK_CONFIG=str(home / "nothing.yaml")),
         capture_output=True,
@@ -233,5 +233,5 @@ def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
         timeout=60,
         check=False,
     )
-    assert done.returncode != 0
-    assert "TLS expects a `ssl_context`" in done.stderr
+    assert completed.returncode != 0
+    assert "TLS expects a `ssl_context`" in completed.stderr

@@ -1,4 +1,4 @@
-"""What docs/clusters.md and kubernetes.yaml tell people to run exists, and fits together."""
+"""The commands of docs/clusters.md and the manifest kubernetes.yaml exist and fit together."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNITS = {"Gi": "GiB", "Mi": "MiB"}
 
 
 def check_options(words: list[str]) -> None:
-    """Every option of a command is one of its own, and followed by a value where it wants one."""
+    """Check that a command has each of the options, and that values follow those that take one."""
     command = COMMANDS[words[0], words[1]]
     takes_value = {
         name: not option.is_flag
@@ -47,7 +47,7 @@ def documents() -> list[dict[str, Any]]:
 
 
 def pods() -> Mapping[str, dict[str, Any]]:
-    """The pod of each kind of container."""
+    """Return the pod of each kind of container."""
     cluster, gpu = (document["spec"] for document in documents()[:2])
     return {
         "worker": cluster["worker"]["spec"],
@@ -64,7 +64,7 @@ def test_documented_options_exist() -> None:
         check_options(words)
     for words in documented("python "):
         assert (ROOT / words[1]).is_file()
-    # Lazily, since it changes what Ctrl-C does.
+    # Not imported, since that changes the effect of Ctrl-C.
     assert importlib.util.find_spec("dask_jobqueue") is not None
 
 
@@ -98,7 +98,7 @@ def test_pods(name: str) -> None:
     if "--memory-limit" in container["args"]:
         limit = container["args"][container["args"].index("--memory-limit") + 1]
         allowed = resources["limits"]["memory"]
-        # The nanny beside the worker needs some too.
+        # The nanny beside the worker takes some memory too.
         assert parse_bytes(limit) <= 0.85 * parse_bytes(allowed[:-2] + UNITS[allowed[-2:]])
     if name != "scheduler":
         assert container["envFrom"] == [{"secretRef": {"name": "object-store"}}]

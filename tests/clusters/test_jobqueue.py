@@ -1,4 +1,4 @@
-"""SLURM and PBS: what would be submitted, and studies on jobs that are processes of this machine."""
+"""SLURM and PBS: scripts of jobs, and studies on jobs that are processes of this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.recipes import FOLDER, TABLE, add_command, documented, enviro
 
 SETTINGS = FOLDER / "jobqueue.yaml"
 
-# SLURM's commands, for which every job runs at once and here.
+# Stand-ins for the commands of SLURM: every job runs at once on this machine.
 SBATCH = """
 if [ -n "$REFUSE" ]; then echo "sbatch: error: Invalid account" >&2; exit 1; fi
 cp "$1" "$HOME/job-$$"
@@ -27,7 +27,7 @@ SCANCEL = 'kill -- "-$1"'
 def jobqueue(
     home: Path, *options: str, settings: Path = SETTINGS, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """The documented command, with further options."""
+    """Run the documented command with further options."""
     command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
     script, study = FOLDER / Path(command[0]).name, command[1]
     return subprocess.run(
@@ -55,9 +55,9 @@ def jobqueue(
     ],
 )
 def test_the_script_of_a_job(system: str, directives: list[str], tmp_path: Path) -> None:
-    done = jobqueue(tmp_path, "--system", system, "--print-script")
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+    completed = jobqueue(tmp_path, "--system", system, "--print-script")
+    assert completed.returncode == 0, completed.stderr
+    lines = completed.stdout.splitlines()
     for directive in directives:
         assert f"#{'SBATCH' if system == 'slurm' else 'PBS'} {directive}" in lines
     (worker,) = (line for line in lines if "dask_worker" in line)
@@ -82,17 +82,17 @@ def test_lifetimes_end_before_the_walltime(system: str) -> None:
 
 def test_a_study_on_local_jobs(tmp_path: Path) -> None:
     write_study(tmp_path)
-    done = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")
-    assert done.returncode == 0, done.stderr
-    assert re.search(TABLE, done.stdout)
-    assert done.stderr.count(": complete") == 6
+    completed = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
+    assert completed.stderr.count(": complete") == 6
     assert (tmp_path / "results.zarr" / "zarr.json").exists()
     assert not list(tmp_path.glob(".sobolev-batch*"))
 
 
 @pytest.fixture
 def slurm(tmp_path: Path) -> Path:
-    """A home with SLURM's commands and settings for them: two workers a job."""
+    """Return a home with SLURM's commands and settings for two workers a job."""
     add_command(tmp_path, "sbatch", SBATCH)
     add_command(tmp_path, "scancel", SCANCEL)
     settings = yaml.safe_load(SETTINGS.read_text())
@@ -116,7 +116,7 @@ if __name__ == "__main__":
         first = set(client.scheduler_info(n_workers=-1)["workers"])
         assert all(worker.startswith("tls://127.0.0.1") for worker in first)
         while not all(getattr(job, "had_workers", False) for job in cluster.workers.values()):
-            time.sleep(0.05)  # until it was looked at
+            time.sleep(0.05)  # until the job has been checked
         client.retire_workers(list(first))
         client.wait_for_workers(2)
         assert not first & set(client.scheduler_info(n_workers=-1)["workers"])
@@ -125,7 +125,7 @@ if __name__ == "__main__":
 
 def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
     paths = environment(slurm)["PYTHONPATH"]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", REPLACED],
         env=environment(slurm, DASK_CONFIG=str(slurm / "jobqueue.yaml"), PYTHONPATH=f"{paths}:{FOLDER}"),
         cwd=slurm,
@@ -134,27 +134,27 @@ def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
+    assert completed.returncode == 0, completed.stderr
     assert len(list(slurm.glob("job-*"))) == 2
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
 def test_a_job_that_is_refused(slurm: Path) -> None:
     write_study(slurm)
-    done = jobqueue(slurm, "--system", "slurm", settings=slurm / "jobqueue.yaml", REFUSE="yes")
-    assert done.returncode == 1
-    assert "sbatch: error: Invalid account" in done.stderr
-    assert "Traceback" not in done.stderr
+    completed = jobqueue(slurm, "--system", "slurm", settings=slurm / "jobqueue.yaml", REFUSE="yes")
+    assert completed.returncode == 1
+    assert "sbatch: error: Invalid account" in completed.stderr
+    assert "Traceback" not in completed.stderr
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
 def test_settings_that_cannot_serve(tmp_path: Path) -> None:
-    done = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")
-    assert done.returncode == 1
-    assert "jobqueue.slurm.cores is not set: copy jobqueue.yaml" in done.stderr
-    done = jobqueue(tmp_path, "--system", "slurm", PATH=str(tmp_path))
-    assert "there is no sbatch here" in done.stderr
+    completed = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")
+    assert completed.returncode == 1
+    assert "jobqueue.slurm.cores is not set: copy jobqueue.yaml" in completed.stderr
+    completed = jobqueue(tmp_path, "--system", "slurm", PATH=str(tmp_path))
+    assert "sbatch is not on the PATH" in completed.stderr
     everywhere = tmp_path / "everywhere.yaml"
     everywhere.write_text(SETTINGS.read_text().replace("    interface: ib0", "    interface: null"))
-    done = jobqueue(tmp_path, "--system", "pbs", "--print-script", settings=everywhere)
-    assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all" in done.stderr
+    completed = jobqueue(tmp_path, "--system", "pbs", "--print-script", settings=everywhere)
+    assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all networks" in completed.stderr

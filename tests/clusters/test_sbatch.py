@@ -1,4 +1,4 @@
-"""One allocation of SLURM: the script with an srun that starts its tasks here."""
+"""One allocation of SLURM: the script, with an srun that starts its tasks on this machine."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     add_command(tmp_path, "srun", SRUN)
     write_study(tmp_path)
     script, study = documented("sbatch workflows")[0][1:]
-    done = subprocess.run(
+    completed = subprocess.run(
         ["bash", FOLDER / Path(script).name, study, "--store", "results.zarr"],
         env=environment(
             tmp_path,
-            INTERFACE=next(name for name, found in psutil.net_if_addrs().items() if found[0].address == "127.0.0.1"),
+            INTERFACE=next(
+                name for name, addresses in psutil.net_if_addrs().items() if addresses[0].address == "127.0.0.1"
+            ),
             RECIPES=str(FOLDER),
             SLURM_SUBMIT_DIR=str(tmp_path),
             SLURM_NTASKS="1",
@@ -40,8 +42,8 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(TABLE, done.stdout)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
     log = (tmp_path / "workers.log").read_text()
     assert len(re.findall(r"Start worker at: +tls://127\.0\.0\.1", log)) == 1
     assert log.count("Memory:                   2.00 GiB") == 1

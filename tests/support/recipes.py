@@ -1,4 +1,4 @@
-"""The recipes of workflows/clusters/, and the commands of docs/clusters.md as they stand there."""
+"""The recipes of workflows/clusters/, and the commands of docs/clusters.md."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "workflows" / "clusters"
 CERTIFICATES = FOLDER / "make-certificates"
 
-# One of its meshes is a file beside it, and workers are started elsewhere.
+# One mesh is a file beside the study: workers are started in another folder.
 STUDY = """
 [study]
 name = "small"
@@ -33,31 +33,31 @@ source = "files"
 paths = ["tetrahedron.off"]
 """
 TETRAHEDRON = "OFF\n4 4 0\n1 1 1\n1 -1 -1\n-1 1 -1\n-1 -1 1\n3 0 1 2\n3 0 3 1\n3 0 2 3\n3 1 3 2\n"
-TABLE = r"(?s)ico/3 +1,280 .*file/tetrahedron +4 "  # of its table
+TABLE = r"(?s)ico/3 +1,280 .*file/tetrahedron +4 "  # in its table
 
 
 def write_study(folder: Path) -> None:
-    """Put the study into a folder as study.toml."""
+    """Write the study into a folder as study.toml."""
     (folder / "study.toml").write_text(STUDY)
     (folder / "tetrahedron.off").write_text(TETRAHEDRON)
 
 
 def documented(beginning: str = "") -> list[list[str]]:
-    """The commands of docs/clusters.md that begin so, as lists of words."""
+    """Return the commands of docs/clusters.md with a given beginning, as lists of words."""
     text = (ROOT / "docs" / "clusters.md").read_text(encoding="utf-8")
     lines = "".join(re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)).splitlines()
     return [shlex.split(line, comments=True) for line in lines if line.startswith(beginning)]
 
 
 def environment(home: Path, **variables: str) -> dict[str, str]:
-    """What a process is to see: this checkout, the commands beside this interpreter, a home of its own."""
+    """Return an environment with this checkout, the commands beside this interpreter and a home of its own."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("DASK_", "SLURM_"))}
     path = os.pathsep.join([str(home / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
     return {**kept, "PYTHONPATH": str(ROOT), "HOME": str(home), "PATH": path, "TMPDIR": str(home), **variables}
 
 
 def add_command(home: Path, name: str, script: str) -> None:
-    """Put a command into the PATH of `environment`."""
+    """Add a command to the PATH of `environment`."""
     (home / "bin").mkdir(exist_ok=True)
     (home / "bin" / name).write_text(f"#!/bin/bash\n{script}")
     (home / "bin" / name).chmod(0o755)

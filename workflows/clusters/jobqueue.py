@@ -1,9 +1,9 @@
-"""Runs a study on workers that are jobs of SLURM or PBS.
+"""Run a study on workers that are jobs of SLURM or PBS.
 
     export DASK_CONFIG=$HOME/jobqueue.yaml
     python jobqueue.py STUDY --system slurm --jobs 4
 
-The scheduler is part of this process, on the node where it is started. docs/clusters.md tells the rest.
+The scheduler is part of this process, on the node where you start it. See docs/clusters.md.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from sobolev_batch import SobolevBatchError, Study, open_store, run
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.results.tables.convergence import format_table
 
-# dask_jobqueue ends the process on Ctrl-C as if all had gone well.
+# dask_jobqueue ends the process on Ctrl-C with the exit status of success.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CLUSTERS: dict[str, type[JobQueueCluster]] = {"slurm": SLURMCluster, "pbs": PBSCluster, "local": LocalCluster}
-INTERVAL_SECONDS = 30.0  # between looks at what jobs there are
-SOME_FAILED = 3  # the exit status of sobolev-batch
+INTERVAL_SECONDS = 30.0  # between two checks of the jobs
+SOME_FAILED = 3  # as the exit status of sobolev-batch
 
 
-class Replacing(Adaptive):  # type: ignore[misc]  # distributed has no types
-    """Asks for a new job once the workers of one have left.
+class ReplacingAdaptive(Adaptive):  # type: ignore[misc]  # distributed has no types
+    """Policy that requests a new job once the workers of one have left.
 
-    Left to itself dask-jobqueue notices this of jobs with one worker only, and takes a refused job for one that waits.
+    dask-jobqueue alone does so only for jobs with one worker, and it takes a refused job for a waiting one.
     """
 
-    said = ""
+    last_refusal = ""
 
     async def target(self) -> int:
-        """The number of workers that there should be, after jobs without workers are forgotten."""
+        """Return the number of workers to have, after forgetting jobs whose workers have left."""
         cluster = self.cluster
         forget_refused(cluster)
         for name, job in list(cluster.workers.items()):
@@ -60,17 +60,17 @@ class Replacing(Adaptive):  # type: ignore[misc]  # distributed has no types
         return wanted
 
     async def adapt(self) -> None:
-        """Have as many jobs as there should be; what the batch system refuses is said once."""
+        """Adapt the number of jobs; report each refusal of the batch system once."""
         try:
             await super().adapt()
         except RuntimeError as error:
-            if str(error) != self.said:
+            if str(error) != self.last_refusal:
                 click.echo(f"no new job: {str(error).strip()}", err=True)
-            self.said = str(error)
+            self.last_refusal = str(error)
 
 
 def forget_refused(cluster: JobQueueCluster) -> None:
-    """Drop the jobs that the batch system did not take: they are in the cluster's books all the same."""
+    """Drop the jobs that the batch system refused: the cluster counts them otherwise."""
     for name, job in list(cluster.workers.items()):
         if job.job_id is None:
             job.status = Status.failed
@@ -78,12 +78,12 @@ def forget_refused(cluster: JobQueueCluster) -> None:
 
 
 def setting(system: str, name: str) -> Any:
-    """A setting of Dask's configuration for a batch system."""
+    """Return a setting of Dask's configuration for a batch system."""
     return dask.config.get(f"jobqueue.{system}.{name}", None)
 
 
 def check_settings(system: str, printing: bool) -> None:
-    """Refuse a configuration with which jobs cannot be asked for, or whose scheduler everybody could reach."""
+    """Refuse a configuration that cannot request jobs, or whose scheduler everybody could reach."""
     for name in ("cores", "memory", "processes"):
         if setting(system, name) is None:
             raise click.ClickException(
@@ -91,16 +91,16 @@ def check_settings(system: str, printing: bool) -> None:
             )
     command = CLUSTERS[system].job_cls.submit_command
     if command is not None and not printing and shutil.which(command) is None:
-        raise click.ClickException(f"there is no {command} here: call this on a node from which jobs are submitted")
+        raise click.ClickException(f"{command} is not on the PATH: start this on a node from which jobs are submitted")
     if setting(system, "interface") is None and not {"host", "interface"} & set(setting(system, "scheduler-options")):
         raise click.ClickException(
-            f"jobqueue.{system}.interface is not set, and the scheduler would listen on all: "
-            "name the network that the nodes share, such as ib0"
+            f"jobqueue.{system}.interface is not set, and the scheduler would listen on all networks: "
+            "name the one that the nodes share, such as ib0"
         )
 
 
 def security_of(folder: Path) -> Security:
-    """Encryption with what make-certificates puts into a folder."""
+    """Return the security settings for a folder made by make-certificates."""
     files = {
         f"tls_{role}_{part}": f"{folder}/{name}.pem"
         for role in ("scheduler", "worker", "client")
@@ -110,7 +110,7 @@ def security_of(folder: Path) -> Security:
 
 
 def job_script(system: str) -> str:
-    """The script of one job, with names in place of what is known only when it is submitted."""
+    """Return the script of one job, with placeholders for values that are known only on submission."""
     security = security_of(Path("CERTIFICATES"))
     job = CLUSTERS[system].job_cls("tls://SCHEDULER:PORT", name="WORKER", protocol="tls://", security=security)
     return str(job.job_script())
@@ -118,22 +118,22 @@ def job_script(system: str) -> str:
 
 @contextmanager
 def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueueCluster]:
-    """A cluster whose workers are jobs, cancelled at the end; encrypted, since other users share its network.
+    """Yield a cluster whose workers are jobs, cancelled at the end; encrypted, since other users share its network.
 
     Args:
-        system: one of CLUSTERS.
-        jobs: how many there should be; jobs that end are replaced.
-        adaptive: have fewer jobs while there is little to do.
+        system: Key of CLUSTERS.
+        jobs: Number of jobs; those that end are replaced.
+        adaptive: Permission to run fewer jobs while there is little work.
     """
     options = {"dashboard_address": "127.0.0.1:0", **setting(system, "scheduler-options")}
-    # Certificates for this time alone, in a folder that all nodes see and nobody else can read: of the one in which
-    # this was started, unless the configuration names another.
+    # Certificates for this run alone, in a folder that all nodes see and nobody else can read: below the current
+    # folder, unless the configuration names another.
     parent = setting(system, "shared-temp-directory") or Path.cwd()
     with TemporaryDirectory(prefix=".sobolev-batch-", dir=parent) as work:
         folder = Path(work, "certificates")
         subprocess.run([Path(__file__).with_name("make-certificates"), folder], check=True, stdout=subprocess.DEVNULL)
         cluster = CLUSTERS[system](
-            # Said here too: dask-jobqueue does not know the workers of its jobs by name from the configuration alone.
+            # Given here too: from the configuration alone dask-jobqueue does not learn the names of the workers.
             processes=setting(system, "processes"),
             security=security_of(folder),
             scheduler_options=options,
@@ -148,21 +148,21 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
         least = 1 if adaptive else jobs
         with closing(cluster):
             for _ in range(least):
-                # Not by scale(), which submits in the background and keeps to itself what the batch system refuses.
+                # scale() would submit in the background and hide the refusals of the batch system.
                 cluster.worker_spec.update(cluster.new_worker_spec())
                 cluster.sync(submit)
             cluster.adapt(
-                Adaptive=Replacing,
+                Adaptive=ReplacingAdaptive,
                 minimum_jobs=least,
                 maximum_jobs=jobs,
                 interval=INTERVAL_SECONDS,
-                wait_count=4,  # so often in a row must a job have had nothing to do before it goes
+                wait_count=4,  # checks in a row that find a job idle before it is cancelled
             )
             yield cluster
 
 
 def show(progress: Progress) -> None:
-    """A line for each mesh, on standard error."""
+    """Print a line for each mesh on standard error."""
     if progress.record is not None:
         outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
         line = f"[{progress.done}/{progress.total}] {progress.label}: {progress.record.status}, {outcome}"
@@ -172,9 +172,9 @@ def show(progress: Progress) -> None:
 @click.command()
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--system", type=click.Choice(list(CLUSTERS)), required=True)
-@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Jobs at a time.")
-@click.option("--adaptive", is_flag=True, help="Fewer jobs while there is little to do.")
-@click.option("--store", help="Where results go: a path or a URL. [default: storage/NAME.zarr]")
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of jobs at a time.")
+@click.option("--adaptive", is_flag=True, help="Run fewer jobs while there is little work.")
+@click.option("--store", help="Path or URL for the results. [default: storage/NAME.zarr]")
 @click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
 def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None, print_script: bool) -> None:
     """Run STUDY on jobs of a batch system and print its table."""
@@ -184,13 +184,13 @@ def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None,
         return
     try:
         parsed = Study.from_toml(study)
-        place = store or f"storage/{parsed.name}.zarr"
+        store = store or f"storage/{parsed.name}.zarr"
         with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
-            click.echo("jobs are submitted; the study begins with the first that runs", err=True)
+            click.echo("jobs are submitted; the study begins when the first one runs", err=True)
             client.wait_for_workers(1)
-            summary = run(parsed, place, client, on_progress=show)
-        click.echo(format_table(open_store(place)))
-    except (SobolevBatchError, RuntimeError) as error:  # the latter: what the batch system or Dask refuses
+            summary = run(parsed, store, client, on_progress=show)
+        click.echo(format_table(open_store(store)))
+    except (SobolevBatchError, RuntimeError) as error:  # the batch system and Dask raise the latter
         raise click.ClickException(str(error).strip()) from error
     for label, reason in summary.failed.items():
         click.echo(f"{label}: {reason}", err=True)
@@ -198,6 +198,6 @@ def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None,
 
 
 if __name__ == "__main__":
-    for ending in (signal.SIGTERM, signal.SIGHUP):  # jobs are cancelled then too
-        signal.signal(ending, lambda number, frame: sys.exit(128 + number))
+    for number in (signal.SIGTERM, signal.SIGHUP):  # these cancel the jobs too
+        signal.signal(number, lambda number, frame: sys.exit(128 + number))
     main()
