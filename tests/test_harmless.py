@@ -21,9 +21,9 @@ FORBIDDEN = {
 # pickle.dumps sends a plugin to workers; what arrives there Dask unpickles.
 ALLOWED_OF_PICKLE = {"dumps"}
 # Of CUDA's libraries, and of the package's own modules, by names that stand in these modules.
-ALLOWED_IMPORTS = {("spectral/cuda.py", "import_module"), ("__init__.py", "import_module")}
+ALLOWED_IMPORTS = {("spectral/backends/cuda.py", "import_module"), ("__init__.py", "import_module")}
 # Of this interpreter, with a script of the package and two files of its own making.
-ALLOWED_PROCESSES = {"results/rendering.py"}
+ALLOWED_PROCESSES = {"results/meshes/render.py"}
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[str, str, ast.Call]]:
