@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test coverage soak check bench docs audit format clean
+.PHONY: study icosphere test test-fast coverage soak check bench docs audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -12,8 +12,14 @@ study: $(READY)  ## run the real study (a cortical surface) and print its table
 icosphere: $(READY)  ## run the paper's study
 	$(BIN)/sobolev-batch run workflows/icosphere.toml
 
+# Whole files, in the order of tests/conftest.py. Three for two cores, since many tests wait for processes to start.
+PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+
 test: $(READY)  ## the tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(PYTEST) -n 3
+
+test-fast: $(READY)  ## the tests of the numerics, in less than a minute
+	$(PYTEST) -n 2 -m "not slow" tests/surfaces tests/spectral
 
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage

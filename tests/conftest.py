@@ -1,4 +1,4 @@
-"""Clusters, stores and files that tests of several folders share."""
+"""Clusters, stores and files that tests of several folders share, and the markers of what a test takes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,31 @@ from sobolev_batch.batch.cluster.clients import local_client
 from tests.support.mesh_files import Read
 from tests.support.spheres import make_study
 from tests.support.studies import small_table
+
+# A test that asks for one of these fixtures, or calls one of these functions, has the marker.
+_SIGNS = {
+    "cluster": {
+        *("client", "cluster", "driving", "finished_store", "mixed", "s3_client", "spheres"),
+        *("local_client", "remote_client", "run", "run_icospheres", "started", "tcp_cluster"),
+    },
+    "s3": {"served", "server", "serving", "storage"},
+    "browser": {"browser", "reader"},
+}
+_CLUSTER_FOLDERS = ("faults", "soak")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by what they use, and put the longest files first: at the end, one core would wait for them."""
+    for item in items:
+        if isinstance(item, pytest.Function):
+            used = {*item.fixturenames, *(vars(item.module).keys() & set(item.function.__code__.co_names))}
+            for marker, signs in _SIGNS.items():
+                if used & signs:
+                    item.add_marker(marker)
+        if any(f"tests/{folder}/" in item.nodeid for folder in _CLUSTER_FOLDERS):
+            item.add_marker("cluster")
+    slow, clustered = ({item.path for item in items if item.get_closest_marker(name)} for name in ("slow", "cluster"))
+    items.sort(key=lambda item: (item.path not in slow, item.path not in clustered))
 
 
 @pytest.fixture(scope="session")

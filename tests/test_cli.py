@@ -1,4 +1,4 @@
-"""The command line as a process: output, errors in one line, exit status."""
+"""The command line: output, errors in one line, exit status."""
 
 from __future__ import annotations
 
@@ -8,23 +8,14 @@ import pty
 import re
 import select
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import trimesh
 
 from sobolev_batch import icosphere
-from tests.support.commands import STUDY
+from tests.support.commands import COMMAND, STUDY, call, command
 from tests.support.drawing import obstacle
-
-COMMAND = [sys.executable, "-m", "sobolev_batch"]
-
-
-def call(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=folder, timeout=120, check=False
-    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a study that has been run once."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "study.toml").write_text(STUDY)
-    done = call("run", "study.toml", "--workers", "1", folder=folder)
+    done = command("run", "study.toml", "--workers", "1", folder=folder)
     assert done.returncode == 0, done.stderr
     (folder / "run.out").write_text(done.stdout)
     (folder / "run.err").write_text(done.stderr)
@@ -52,7 +43,7 @@ def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
 
 
 def test_a_second_run_reuses_everything_and_starts_no_cluster(folder: Path) -> None:
-    done = call("run", "study.toml", folder=folder)
+    done = command("run", "study.toml", folder=folder)
     assert done.returncode == 0
     assert "0 computed, 3 reused, 0 failed" in done.stdout
     assert "dashboard" not in done.stderr
@@ -223,11 +214,20 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
     assert (folder / "taken" / "precious").read_text() == "text"
 
 
+def test_wrong_input_ends_a_process_in_the_same_way(folder: Path) -> None:
+    done = command("status", "nothing.zarr", folder=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.match(r"^error: .*no store of a study is there.*\n$", done.stderr)
+    done = command("fly", folder=folder)
+    assert done.returncode == 2
+    assert "Usage:" in done.stderr
+
+
 def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path) -> None:
     (folder / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
     study = STUDY.replace('"cli"', '"partly"') + '\n[[family]]\nname = "f"\nsource = "files"\npaths = ["bad.off"]\n'
     (folder / "partly.toml").write_text(study)
-    done = call("run", "partly.toml", "--workers", "1", folder=folder)
+    done = command("run", "partly.toml", "--workers", "1", folder=folder)
     assert done.returncode == 3
     assert re.search(r"f/bad( +missing){6}\n", done.stdout)
     assert "f/bad is failed: " in done.stdout
@@ -253,12 +253,12 @@ def test_usage_errors_have_status_2(folder: Path) -> None:
         ("run", "study.toml", "--workers", "0"),
     ):
         done = call(*arguments, folder=folder)
-        assert done.returncode == 2
+        assert done.returncode == 2, arguments
         assert "Usage:" in done.stderr
 
 
 def test_debug_shows_the_traceback(folder: Path) -> None:
-    done = call("--debug", "run", "no.toml", folder=folder)
+    done = command("--debug", "run", "no.toml", folder=folder)
     assert "Traceback" in done.stderr
     assert done.returncode == 1
 

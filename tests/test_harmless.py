@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-import sobolev_batch
 from sobolev_batch import Study, StudyError
+from tests.support.repository import PACKAGE
 from tests.support.studies import small_table
 
-PACKAGE = Path(sobolev_batch.__file__).parent
 FORBIDDEN_MODULES = {"dill", "joblib", "marshal", "runpy", "shelve", "subprocess", "yaml"}
 FORBIDDEN = {
     *("eval", "exec", "compile", "__import__", "import_module", "system", "popen", "Unpickler"),

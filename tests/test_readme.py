@@ -35,7 +35,6 @@ def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=200,
         check=False,
     )
     assert completed.returncode == 0, completed.stderr

@@ -13,7 +13,8 @@ from sobolev_batch import ClusterError, Study, StudyError, submit
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
-from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
+from tests.support.commands import call, command
+from tests.support.processes import tcp_cluster
 from tests.support.recipes import write_study
 from tests.support.studies import small_table
 
@@ -37,26 +38,20 @@ def study_path(tmp_path: Path) -> Path:
     return tmp_path / "study.toml"
 
 
-def cli(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
-
-
 def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, _):
         client = subprocess.run(
             [sys.executable, "-c", CLIENT, address, str(study_path), str(store_path)],
             capture_output=True,
             text=True,
-            timeout=PATIENCE_SECONDS,
             check=False,
         )
         assert client.returncode == -9, client.stderr
-        followed = cli("status", store_path, "--follow")
+        followed = call("status", store_path, "--follow")
     assert followed.returncode == 0, followed.stdout + followed.stderr
     assert f"{store_path}: 6 of 6 complete, 0 failed, 0 to go" in followed.stdout
     assert "\ndone; by process" in followed.stdout
-    table = cli("table", store_path)
+    table = call("table", store_path)
     assert "ico/3" in table.stdout
     assert "nan" not in table.stdout.lower()
 
@@ -64,16 +59,16 @@ def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: 
 def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: Path) -> None:
     store = tmp_path / "with space.zarr"
     with tcp_cluster([]) as (address, _):
-        submitted = cli("submit", study_path, "--scheduler", address, "--store", store)
+        submitted = command("submit", study_path, "--scheduler", address, "--store", store)
         assert submitted.returncode == 0, submitted.stderr
         assert submitted.stdout.splitlines() == [
             f"6 of 6 surfaces to be computed by the cluster at {address}",
             f"follow it by: sobolev-batch status --follow '{store}'",
         ]
-        assert cli("status", store, "--follow").returncode == 0
-        again = cli("submit", study_path, "--scheduler", address, "--store", store)
+        assert call("status", store, "--follow").returncode == 0
+        again = command("submit", study_path, "--scheduler", address, "--store", store)
         assert again.stdout.startswith("0 of 6 surfaces to be computed")
-        assert cli("status", store, "--follow").returncode == 0
+        assert call("status", store, "--follow").returncode == 0
 
 
 def test_what_is_wrong_is_said_before_anything_is_handed_over(tmp_path: Path, store_path: Path) -> None:
@@ -89,7 +84,7 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(tmp_path: Path, st
 
 def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, workers):
-        assert cli("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
+        assert command("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
         store = Store.open(store_path)
         while (record := store.read_run()) is None or record.state == "submitted":
             time.sleep(_POLL_SECONDS)
@@ -115,7 +110,7 @@ def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, st
         blocked = client.submit(_remove, str(mesh), pure=False, priority=10)
         submit(study, store_path, client)
         blocked.result()
-        followed = cli("status", store_path, "--follow")
+        followed = call("status", store_path, "--follow")
     assert followed.returncode == 1
     assert "the latest run failed: the reference cannot be made" in followed.stdout
 

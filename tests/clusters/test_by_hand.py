@@ -230,7 +230,6 @@ def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
         env=environment(home, DASK_CONFIG=str(home / "nothing.yaml")),
         capture_output=True,
         text=True,
-        timeout=60,
         check=False,
     )
     assert completed.returncode != 0

@@ -36,7 +36,6 @@ def jobqueue(
         cwd=home,
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
 
@@ -131,7 +130,6 @@ def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
         cwd=slurm,
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert completed.returncode == 0, completed.stderr

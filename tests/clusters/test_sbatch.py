@@ -39,7 +39,6 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert completed.returncode == 0, completed.stderr

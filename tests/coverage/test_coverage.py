@@ -17,6 +17,8 @@ from tests.coverage.matern import kernel, radial_integral
 from tests.coverage.truth import Truth, closed_within, on_fine_lattice, summed_in_real_space, truths
 from tests.support.shapes import CENTRED_BOX as BOX
 
+pytestmark = pytest.mark.slow
+
 SMALL = Mesh(0.9 * BOX.vertices, BOX.triangles)
 
 

@@ -20,7 +20,7 @@ from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire, locked
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import LockError
-from tests.support.commands import command, write_toml
+from tests.support.commands import call, command, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often. Told that its store was released, it
 # goes on when its heartbeat has ended.
@@ -68,7 +68,7 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
             assert f"another run has this store to itself: process {first.pid} on " in second.stderr
             assert f"sobolev-batch release {store_path}" in second.stderr
         # Not from somebody who is alive.
-        refused = command("release", store_path)
+        refused = call("release", store_path)
         assert refused.returncode == 2
         assert f"process {first.pid} on" in refused.stderr
         assert "is alive" in refused.stderr
@@ -76,12 +76,12 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
         _, said = first.communicate("go on\n")
     assert first.returncode == 0, said
     assert not (store_path / LOCK_KEY).exists()
-    assert command("run", study, "--store", store_path).returncode == 0
+    assert call("run", study, "--store", store_path).returncode == 0
 
 
 def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -> None:
     first = driving(write_toml(tmp_path), store_path)
-    released = command("release", "--force", store_path)
+    released = call("release", "--force", store_path)
     assert released.returncode == 0
     assert f"released from process {first.pid} on" in released.stdout
     _, said = first.communicate("released\n")
@@ -239,6 +239,6 @@ def test_a_folder_of_the_users_stays(tmp_path: Path) -> None:
 def test_nothing_is_left_where_nothing_was_begun(tmp_path: Path) -> None:
     bad = '[[family]]\nname = "f"\nsource = "files"\npaths = ["*.ply"]'
     (tmp_path / "bad.toml").write_text(write_toml(tmp_path).read_text() + bad)
-    done = command("run", tmp_path / "bad.toml", "--store", tmp_path / "new.zarr")
+    done = call("run", tmp_path / "bad.toml", "--store", tmp_path / "new.zarr")
     assert done.returncode == 2
     assert not (tmp_path / "new.zarr").exists()

@@ -15,7 +15,7 @@ from distributed import Client
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
-from tests.support.commands import command, write_toml
+from tests.support.commands import call, write_toml
 from tests.support.stores import assert_same_fields, assert_same_tables
 from tests.support.studies import small_table, variable
 
@@ -236,11 +236,11 @@ def test_a_field_of_zeros_is_one(store: Path, study: Study, client: Client) -> N
 
 
 def test_the_command_says_what_is_damaged(store: Path, tmp_path: Path) -> None:
-    sound = command("verify", store)
+    sound = call("verify", store)
     assert (sound.returncode, sound.stdout.splitlines()[-1]) == (0, "nothing is damaged")
     flip(store / FIELD.format(row=2))
     flip(store / "norms/norm/c/0/0")
-    found = command("verify", store)
+    found = call("verify", store)
     assert found.returncode == 1
     assert found.stdout.splitlines()[1].startswith("ico/2: ")
     assert found.stdout.splitlines()[2].startswith("table norms/norm: ")
@@ -248,5 +248,5 @@ def test_the_command_says_what_is_damaged(store: Path, tmp_path: Path) -> None:
         found.stdout.splitlines()[3]
         == "1 surfaces and 1 arrays of tables are damaged; run the study again to repair it"
     )
-    assert command("run", write_toml(tmp_path), "--store", store, "--workers", "1").returncode == 0
-    assert command("verify", store).returncode == 0
+    assert call("run", write_toml(tmp_path), "--store", store, "--workers", "1").returncode == 0
+    assert call("verify", store).returncode == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch.batch.store.store import Store
-from tests.support.commands import command, read_until, started, write_toml
+from tests.support.commands import call, read_until, started, write_toml
 from tests.support.stores import assert_same_fields, assert_same_tables
 
 
@@ -28,7 +28,7 @@ def test_the_next_run_computes_what_has_no_record(
     complete = [record is not None for record in Store.open(store_path).records()].count(True)
     assert complete >= {"dashboard:": 0, "[2/5]": 2, "tables reduced": 5}[line]
     # The process is known to be gone, so that its claim keeps nobody out.
-    again = command("run", study, "--store", store_path, "--workers", "1")
+    again = call("run", study, "--store", store_path, "--workers", "1")
     assert again.returncode == 0, again.stderr
     assert "taken over from process" in again.stderr
     assert again.stderr.count("complete, ") == 5 - complete

@@ -13,7 +13,7 @@ from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.store.store import Store
 from tests.faults.fatal import Moment, fatal
-from tests.support.commands import PATIENCE_SECONDS, TOML, write_toml
+from tests.support.commands import TOML, write_toml
 from tests.support.stores import assert_same_fields, assert_same_tables
 from tests.support.studies import variable
 
@@ -45,7 +45,6 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
             [sys.executable, "-c", COMMAND, str(write_toml(tmp_path)), str(store_path)],
             capture_output=True,
             text=True,
-            timeout=PATIENCE_SECONDS,
             check=False,
         )
     assert done.returncode == 3, done.stderr

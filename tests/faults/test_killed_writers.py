@@ -11,7 +11,7 @@ from typing import Any
 from sobolev_batch import Study
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
-from tests.support.commands import PATIENCE_SECONDS
+from tests.support.processes import PATIENCE_SECONDS
 from tests.support.studies import small_table
 
 KILLS = 60

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import command, write_toml
+from tests.support.commands import call, write_toml
 
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    done = command("run", write_toml(tmp_path), "--store", tmp_path / "typo" / "results.zarr")
+    done = call("run", write_toml(tmp_path), "--store", tmp_path / "typo" / "results.zarr")
     assert done.returncode == 2
     assert f"there is no folder {tmp_path / 'typo'} to hold the store; make it first" in done.stderr
     assert "dashboard" not in done.stderr
@@ -26,7 +26,7 @@ def test_something_else_is_there(there: str, tmp_path: Path) -> None:
     else:
         place.mkdir()
         (place / "precious.txt").write_text("text")
-    done = command("run", write_toml(tmp_path), "--store", place)
+    done = call("run", write_toml(tmp_path), "--store", place)
     assert done.returncode == 2
     assert {"file": "a file is there", "folder": "not empty and holds no store"}[there] in done.stderr
     assert "dashboard" not in done.stderr
@@ -34,7 +34,7 @@ def test_something_else_is_there(there: str, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that nobody can write to")
 def test_a_place_that_nobody_can_write(tmp_path: Path) -> None:
-    done = command("run", write_toml(tmp_path), "--store", "/proc/results.zarr")
+    done = call("run", write_toml(tmp_path), "--store", "/proc/results.zarr")
     assert done.returncode == 2
     assert "/proc/results.zarr: the store cannot be written" in done.stderr
     assert "dashboard" not in done.stderr
@@ -44,7 +44,7 @@ def test_a_place_that_nobody_can_write(tmp_path: Path) -> None:
 def test_a_folder_without_permission(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o555)
-    done = command("run", write_toml(tmp_path), "--store", closed / "results.zarr")
+    done = call("run", write_toml(tmp_path), "--store", closed / "results.zarr")
     assert done.returncode == 2
     assert "results.zarr: the store cannot be written: Permission denied" in done.stderr
     assert "dashboard" not in done.stderr

@@ -13,6 +13,7 @@ from tests.soak.havoc import HavocPlan
 from tests.soak.trial import Outcome, soak
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
+pytestmark = [pytest.mark.slow, pytest.mark.s3]
 
 
 @pytest.fixture(scope="module")

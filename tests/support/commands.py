@@ -1,14 +1,20 @@
-"""The command line as a process of its own, watched while it runs."""
+"""The command line: within this process, as a process of its own, and watched while it runs."""
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
+
+import pytest
+
+from sobolev_batch import cli
 
 TOML = """
 study.name = "small"
@@ -21,22 +27,61 @@ source = "icosphere"
 levels = [0, 1, 2, 3]
 """
 
-# Limit of every command, for a machine that does much else.
-PATIENCE_SECONDS = 200
+# A smaller one, written in sections.
+STUDY = """
+[study]
+name = "cli"
+[lattice]
+xi_max = 3.0
+M = 16
+[norm]
+orders = [-10.0, -3.0]
+[reference]
+source = "sphere"
+[[family]]
+name = "ico"
+source = "icosphere"
+levels = [0, 1]
+"""
+
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 
 def write_toml(folder: Path) -> Path:
-    """Write the small study to a file."""
+    """Write the small study into a folder."""
     path = folder / "study.toml"
     path.write_text(TOML)
     return path
 
 
-def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
+def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end within this process, which has imported already what a new one takes seconds for."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["sobolev-batch", *map(str, arguments)])
+        # Signals are the test runner's, and so are its log handlers: the command is to set up its own.
+        patch.setattr(cli, "raise_when_asked", lambda: None)
+        patch.setattr(logging.root, "handlers", [])
+        patch.setattr(logging.root, "level", logging.root.level)
+        with (
+            redirect_stdout(StringIO()) as output,
+            redirect_stderr(StringIO()) as errors,
+            pytest.raises(SystemExit) as end,
+        ):
+            cli.main()
+    assert isinstance(end.value.code, int)
+    return subprocess.CompletedProcess(sys.argv, end.value.code, output.getvalue(), errors.getvalue())
+
+
+def command(*arguments: object, folder: Path = Path(), **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end as a process, as users do: for exit statuses, logs and settings of a process."""
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        check=False,
+        env={**os.environ, **environment},
     )
 
 
@@ -67,33 +112,3 @@ def read_until(process: subprocess.Popen[str], text: str) -> str:
         if text in line:
             return output
     raise AssertionError(f"{text!r} did not appear: {output}")
-
-
-def call(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a folder, with further variables in its environment."""
-    return subprocess.run(
-        [*COMMAND, *arguments],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        timeout=PATIENCE_SECONDS,
-        check=False,
-        env={**os.environ, **environment},
-    )
-
-
-STUDY = """
-[study]
-name = "cli"
-[lattice]
-xi_max = 3.0
-M = 16
-[norm]
-orders = [-10.0, -3.0]
-[reference]
-source = "sphere"
-[[family]]
-name = "ico"
-source = "icosphere"
-levels = [0, 1]
-"""

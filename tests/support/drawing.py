@@ -1,4 +1,4 @@
-"""Whether meshes can be drawn on this machine."""
+"""Detection of what drawing meshes takes on this machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 
 def obstacle() -> str | None:
-    """What keeps VTK from drawing here, looked up without it; None where nothing does."""
+    """Return what keeps VTK from drawing here, looked up without it; None where nothing does."""
     if find_spec("pyvista") is None:
         return "pyvista, of the extra vtk, is not installed"
     if sys.platform == "linux" and find_library("EGL_mesa") is None and find_library("OSMesa") is None:

@@ -15,11 +15,11 @@ from sobolev_batch import ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import GPU
-from tests.support import pretend_gpu
 from tests.support.processes import tcp_cluster
+from tests.support.repository import ROOT
 from tests.support.studies import small_table, variable
 
-PRETEND = ["--preload", str(Path(pretend_gpu.__file__))]
+PRETEND = ["--preload", str(ROOT / "tests" / "support" / "pretend_gpu.py")]
 
 
 @pytest.fixture

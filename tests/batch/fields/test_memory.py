@@ -49,9 +49,7 @@ print(record.facts.triangles, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 @pytest.mark.slow
 def test_five_million_triangles_stay_below_two_gigabytes(store_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", TASK, str(store_path)], capture_output=True, text=True, timeout=280, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", TASK, str(store_path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     triangles, peak_kilobytes = map(int, done.stdout.split())
     assert triangles > 5_000_000

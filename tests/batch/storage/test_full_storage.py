@@ -14,7 +14,7 @@ from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store
-from tests.support.commands import STUDY, call
+from tests.support.commands import STUDY, command
 from tests.support.failing_storage import HEALTHY, FailingStorage, Rule, Turn, failing
 from tests.support.object_storage import BUCKET, IMPATIENT, serving, taken_for_s3
 from tests.support.stores import assert_same
@@ -32,7 +32,7 @@ def test_object_storage_that_takes_no_more_fields(storage: FailingStorage, tmp_p
     location = Location.of(f"s3://{BUCKET}/results.zarr")
 
     def go() -> subprocess.CompletedProcess[str]:
-        return call("run", "study.toml", "--workers", "1", "--store", str(location), folder=tmp_path)
+        return command("run", "study.toml", "--workers", "1", "--store", str(location), folder=tmp_path)
 
     (tmp_path / "study.toml").write_text(STUDY)
     # Records could still be written: of meshes that failed, too.

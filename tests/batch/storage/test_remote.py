@@ -23,7 +23,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan
-from tests.support.commands import STUDY, call
+from tests.support.commands import STUDY, command
 from tests.support.failing_storage import GONE, HEALTHY, KINDS, FailingStorage, Kind, Rule, Turn, failing
 from tests.support.object_storage import BUCKET, IMPATIENT, serving, taken_for_s3
 from tests.support.stores import assert_same
@@ -164,7 +164,7 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
     storage: FailingStorage, location: Location, tmp_path: Path
 ) -> None:
     def go() -> subprocess.CompletedProcess[str]:
-        return call("run", "study.toml", "--workers", "1", "--store", str(location), folder=tmp_path, **IMPATIENT)
+        return command("run", "study.toml", "--workers", "1", "--store", str(location), folder=tmp_path, **IMPATIENT)
 
     (tmp_path / "study.toml").write_text(STUDY)
     # The field of the second mesh, after the record of the first.

@@ -32,14 +32,12 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import LockError
-from tests.support.commands import STUDY, call
+from tests.support.commands import STUDY, call, command
 from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
 from tests.support.stores import READER, assert_same
 from tests.support.studies import small_table, variable
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
-
-COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +185,7 @@ def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Pat
 def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     assert f"{url}, 0 of 3 already stored" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
-    done = call("run", "study.toml", "--store", url, "--workers", "2", folder=tmp_path)
+    done = command("run", "study.toml", "--store", url, "--workers", "2", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
     assert "botocore" not in done.stderr
@@ -204,7 +202,7 @@ def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
 
 def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
-    done = call("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
+    done = command("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
     assert done.returncode == 0, done.stderr
     assert "DEBUG" in done.stderr
     keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
@@ -283,7 +281,8 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
     ]
     for arguments, environment, message in cases:
         started = time.monotonic()
-        done = call(*arguments, folder=tmp_path, **environment)
+        with taken_for_s3(environment):
+            done = call(*arguments, folder=tmp_path)
         assert done.returncode == 2, done.stderr
         assert message in done.stderr, done.stderr
         assert done.stderr.startswith("error: ")
@@ -316,14 +315,15 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
         reader = server.environment(made["AccessKeyId"], made["SecretAccessKey"])
         # Another may write, and has done so.
         assert (
-            call(
+            command(
                 "run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **server.environment()
             ).returncode
             == 0
         )
         before = server.keys("")
         server.enforce(True)
-        assert call("status", f"s3://{BUCKET}/a.zarr", folder=tmp_path, **reader).returncode == 0
+        with taken_for_s3(reader):
+            assert call("status", f"s3://{BUCKET}/a.zarr", folder=tmp_path).returncode == 0
         for arguments, environment, message in [
             (("run", "study.toml", "--store", f"s3://{BUCKET}/b.zarr"), reader, "cannot be written: access is denied"),
             (("run", "study.toml", "--store", f"s3://{BUCKET}/a.zarr"), reader, "cannot be written: access is denied"),
@@ -334,7 +334,8 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
                 "cannot be read: access is denied",
             ),
         ]:
-            done = call(*arguments, folder=tmp_path, **environment)
+            with taken_for_s3(environment):
+                done = call(*arguments, folder=tmp_path)
             assert done.returncode == 2, done.stderr
             assert message in done.stderr, done.stderr
             assert done.stderr.startswith("error: ")

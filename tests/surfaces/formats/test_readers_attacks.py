@@ -20,7 +20,7 @@ from tests.support.mesh_attacks import ATTACKS
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")
 
-# Most take a tenth of a second; machines may be busy.
+# Of this process alone, whatever else the machine does. Most take a tenth of a second.
 _LONGEST_SECONDS = 20
 # What refusing may take besides a multiple of the file: what packed data may grow to in any case, and its parsing.
 _SPARE_BYTES, _BYTES_PER_BYTE = 150 << 20, 150
@@ -39,9 +39,9 @@ def main(folder: Path) -> None:
         place.mkdir()
         path = attack(place)
         Path("/proc/self/clear_refs").write_text("5")
-        before, start = _peak_bytes(), time.perf_counter()
+        before, start = _peak_bytes(), time.process_time()
         outcomes = [_outcome(path, use) for use in ("load", "fingerprint", "expected_size")]
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         sys.stdout.write(json.dumps([name, outcomes, seconds, _peak_bytes() - before]) + "\n")
         sys.stdout.flush()
 
@@ -67,12 +67,12 @@ def disk_bytes(folder: Path) -> int:
     return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if not path.is_symlink())
 
 
+@pytest.mark.slow
 def test_attacks_are_refused_in_bounded_time_and_memory(tmp_path: Path) -> None:
     found = subprocess.run(
         [sys.executable, "-c", f"from {__name__} import main; from pathlib import Path; main(Path({str(tmp_path)!r}))"],
         capture_output=True,
         text=True,
-        timeout=280,
         cwd=Path(__file__).parents[3],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )
