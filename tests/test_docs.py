@@ -43,6 +43,16 @@ def documented(value: Any) -> list[str]:
     return [text for text in texts if text]
 
 
+def test_every_public_name_has_an_example() -> None:
+    values = [getattr(sb, name) for name in sb.__all__]
+    without = [
+        value.__name__
+        for value in values
+        if ">>>" not in str(value.__doc__) and not (isinstance(value, type) and issubclass(value, Exception))
+    ]
+    assert not without
+
+
 def test_every_public_name_is_there_with_its_text(site: Path) -> None:
     page = (site / "sobolev_batch.html").read_text(encoding="utf-8")
     # From one name to the next, methods and attributes included.

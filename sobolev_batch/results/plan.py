@@ -25,7 +25,7 @@ DEFAULT_FOLDER = Path("storage")
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What a run of a study would do; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
+    """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
 
     Attributes:
         study: Study.
@@ -36,6 +36,18 @@ class StudyPlan:
         refused: Reason for each surface that fits into no worker, by label.
         memory_bytes: Projected peak memory of each surface's largest task, by label.
         task_count: Number of tasks, if nothing were stored.
+
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "spheres"},
+    ...     "lattice": {"xi_max": 2.0, "M": 8},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+    ... })
+    >>> plan = sb.plan(study, "memory://forecast.zarr")
+    >>> plan.labels, plan.lattice, plan.stored
+    (('ico/0', 'ico/1', 'reference'), Lattice(xi_max=2.0, M=8), ())
     """
 
     study: Study

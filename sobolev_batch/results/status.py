@@ -31,6 +31,19 @@ class Status:
         run: Record of the latest run, or None.
         reduced: True once the store has tables.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
+
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "spheres"},
+    ...     "lattice": {"xi_max": 2.0, "M": 16},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+    ... })
+    >>> summary = sb.run(study, "memory://progress.zarr")
+    >>> status = sb.status("memory://progress.zarr")
+    >>> status.complete, status.total, status.failed
+    (3, 3, {})
     """
 
     store: str

@@ -67,7 +67,7 @@ class Location:
 
     @property
     def is_in_memory(self) -> bool:
-        """Whether no other process can see the store."""
+        """True if no other process can see the store."""
         return self.scheme == "memory"
 
     def absolute(self) -> Location:

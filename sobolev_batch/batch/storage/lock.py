@@ -82,12 +82,12 @@ class Lock:
 
     @property
     def holder_is_gone(self) -> bool:
-        """Whether the holder's process has certainly ended."""
+        """True if the holder's process has certainly ended."""
         return self._is_of_this_machine and not self.holder_is_alive
 
     @property
     def holder_is_alive(self) -> bool:
-        """Whether the holder's process certainly runs."""
+        """True if the holder's process certainly runs."""
         number = self.process.rpartition("/")[2].partition("@")[0]
         return self._is_of_this_machine and number.isdecimal() and _process_mark(int(number)) == self.process
 

@@ -96,7 +96,7 @@ class Store(Hierarchy):
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether the creation of the store was not finished: nothing in it counts."""
+        """True if the creation of the store was not finished: nothing in it counts."""
         return self.exists() and bool(self.documents[""].get("attributes", {}).get(UNFINISHED))
 
     @property

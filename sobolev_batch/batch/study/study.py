@@ -85,6 +85,17 @@ class Study:
         folder: Folder in which relative paths start.
         table: The study as it was written.
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
+
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "spheres"},
+    ...     "lattice": {"xi_max": 2.0, "M": 8},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+    ... })
+    >>> study.orders, study.lattice, study.pairs
+    ((-2.0,), Lattice(xi_max=2.0, M=8), 'all')
     """
 
     name: str
