@@ -1,4 +1,4 @@
-"""Ctrl-C and its like: the command ends within seconds, says how to go on, and goes on."""
+"""Ctrl-C and its like: the command ends within seconds, says how to continue, and continues."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) -> 
 @pytest.mark.parametrize(
     ("line", "number", "status", "words"),
     [
-        ("dashboard:", signal.SIGINT, 130, "interrupted; the same command goes on"),
-        ("[2/5]", signal.SIGINT, 130, "interrupted; the same command goes on"),
-        ("[5/5]", signal.SIGINT, 130, "interrupted; the same command goes on"),
-        ("[2/5]", signal.SIGTERM, 143, "terminated; the same command goes on"),
+        ("dashboard:", signal.SIGINT, 130, "interrupted; the same command continues"),
+        ("[2/5]", signal.SIGINT, 130, "interrupted; the same command continues"),
+        ("[5/5]", signal.SIGINT, 130, "interrupted; the same command continues"),
+        ("[2/5]", signal.SIGTERM, 143, "terminated; the same command continues"),
     ],
 )
 def test_a_run_ends_and_goes_on(
@@ -110,6 +110,6 @@ def test_a_request_within_a_finalizer_is_heard(number: int, status: int, word: s
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=_SECONDS)
     lines = [line for line in found.stderr.splitlines() if line]
     assert lines[0] == "goes on"
-    assert lines[1].startswith(f"{word}; the same command goes on")
+    assert lines[1].startswith(f"{word}; the same command continues")
     assert len(lines) == 2
     assert found.returncode == status

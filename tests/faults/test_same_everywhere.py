@@ -71,5 +71,7 @@ def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_p
     for record, other in zip(records, clean, strict=True):
         assert record is not None
         assert other is not None
-        assert (record.facts, record.quality, record.checksums) == (other.facts, other.quality, other.checksums)
+        # As text, since facts of a sphere hold NaN.
+        assert str(record.facts) == str(other.facts)
+        assert (record.quality, record.checksums) == (other.quality, other.checksums)
     assert run(study, store_path, workers=1).computed == ()

@@ -63,6 +63,8 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
         patch.setattr(cli, "raise_when_asked", lambda: None)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)
+        # It tells of connections that earlier tests of this process left open.
+        patch.setattr(logging.getLogger("asyncio"), "disabled", True)
         with (
             redirect_stdout(StringIO()) as output,
             redirect_stderr(StringIO()) as errors,

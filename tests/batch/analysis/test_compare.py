@@ -226,7 +226,7 @@ def test_damage_is_named_and_repaired(
 @pytest.mark.parametrize("axis", ["mesh", "order"])
 def test_a_lost_coordinate_of_witness_functions(axis: str, store: Path, client: Client) -> None:
     (store / f"witness/{axis}/c/0").unlink()
-    with pytest.raises(sb.DamageError, match=f"witness/{axis} is not there"):
+    with pytest.raises(sb.DamageError, match=f"witness/{axis} is missing"):
         sb.open_store(store)
     sb.run(asking(), store, client)
     assert_right(store, asking())

@@ -108,7 +108,7 @@ def test_a_batch_that_is_gone_is_no_failure_of_its_mesh(plan: Plan, store_path: 
     split = split_mesh(job, 3)
     assert split.batches == {0, 1, 2}
     job.store.scratch.discard(0)
-    with pytest.raises(StoreError, match="1 of the mesh of row 0 cannot be read"):
+    with pytest.raises(StoreError, match="batch 1 of the triangles of row 0 cannot be read"):
         transform_batch(job, split, 1, plan.blocks[0])
 
 
