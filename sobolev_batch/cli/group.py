@@ -20,7 +20,7 @@ _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "az
 def cli(context: click.Context, debug: bool) -> None:
     """Sobolev distances of negative order between surface meshes.
 
-    A study file names families of meshes and a reference. `run` stores the Fourier field of every
+    A study file names families of meshes and a reference. `run` stores the Fourier transform of every
     mesh and prints its distance from the reference.
 
     Exit status: 0 all done, 1 another error, 2 wrong input, 3 some meshes failed.

@@ -20,7 +20,7 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
-@click.option("--rtol", type=float, help="Largest error relative to the distance; chooses the lattice.")
+@click.option("--rtol", type=float, help="Largest relative error; use instead of --xi-max and --M.")
 @click.option("--memory", type=byte_count, metavar="SIZE", help="Memory of a transform, for --rtol. [default: 2GB]")
 @click.option("--memory-gb", type=float, hidden=True)
 @click.option("--xi-max", type=float, help="Highest frequency on each axis. [default: 5]")

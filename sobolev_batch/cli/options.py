@@ -28,7 +28,7 @@ folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path),
     default=".",
-    help="Folder where relative paths in the study start, to make its meshes again. [default: here]",
+    help="Base folder of the study's relative paths, to rebuild its meshes. [default: current folder]",
 )
 up_option = click.option(
     "--up",

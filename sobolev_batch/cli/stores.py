@@ -32,7 +32,7 @@ _FOLLOW_SECONDS = 5.0
 @click.option("--follow", is_flag=True, help="Repeat until the run has ended.")
 @click.pass_context
 def status_command(context: click.Context, store: Location, follow: bool) -> None:
-    """Show how far the study of STORE is, and what failed and why."""
+    """Show the progress of STORE's study, and what failed and why."""
     current = status(store)
     while follow and current.going_on:
         click.echo(f"{current}\n")
@@ -51,7 +51,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 def verify_command(context: click.Context, store: Location) -> None:
     """Check all data of STORE against its checksums.
 
-    Damaged data are named. If STORE can be written, they are also withdrawn, and `run` computes them again.
+    Damaged data are named. If STORE can be written, they are also removed, and `run` computes them again.
     The exit status is 1 if anything is damaged.
     """
     with click.progressbar(label="fields", file=sys.stderr, show_pos=True, length=0) as bar:
@@ -80,7 +80,7 @@ def verify_command(context: click.Context, store: Location) -> None:
 
 @cli.command("release")
 @store_argument
-@click.option("--force", is_flag=True, help="Release it even if its run gave a sign of life a moment ago.")
+@click.option("--force", is_flag=True, help="Release it even if its run was active a moment ago.")
 def release_command(store: Location, force: bool) -> None:
     """Remove the lock that a killed run left on STORE."""
     lock = release(store, force=force)
@@ -113,10 +113,10 @@ def plot_command(
 ) -> None:
     """Draw the results of STORE as pictures.
 
-    These are its convergence, transforms, distances and spectra, and some of its meshes.
+    They show convergence, transforms, distances and spectra, and some of the meshes.
 
-    Meshes are coloured by their witness functions, which show where they differ from the reference. The study makes
-    them again, and they are drawn with the extra "vtk"; by default a few are chosen by their distances.
+    Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
+    from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     # Imported here, since it takes as long as the start of all other commands.
     from sobolev_batch.results.figures.plots import write_plots
@@ -141,7 +141,7 @@ def plot_command(
 
 @cli.command("witness")
 @store_argument
-@click.option("--mesh", "meshes", multiple=True, metavar="LABEL", help="Only this mesh; may be repeated.")
+@click.option("--mesh", "meshes", multiple=True, metavar="MESH", help="Only this mesh; may be repeated.")
 @click.option(
     *("--order", "orders"), type=float, multiple=True, help="Any below -1/2; may be repeated. [default: the study's]"
 )

@@ -28,7 +28,9 @@ from sobolev_batch.results.tables.convergence import format_table
 @click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler, such as tls://host:8786.")
 @trust_option
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
-@click.option("--memory", type=byte_count, metavar="SIZE", help="Memory of each, such as 4GB. [default: equal parts]")
+@click.option(
+    "--memory", type=byte_count, metavar="SIZE", help="Memory per process, such as 4GB. [default: equal parts]"
+)
 @click.option("--worker-memory", type=byte_count, hidden=True)
 @click.pass_context
 def run_command(
