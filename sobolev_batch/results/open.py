@@ -14,36 +14,12 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.parameters import renamed_parameters
+from sobolev_batch.spectral.metrics.datasets import describe
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
 
 _SOURCE = "source"
-# Attributes of variables that the store itself does not describe.
-_ATTRIBUTES = {
-    "mesh": {"long_name": "label of the mesh"},
-    "other": {"long_name": "label of the other mesh"},
-    "order": {"long_name": "Sobolev order s"},
-    "fourier": {"long_name": "Fourier transform of the area measure", "convention": "∫ exp(-2πi ξ·x) dμ(x)"},
-    **{f"xi_{axis}": {"long_name": f"frequency along {axis}"} for axis in "xyz"},
-    "norm": {"long_name": "Sobolev norm", "kernel": "(1 + |ξ|²)^s"},
-    "distance": {"long_name": "Sobolev distance", "kernel": "(1 + |ξ|²)^s"},
-    "error": {"long_name": "bound on the error"},
-    "truncation": {"long_name": "error of truncation"},
-    "aliasing": {"long_name": "error of aliasing"},
-    "discretisation": {"long_name": "error of discretisation"},
-    "relative": {"long_name": "distance over the norm of the reference", "units": "1"},
-    "relative_error": {"long_name": "bound on the error of the relative distance", "units": "1"},
-    "rate": {"long_name": "observed order of convergence in the edge length", "units": "1"},
-    "rate_error": {"long_name": "bound on the error of the rate", "units": "1"},
-    "area_part": {"long_name": "distance by a change of total area"},
-    "shape_part": {"long_name": "distance by a change of shape"},
-    "edge_length": {"long_name": "mean edge length"},
-    "area": {"long_name": "area"},
-    "seconds": {"long_name": "time spent in tasks"},
-    "resolved": {"long_name": "distance exceeds its error"},
-    "within": {"long_name": "error is as small as the study asks for"},
-}
 
 
 @renamed_parameters(place="store")
@@ -82,8 +58,8 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
         tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
     tree.encoding = {**tree.encoding, _SOURCE: str(store)}
     for node in tree.subtree:
-        for name, variable in node.dataset.variables.items():
-            variable.attrs = {**_ATTRIBUTES.get(str(name), {}), **variable.attrs}
+        # Older stores describe fewer variables.
+        describe(node.dataset)
     return tree
 
 

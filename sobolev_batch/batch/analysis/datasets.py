@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -14,17 +14,11 @@ from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.rates import observed_rates
 
 Reals = NDArray[np.float64]
-
-_UNITS = {
-    "area": "unit length squared",
-    "edge_length_mean": "unit length",
-    "edge_length_max": "unit length",
-    "seconds": "s",
-}
 
 
 def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.Dataset:
@@ -43,25 +37,21 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     columns["seconds"] = np.array([record.seconds for record in filled])
     for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
-    return xr.Dataset(
-        {name: ("mesh", values, {"units": _UNITS[name]} if name in _UNITS else {}) for name, values in columns.items()},
-        coords={"mesh": _labels(rows)},
-    )
+    variables = {name: ("mesh", values) for name, values in columns.items()}
+    return describe(xr.Dataset(variables, coords={"mesh": _labels(rows)}))
 
 
 def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
     """Return `norm` (mesh, order) with its error, from values over (orders, meshes)."""
-    return xr.Dataset(_with_errors("norm", ("mesh", "order"), norms), coords=_coordinates(rows, orders))
+    return describe(xr.Dataset(_variables(norms.named("norm"), "mesh"), coords=_coordinates(rows, orders)))
 
 
 def distances_dataset(
     rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: NormEstimate
 ) -> xr.Dataset:
     """Return `distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
-    return xr.Dataset(
-        _with_errors("distance", ("mesh", "other", "order"), distances),
-        coords={**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))},
-    )
+    coordinates = {**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))}
+    return describe(xr.Dataset(_variables(distances.named("distance"), "mesh", "other"), coords=coordinates))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,43 +102,28 @@ def convergence_dataset(
     norms, norm_errors = to_reference.norms.values[:, None], to_reference.norms.errors[:, None]
     relative = distances / norms
     within = np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference.distances)
-    return xr.Dataset(
-        {
-            **_with_errors("distance", ("mesh", "order"), to_reference.distances),
-            "relative": (("mesh", "order"), relative.T),
-            "relative_error": (("mesh", "order"), (errors / norms + relative * norm_errors / norms).T),
-            "area_part": (("mesh", "order"), proportion.area.T, {"description": "a pure change of total area"}),
-            "shape_part": (("mesh", "order"), proportion.shape.T, {"description": "the rest; squares add up"}),
-            "rate": (("mesh", "order"), rates.T),
-            "rate_error": (("mesh", "order"), rate_errors.T),
-            "resolved": (("mesh", "order"), (errors < distances).T),
-            "within": (("mesh", "order"), within.T, {"description": "the error is as small as the study asks for"}),
-            "edge_length": ("mesh", sizes, {"units": "unit length"}),
-        },
+    columns = {
+        **to_reference.distances.named("distance"),
+        "relative": relative,
+        "relative_error": errors / norms + relative * norm_errors / norms,
+        "area_part": proportion.area,
+        "shape_part": proportion.shape,
+        "rate": rates,
+        "rate_error": rate_errors,
+        "resolved": errors < distances,
+        "within": within,
+    }
+    dataset = xr.Dataset(
+        {**_variables(columns, "mesh"), "edge_length": ("mesh", sizes)},
         coords=_coordinates(rows, orders),
         attrs={"reference": reference, **({} if accuracy is None else {"rtol": accuracy.rtol})},
     )
+    return describe(dataset)
 
 
-def _with_errors(name: str, dimensions: tuple[str, ...], estimate: NormEstimate) -> dict[str, Any]:
-    """Return a number, its error and the terms of the error; the axis of orders comes last."""
-    columns = {
-        name: estimate.values,
-        "error": estimate.errors,
-        "truncation": estimate.truncation,
-        "aliasing": estimate.aliasing,
-        "discretisation": estimate.discretisation,
-    }
-    descriptions = {
-        "error": f"the true {name} lies within this of the given one",
-        "truncation": f"part of the error: frequencies beyond xi_max, which can only add to the {name}",
-        "aliasing": "part of the error: spacing of the lattice",
-        "discretisation": "part of the error: quadrature and NUFFT",
-    }
-    return {
-        key: (dimensions, np.moveaxis(values, 0, -1), {"description": descriptions[key]} if key in descriptions else {})
-        for key, values in columns.items()
-    }
+def _variables(values: Mapping[str, NDArray[Any]], *dimensions: str) -> dict[str, Any]:
+    """Return values (orders, ...) as variables whose last dimension is the order."""
+    return {name: ((*dimensions, "order"), np.moveaxis(array, 0, -1)) for name, array in values.items()}
 
 
 def _coordinates(rows: Sequence[Row], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:

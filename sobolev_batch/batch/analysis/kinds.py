@@ -6,7 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -29,7 +29,8 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import Workspace
-from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES
+from sobolev_batch.spectral.metrics.datasets import describe
+from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES, Proximity
 
 # Raise it whenever comparisons come out differently: they are then made again.
 _VERSION = 1
@@ -259,23 +260,22 @@ class ProximityKind(ComparisonKind):
         return attributes is not None and attributes.get("digest") == self._digest(self._current(records))
 
     def _dataset(self, records: Lines) -> xr.Dataset:
-        """Return `hausdorff`, `chamfer` and `chamfer_error` (mesh), and `reason` where they are NaN."""
+        """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN."""
         records = self._current(records)
 
-        def column(name: str) -> tuple[str, Any, dict[str, str]]:
-            values = [record.numbers[name] if record and record.numbers else np.nan for record in records]
-            return "mesh", np.array(values), {"units": "unit length"}
-
-        reasons = np.array([record.reason if record else "" for record in records], dtype=object)
-        return xr.Dataset(
-            {**{name: column(name) for name in ("hausdorff", "chamfer", "chamfer_error")}, "reason": ("mesh", reasons)},
-            coords={"mesh": np.array(self.meshes.workspace.labels, dtype=object)},
-            attrs={
-                "reference": self.meshes.workspace.plan.reference,
-                "points": self.study.proximity,
-                "digest": self._digest(records),
-            },
-        )
+        columns: dict[str, Any] = {
+            name: [record.numbers[name] if record and record.numbers else np.nan for record in records]
+            for name in (field.name for field in fields(Proximity))
+        }
+        columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
+        attributes = {
+            "reference": self.meshes.workspace.plan.reference,
+            "points": self.study.proximity,
+            "digest": self._digest(records),
+        }
+        labels = np.array(self.meshes.workspace.labels, dtype=object)
+        variables = {name: ("mesh", values) for name, values in columns.items()}
+        return describe(xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes))
 
     def _current(self, records: Lines) -> list[ComparisonRecord | None]:
         """Return the records of the meshes and points that there are now."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,8 @@ import xarray as xr
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.formatting import Digits, duration, minus
+from sobolev_batch.results.tables.convergence import Column, shown_columns, shown_rows, table
+from sobolev_batch.results.tables.formatting import duration, minus
 from sobolev_batch.results.tables.groups import finished_group, has_proximity
 from sobolev_batch.spectral.lattice import Lattice
 
@@ -92,6 +92,7 @@ class Content:
         settings: Settings of the study, by keyword.
         summary: Key figures, by keyword.
         orders: Orders as they are shown.
+        columns: Headings of the convergence tables, after that of the meshes.
         tables: Convergence tables, one for each order.
         meshes: Sizes and times of each mesh.
         omitted: Number of meshes that the tables of convergence and of sizes leave out.
@@ -109,6 +110,7 @@ class Content:
     settings: Mapping[str, str]
     summary: Mapping[str, str]
     orders: tuple[str, ...]
+    columns: tuple[str, ...]
     tables: tuple[OrderTable, ...]
     meshes: tuple[TableRow, ...]
     omitted: tuple[int, int]
@@ -139,6 +141,7 @@ class Content:
             settings=dict(_settings(attributes, meshes)),
             summary=dict(_summary(meshes, convergence, orders)),
             orders=orders,
+            columns=tuple(column.heading for column in shown_columns(tree)),
             tables=tables,
             meshes=rows[: limits.mesh_rows],
             omitted=(omitted, max(0, len(rows) - limits.mesh_rows)),
@@ -173,37 +176,25 @@ def _tables(tree: xr.DataTree, families: tuple[str, ...], most_rows: int) -> tup
     """Return the table of each order, and how many meshes they leave out."""
     groups = list(table(tree).groupby("order", sort=False))
     most = max(1, most_rows // max(1, len(groups)))
+    columns = shown_columns(tree)
     tables = tuple(
         OrderTable(
-            minus(f"{order:g}"), tuple(_convergence_row(row, families) for row in rows[:most].to_dict(orient="records"))
+            minus(f"{order:g}"), tuple(_convergence_row(row, columns, families) for row in shown_rows(rows[:most]))
         )
         for order, rows in groups
     )
     return tables, max((len(rows) - most for _, rows in groups if len(rows) > most), default=0)
 
 
-def _convergence_row(row: Mapping[str, Any], families: tuple[str, ...]) -> TableRow:
-    mesh = row["mesh"], families.index(row["family"]), row["status"]
+def _convergence_row(row: Mapping[str, Any], columns: Sequence[Column], families: tuple[str, ...]) -> TableRow:
     if row["status"] != "complete":
-        return TableRow(*mesh, (Cell(row["status"]),))
-    distance = Digits.of(row["distance"], row["error"])
-    mark = "" if row["within"] else "above rtol"
-    area = math.nan if not row["distance"] else (row["area_part"] / row["distance"]) ** 2
-    cells: tuple[Cell, ...] = (
-        Cell.of_count(row["triangles"]) if row["triangles"] else Cell(""),
-        Cell.of_number(row["edge_length"]),
-        Cell.of_number(row["distance"], distance.value, mark if row["resolved"] else "below its error"),
-        Cell.of_number(row["error"], distance.error),
-        Cell.of_number(row["relative"], Digits.of(row["relative"], row["relative_error"]).together),
-        Cell.of_number(row["rate"], Digits.of(row["rate"], row["rate_error"]).together),
-        Cell.of_number(area, f"{100 * area:.1f} %"),
-    )
-    if "hausdorff" in row:
-        cells += (
-            Cell.of_number(row["hausdorff"], f"{row['hausdorff']:.3g}"),
-            Cell.of_number(row["chamfer"], Digits.of(row["chamfer"], row["chamfer_error"]).together),
-        )
-    return TableRow(*mesh, cells)
+        cells = [Cell(row["status"])]
+    else:
+        cells = [
+            Cell.of_number(row[column.name], column.page.format_map(row), row["mark"].page if column.is_marked else "")
+            for column in columns
+        ]
+    return TableRow(row["mesh"], families.index(row["family"]), row["status"], tuple(cells))
 
 
 def _mesh_rows(meshes: xr.Dataset, families: tuple[str, ...]) -> Iterator[TableRow]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import pandas as pd
 import xarray as xr
 
 from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables.formatting import Digits
 from sobolev_batch.results.tables.groups import chosen_orders, finished_group, has_proximity
 from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
 from sobolev_batch.spectral.shells import Orders
@@ -33,8 +35,6 @@ _NUMBERS = (
 )
 # Where the study asks for them.
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
-_HEADERS = ("mesh", "triangles", "edge", "distance ± error", "relative", "rate", "area")
-_PROXIMITY_HEADERS = ("Hausdorff ≥", "Chamfer ± s.e.")
 _NOTE = """\
 The true distance lies within its error, the sum of truncation (frequencies beyond
 xi_max; they can only add to the distance), aliasing (spacing of the lattice) and
@@ -49,6 +49,60 @@ standard error."""
 _ACCURACY_NOTE = """\
 The study asks for an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
+
+
+class Mark(NamedTuple):
+    """A remark about a distance, in a text table and on the page of a report."""
+
+    text: str = ""
+    page: str = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the text table and of the page of a report, beside the meshes; see `shown_rows` for its rows.
+
+    Attributes:
+        name: Number of a row that the column shows. Its cell is empty where that is NaN.
+        header: Header in text tables; without one they leave the column out.
+        heading: Heading on the page.
+        text: Template of cells in text tables.
+        page: Template of cells on the page.
+        is_marked: True where the mark of the distance follows the number.
+        group: Group of the store that has the number; the column is shown if the store has the group.
+    """
+
+    name: str
+    header: str
+    heading: str
+    text: str
+    page: str
+    is_marked: bool = False
+    group: str = "convergence"
+
+    def text_cell(self, row: dict[str, Any]) -> str:
+        """Return the cell of a text table."""
+        if row["status"] != "complete":
+            return "missing"
+        # The number itself is not NaN here, but its error may be.
+        text = "" if math.isnan(row[self.name]) else self.text.format_map(row).replace("nan", "?")
+        return text + row["mark"].text if self.is_marked else text
+
+
+_DISTANCE = "{distance:.6e} ± {error:.0e}"
+_CHAMFER = "{chamfer:.4e} ± {chamfer_error:.0e}"
+_COLUMNS = (
+    Column("triangles", "triangles", "triangles", "{triangles:,}", "{triangles:,}"),
+    Column("edge_length", "edge", "mean edge", "{edge_length:.4g}", "{edge_length:.4g}"),
+    Column("distance", "distance ± error", "distance", _DISTANCE, "{digits[distance].value}", is_marked=True),
+    Column("error", "", "± error", "", "{digits[distance].error}"),
+    Column("relative", "relative", "relative distance", "{relative:.5e}", "{digits[relative].together}"),
+    Column("rate", "rate", "rate", "{rate:.3f} ± {rate_error:.0e}", "{digits[rate].together}"),
+    Column("area_fraction", "area", "area", "{area_percent:.1f} %", "{area_percent:.1f} %"),
+    Column("hausdorff", "Hausdorff ≥", "Hausdorff ≥", "{hausdorff:.2e}", "{hausdorff:.3g}", group="proximity"),
+    Column("chamfer", "Chamfer ± s.e.", "Chamfer", _CHAMFER, "{digits[chamfer].together}", group="proximity"),
+)
+_ERRORS = {"distance": "error", "relative": "relative_error", "rate": "rate_error", "chamfer": "chamfer_error"}
 
 
 def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
@@ -103,16 +157,33 @@ def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[flo
     frame = table(tree, orders)
     if style in ("csv", "json"):
         return machine_table(frame, style)
-    headers = (*_HEADERS, *_PROXIMITY_HEADERS) if has_proximity(tree) else _HEADERS
+    columns = [column for column in shown_columns(tree) if column.header]
+    headers = ["mesh", *(column.header for column in columns)]
     sections = []
     for order, rows in frame.groupby("order", sort=False):
-        cells = [_cells(row)[: len(headers)] for row in rows.to_dict(orient="records")]
+        cells = [[row["mesh"], *(column.text_cell(row) for column in columns)] for row in shown_rows(rows)]
         caption = prose(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", style)
         separator = "\n" if style == "latex" else "\n\n"
         sections.append(f"{caption}{separator}{printed_table(cells, headers, style)}")
     sections.append(prose("\n".join(_notes(tree, frame)), style))
     failures = "\n".join(_failures(tree, frame))
     return "\n\n".join([*sections, prose(failures, style)] if failures else sections)
+
+
+def shown_columns(tree: xr.DataTree) -> list[Column]:
+    """Return the columns of which an open store has the numbers."""
+    return [column for column in _COLUMNS if column.group in tree.children]
+
+
+def shown_rows(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return rows of `table` with their marks, fractions of area and `Digits`, and NaN for no triangles."""
+    rows: list[dict[str, Any]] = frame.to_dict(orient="records")
+    for row in rows:
+        fraction = _area_fraction(row)
+        row.update(triangles=row["triangles"] or math.nan, area_fraction=fraction, area_percent=100 * fraction)
+        row["mark"] = _mark(row)
+        row["digits"] = {name: Digits.of(row[name], row[error]) for name, error in _ERRORS.items() if name in row}
+    return rows
 
 
 def _notes(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
@@ -133,39 +204,13 @@ def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     return failures
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    if row["status"] != "complete":
-        return [row["mesh"], *["missing"] * (len(_HEADERS) + len(_PROXIMITY_HEADERS) - 1)]
-    return [
-        row["mesh"],
-        f"{row['triangles']:,}" if row["triangles"] else "",
-        _number(row["edge_length"], ".4g"),
-        _with_error(row["distance"], row["error"], ".6e", ".0e") + _mark(row),
-        _number(row["relative"], ".5e"),
-        _with_error(row["rate"], row["rate_error"], ".3f", ".0e"),
-        _area_fraction(row),
-        _number(row.get("hausdorff", math.nan), ".2e"),
-        _with_error(row.get("chamfer", math.nan), row.get("chamfer_error", math.nan), ".4e", ".0e"),
-    ]
+def _area_fraction(row: dict[str, Any]) -> float:
+    """Return the fraction of the squared distance that a change of area explains, NaN if that is not resolved."""
+    has_fraction = row["resolved"] and row["distance"]
+    return (row["area_part"] / row["distance"]) ** 2 if has_fraction else math.nan
 
 
-def _area_fraction(row: dict[str, Any]) -> str:
-    if not row["resolved"] or math.isnan(row["area_part"]):
-        return ""
-    return f"{100 * (row['area_part'] / row['distance']) ** 2:.1f} %"
-
-
-def _mark(row: dict[str, Any]) -> str:
+def _mark(row: dict[str, Any]) -> Mark:
     if not row["resolved"]:
-        return "*"
-    return "" if row["within"] else "!"
-
-
-def _with_error(value: float, error: float, spec: str, error_spec: str) -> str:
-    if math.isnan(value):
-        return ""
-    return f"{value:{spec}} ± {'?' if math.isnan(error) else format(error, error_spec)}"
-
-
-def _number(value: float, spec: str) -> str:
-    return "" if math.isnan(value) else format(value, spec)
+        return Mark("*", "below its error")
+    return Mark() if row["within"] else Mark("!", "above rtol")

@@ -104,6 +104,11 @@ class NormEstimate:
         """Total error: the true value differs from the reported one by no more."""
         return self.truncation + self.aliasing + self.discretisation
 
+    def named(self, name: str) -> dict[str, Reals]:
+        """Return the values under a name, the error and its parts under theirs."""
+        parts = {"truncation": self.truncation, "aliasing": self.aliasing, "discretisation": self.discretisation}
+        return {name: self.values, "error": self.errors, **parts}
+
 
 def add_sums(sums: Sequence[Sums]) -> Sums:
     """Return the sums of a whole field from those of its blocks."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.shells import Orders, Reals
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
@@ -16,37 +16,71 @@ LENGTH, AREA, FREQUENCY, NUMBER = "unit length", "unit length squared", "cycles 
 # ||a||_s² = ∫ (1 + |ξ|²)^s |a^|² dξ is an area squared per volume.
 NORM = "unit length^(1/2)"
 
-Labels = Mapping[str, tuple[str, str]]
 
-_ORDER = {"long_name": "Sobolev order s", "units": NUMBER}
+def described(long_name: str, units: str = "", **others: str) -> dict[str, str]:
+    """Return the attributes of a variable, which may have no unit."""
+    return {"long_name": long_name, **({"units": units} if units else {}), **others}
+
+
+# Attributes of variables by name, in the results of functions and in stores.
+VARIABLES: Mapping[str, Mapping[str, str]] = {
+    "mesh": described("label of the mesh"),
+    "other": described("label of the other mesh"),
+    "order": described("Sobolev order s", NUMBER),
+    "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
+    **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
+    "inner_product": described("Sobolev inner product", LENGTH),
+    "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
+    "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
+    "error": described("bound on the error", NORM, description="truncation + aliasing + discretisation"),
+    "truncation": described("error of truncation", NORM, description="frequencies beyond xi_max, which can only add"),
+    "aliasing": described("error of aliasing", NORM, description="spacing of the lattice"),
+    "discretisation": described("error of discretisation", NORM, description="quadrature and NUFFT"),
+    "relative": described("distance over the norm of the reference", NUMBER),
+    "relative_error": described("bound on the error of the relative distance", NUMBER),
+    "area_part": described("distance explained by a change of total area alone", NORM),
+    "shape_part": described("rest of the distance", NORM, description="the squares of both parts add up"),
+    "area_share": described("share of the squared distance explained by a change of total area", NUMBER),
+    "excess": described("relative excess of area over the reference", NUMBER),
+    "rate": described("observed order of convergence in the edge length", NUMBER),
+    "rate_error": described("bound on the error of the rate", NUMBER),
+    "resolved": described("distance exceeds its error"),
+    "within": described("error is as small as asked for"),
+    "edge_length": described("mean edge length", LENGTH),
+    "edge_length_mean": described("mean edge length", LENGTH),
+    "edge_length_max": described("largest edge length", LENGTH),
+    "area": described("area", AREA),
+    "seconds": described("time spent in tasks", "s"),
+    "hausdorff": described("Hausdorff distance, a lower bound", LENGTH),
+    "chamfer": described("Chamfer distance", LENGTH),
+    "chamfer_error": described("standard error of the Chamfer distance", LENGTH),
+}
+
+
+def describe(dataset: xr.Dataset) -> xr.Dataset:
+    """Add to variables the attributes that they lack, in place, and return the dataset."""
+    for name, variable in dataset.variables.items():
+        variable.attrs = {**VARIABLES.get(str(name), {}), **variable.attrs}
+    return dataset
 
 
 def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
     """Return the coordinate `order`: a dimension for several orders, a scalar for one."""
     orders = np.asarray(order, dtype=np.float64)
-    return ("order",) * orders.ndim, orders, _ORDER
+    return ("order",) * orders.ndim, orders, dict(VARIABLES["order"])
 
 
-def labelled(order: Orders, values: Mapping[str, Reals], labels: Labels, attributes: Mapping[str, Any]) -> xr.Dataset:
+def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return values over the dimension `order`, or without dimensions for a single order.
 
     Args:
         order: Order or orders, as the user gave them.
         values: Variables by name, (orders,) each.
-        labels: Long name and unit of each variable.
         attributes: Attributes of the dataset besides the kernel.
     """
     axis = order_axis(order)
-    variables = {
-        name: (axis[0], np.asarray(value).reshape(axis[1].shape), described(*labels[name]))
-        for name, value in values.items()
-    }
-    return xr.Dataset(variables, coords={"order": axis}, attrs={"kernel": KERNEL, **attributes})
-
-
-def described(long_name: str, units: str) -> dict[str, str]:
-    """Return the attributes of a variable."""
-    return {"long_name": long_name, "units": units}
+    variables = {name: (axis[0], np.asarray(value).reshape(axis[1].shape)) for name, value in values.items()}
+    return describe(xr.Dataset(variables, coords={"order": axis}, attrs={"kernel": KERNEL, **attributes}))
 
 
 def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:

@@ -9,17 +9,9 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import NORM, NUMBER, labelled, lattice_attributes
+from sobolev_batch.spectral.metrics.datasets import labelled, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import Operand, pair_of, read_blocks
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
-
-_LABELS = {
-    "distance": ("Sobolev distance", NORM),
-    "area_part": ("distance explained by a change of area", NORM),
-    "shape_part": ("rest of the distance", NORM),
-    "area_share": ("share of the squared distance explained by a change of area", NUMBER),
-    "excess": ("relative excess of area over the reference", NUMBER),
-}
 
 
 @dataclass(frozen=True)
@@ -105,4 +97,4 @@ def proportion(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None
     with np.errstate(invalid="ignore"):
         share = (area / distance) ** 2
     parts = {"distance": distance, "area_part": area, "shape_part": shape, "area_share": share, "excess": excess}
-    return labelled(order, parts, _LABELS, lattice_attributes(weights.lattice, first, second))
+    return labelled(order, parts, lattice_attributes(weights.lattice, first, second))

@@ -20,7 +20,7 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import LENGTH, NORM, labelled, lattice_attributes
+from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
     Operand,
     check_surface,
@@ -36,14 +36,6 @@ from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
-_LABELS = {
-    "norm": ("Sobolev norm", NORM),
-    "distance": ("Sobolev distance", NORM),
-    "error": ("largest error", NORM),
-    "truncation": ("error by frequencies beyond xi_max", NORM),
-    "aliasing": ("error by the spacing of the lattice", NORM),
-    "discretisation": ("error by the quadrature and the NUFFT", NORM),
-}
 
 
 def norm(
@@ -117,17 +109,16 @@ def inner_product(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | N
     '1.758104'
     """
     orders = check_orders(order)
-    labels = {"inner_product": ("Sobolev inner product", LENGTH)}
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         products = np.array([sphere_inner_product(a, b, s) for s in orders])
-        return labelled(order, {"inner_product": products}, labels, {})
+        return labelled(order, {"inner_product": products}, {})
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.of(first), orders)
     sums = np.zeros(weights.lattice.shell_count)
     for block, (values, others) in read_blocks(weights.lattice, first, second):
         sums += shell_sums(values, others, weights.lattice, block)
     attributes = lattice_attributes(weights.lattice, first, second)
-    return labelled(order, {"inner_product": weights.per_shell @ sums}, labels, attributes)
+    return labelled(order, {"inner_product": weights.per_shell @ sums}, attributes)
 
 
 def distance(
@@ -212,7 +203,7 @@ def _to_accuracy(
     }
     dataset = _dataset(name, order, solution.estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
-    return dataset.assign(within=(dataset[name].dims, within, {"long_name": "error within rtol of the value"}))
+    return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"]))
 
 
 def _from_fields(
@@ -240,12 +231,4 @@ def _closed_form(values: Reals, squares: Reals) -> NormEstimate:
 def _dataset(
     name: str, order: Orders, estimate: NormEstimate, attributes: Mapping[str, object] | None = None
 ) -> xr.Dataset:
-    """Return a number with its error and the parts of the error."""
-    variables = {
-        name: estimate.values,
-        "error": estimate.errors,
-        "truncation": estimate.truncation,
-        "aliasing": estimate.aliasing,
-        "discretisation": estimate.discretisation,
-    }
-    return labelled(order, variables, _LABELS, attributes or {})
+    return labelled(order, estimate.named(name), attributes or {})
