@@ -47,7 +47,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int
     def tasks() -> Iterator[Task]:
         for rank, i in enumerate(i for i in missing if rows[i].label in sizes):
             row = rows[i]
-            job = Job(store, i, row, settings, plan.aim(row), sizes[row.label].allowed_bytes)
+            job = Job(store, i, row, settings, plan.distance_target(row), sizes[row.label].allowed_bytes)
             yield field_task(job, sizes[row.label], rank)
 
     # A mesh in batches occupies all workers by itself, and its batches the scratch space.
