@@ -56,9 +56,9 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     results = _Results.empty(workspace)
     for task, outcome in cluster.results(tasks, projected_bytes):
         if task.function == reducer.norms:
-            results.enter_norms(*task.arguments, outcome)
+            results.enter_norms(outcome, *task.arguments)
         else:
-            results.enter_tile(*task.arguments, outcome)
+            results.enter_tile(outcome, *task.arguments)
         steps.advance()
     reference = workspace.reference
     if every_pair:
@@ -94,14 +94,16 @@ class _Results:
         shapes = (4, orders, rows), (4, orders, rows), (3, orders, rows), (4, orders, rows, others)
         return cls(*(np.full(shape, np.nan) for shape in shapes))
 
-    def enter_norms(self, rows: Sequence[int], outcome: tuple[NormEstimate, NormEstimate, Proportion]) -> None:
+    def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.norms` for some rows."""
-        for table, values in zip((self.norms, self.to_reference, self.proportions), outcome, strict=True):
-            table[..., rows] = np.stack(list(values))
+        norms, to_reference, proportions = outcome
+        self.norms[..., rows] = np.stack(norms)
+        self.to_reference[..., rows] = np.stack(to_reference)
+        self.proportions[..., rows] = np.stack(proportions)
 
-    def enter_tile(self, rows: Sequence[int], others: Sequence[int], outcome: NormEstimate) -> None:
+    def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
-        pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
+        pairs, i, j = np.stack(outcome), np.array(rows), np.array(others)
         self.distances[..., i[:, None], j] = pairs
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 

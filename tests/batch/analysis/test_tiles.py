@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sobolev_batch import Sphere, Study, fourier_transform, proportion
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.study import plan as planning
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
@@ -34,11 +33,10 @@ def fields() -> NDArray[np.complex128]:
 
 
 @pytest.fixture
-def reducer(store_path: Path, fields: NDArray[np.complex128], monkeypatch: pytest.MonkeyPatch) -> Reducer:
+def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
     """Of fields in several chunks, of which a task holds five: three rows, one other, and one that is read."""
-    monkeypatch.setattr(planning, "_LARGEST_CHUNK_BYTES", 16_000)
     family = {"name": "ico", "source": "icosphere", "levels": list(range(ROWS - 1))}
-    study = Study.from_table(small_table(family=[family]))
+    study = replace(Study.from_table(small_table(family=[family])), largest_chunk_bytes=16_000)
     plan = make_plan(study)
     assert len(plan.blocks) > 2
     store = prepare_store(store_path, plan)
