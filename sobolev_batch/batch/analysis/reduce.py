@@ -97,13 +97,13 @@ class _Results:
     def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.norms` for some rows."""
         norms, to_reference, proportions = outcome
-        self.norms[..., rows] = np.stack(norms)
-        self.to_reference[..., rows] = np.stack(to_reference)
-        self.proportions[..., rows] = np.stack(proportions)
+        self.norms[..., rows] = np.stack(list(norms))
+        self.to_reference[..., rows] = np.stack(list(to_reference))
+        self.proportions[..., rows] = np.stack(list(proportions))
 
     def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
-        pairs, i, j = np.stack(outcome), np.array(rows), np.array(others)
+        pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
         self.distances[..., i[:, None], j] = pairs
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
