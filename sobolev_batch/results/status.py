@@ -11,6 +11,7 @@ from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.formatting import duration
 
@@ -64,7 +65,7 @@ class Status:
         # Nothing is read of comparisons that the study does not ask for.
         comparisons = {kind: ComparisonRecords(opened, kind) for kind in KINDS}
         notes = {kind: records.read() for kind, records in comparisons.items() if records.name in opened.documents}
-        complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
+        complete = complete_records(records)
         return cls(
             str(place),
             len(complete),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from sobolev_batch.batch.analysis.kinds import ComparisonKind, Meshes, ProximityKind, WitnessKind
-from sobolev_batch.batch.cluster.execution import Cluster, failure_reason
+from sobolev_batch.batch.cluster.execution import Cluster, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, missing_comparisons
 from sobolev_batch.batch.store.store import Store
@@ -111,7 +111,7 @@ class Comparer:
         for task, outcome in cluster.run(tasks, projected_bytes):
             label = self.workspace.rows[task.row].label
             if not isinstance(outcome, ComparisonRecord):
-                reason = failure_reason(outcome)
+                reason = describe_failure(outcome)
                 _log.error("%s: %s: %s", label, kind.name, reason)
                 records.write(task.row, ComparisonRecord(kind.key(task.row), "failed", reason))
             steps.advance(label)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task, failure_reason
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.fields.graph import field_task
 from sobolev_batch.batch.fields.sizing import size_rows
@@ -60,6 +60,6 @@ def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int
         if isinstance(outcome, Record):
             take(task.row, outcome)
         else:
-            give_up(task.row, failure_reason(outcome))
+            give_up(task.row, describe_failure(outcome))
     if is_split:
         store.scratch.discard()

@@ -20,7 +20,7 @@ from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
-from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
+from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.a_priori import choose_settings
 from sobolev_batch.spectral.errors.probe import join
@@ -103,7 +103,7 @@ class Job:
         if isinstance(error, InputError):
             return str(error)
         _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
-        return " ".join(str(error).split()) or type(error).__name__
+        return one_line(error)
 
 
 @dataclass(frozen=True)
