@@ -63,7 +63,7 @@ class Workspace:
         return complete_records(self.records)
 
     @property
-    def missing(self) -> list[int]:
+    def pending(self) -> list[int]:
         """Rows whose fields are to be computed."""
         return [i for i, record in enumerate(self.records) if record is None or not record.completes(self.rows[i].key)]
 
@@ -84,7 +84,7 @@ class Workspace:
             self.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
 
     def withdraw(self, rows: Iterable[int], reason: str) -> None:
-        """Withdraw the records of damaged fields, which makes them missing."""
+        """Withdraw the records of damaged fields, which makes them pending."""
         for i in rows:
             _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
             self.store.write_record(i, None)

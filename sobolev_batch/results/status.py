@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sobolev_batch.batch.storage.timestamps import age_seconds
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, missing_comparisons
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, failed_comparisons
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
@@ -75,7 +75,7 @@ class Status:
                 for label, record in zip(labels, records, strict=True)
                 if record is not None and record.status == "failed"
             },
-            missing_comparisons(labels, notes, complete),
+            failed_comparisons(labels, notes, complete),
             run,
             Tables(opened).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,

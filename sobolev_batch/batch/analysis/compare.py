@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from sobolev_batch.batch.analysis.kinds import ComparisonKind, Meshes, ProximityKind, WitnessKind
 from sobolev_batch.batch.cluster.execution import Cluster, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, missing_comparisons
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, failed_comparisons
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.workspace import Workspace
 
@@ -51,7 +51,7 @@ class Comparer:
         listed = Store.open(self.workspace.store.location)
         for kind in self.kinds:
             records = kind.records.read()
-            if kind.missing(records) or not kind.is_finished(listed, records):
+            if kind.pending(records) or not kind.is_finished(listed, records):
                 return False
         return True
 
@@ -72,17 +72,17 @@ class Comparer:
         for kind in self.unwanted:
             kind.records.remove()
             self.workspace.store.remove(kind.name)
-        missing = {kind: self._prepare(kind) for kind in self.kinds}
-        total = sum(map(len, missing.values()))
+        pending = {kind: self._prepare(kind) for kind in self.kinds}
+        total = sum(map(len, pending.values()))
         if total:
             steps = Steps(cluster.notify, "comparisons", total)
-            for kind, rows in missing.items():
+            for kind, rows in pending.items():
                 self._make(kind, rows, cluster, steps)
         records = {kind.name: kind.records.read() for kind in self.kinds}
         for kind in self.kinds:
             kind.finish(records[kind.name])
         self.workspace.store.consolidate()
-        return missing_comparisons(self.workspace.labels, records, self.meshes.rows)
+        return failed_comparisons(self.workspace.labels, records, self.meshes.rows)
 
     def _hide(self) -> None:
         """Have readers find no comparison until all are made: rows may be those of other fields or orders."""
@@ -95,18 +95,18 @@ class Comparer:
         """Create the group of a kind, and return the meshes whose comparison is to be made."""
         kind.create()
         records = kind.records.read()
-        missing = kind.missing(records)
+        pending = kind.pending(records)
         # A record that stays would speak for the values of another mesh, were that mesh to come back after an
         # end in the middle.
-        kept = set(self.meshes.rows) - set(missing)
+        kept = set(self.meshes.rows) - set(pending)
         for i, record in enumerate(records):
             if record is not None and i not in kept:
                 kind.records.write(i, None)
-        return missing
+        return pending
 
-    def _make(self, kind: ComparisonKind, missing: Sequence[int], cluster: Cluster, steps: Steps) -> None:
+    def _make(self, kind: ComparisonKind, pending: Sequence[int], cluster: Cluster, steps: Steps) -> None:
         records = kind.records
-        tasks = [kind.task(i, cluster.workers.allowed_bytes_per_task) for i in missing]
+        tasks = [kind.task(i, cluster.workers.allowed_bytes_per_task) for i in pending]
         projected_bytes = max((task.projected_bytes for task in tasks), default=0.0)
         for task, outcome in cluster.run(tasks, projected_bytes):
             label = self.workspace.rows[task.row].label

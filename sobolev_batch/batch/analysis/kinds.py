@@ -137,7 +137,7 @@ class ComparisonKind(ABC):
     def is_finished(self, listed: Store, records: Lines) -> bool:
         """Return True where readers of a store find the comparisons."""
 
-    def missing(self, records: Lines) -> list[int]:
+    def pending(self, records: Lines) -> list[int]:
         """Return the meshes whose comparison is to be made."""
         return [i for i in self.meshes.rows if not self.has_record(i, records)]
 
@@ -187,14 +187,14 @@ class WitnessKind(ComparisonKind):
         settings = WitnessSettings(plan.lattice, plan.blocks, plan.study.witness, transform_bytes)
         return Task(compare_by_witness, (self.comparison(i), settings), projected_bytes, row=i)
 
-    def missing(self, records: Lines) -> list[int]:
+    def pending(self, records: Lines) -> list[int]:
         """Return the meshes without a record, and those of which values are lost."""
-        missing = set(super().missing(records))
-        if len(missing) < len(self.meshes.rows):
+        pending = set(super().pending(records))
+        if len(pending) < len(self.meshes.rows):
             witnesses = Witnesses(self.store)
             whole = witnesses.complete_rows(self.meshes.vertex_counts) if witnesses.exist() else set()
-            missing |= set(self.meshes.rows) - whole
-        return sorted(missing)
+            pending |= set(self.meshes.rows) - whole
+        return sorted(pending)
 
     def create(self) -> None:
         """Create the array, of as many vertices as the largest mesh has."""
