@@ -110,7 +110,7 @@ def run(
         StudyError, MeshError, LatticeError: The study cannot be carried out.
         AccuracyError: The accuracy that the study asks for is out of reach; nothing was computed.
         StoreError: The store cannot be reached or written, belongs to another study, or is being
-            written by another run (ClaimError).
+            written by another run (LockError).
         ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice; or
             the scheduler was lost.
         InputError: The memory is not a size, or too little for a worker.
@@ -165,7 +165,7 @@ def carry_out(
     workspace = Workspace.prepared(location, plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
-        if not workspace.pending and are_tabulated(workspace) and Comparer(workspace).is_done:
+        if not workspace.pending and are_tabulated(workspace) and Comparer.of(workspace).is_done:
             return Summary._of(workspace, set(), {})
         with clients as client:
             heartbeat.cluster = client.scheduler.address
@@ -226,7 +226,7 @@ class _Run:
         """Compute the fields of rows again, make the comparisons, and return those that could not be made."""
         if rows:
             self._compute(workspace, rows)
-        return Comparer(workspace).run(self.cluster)
+        return Comparer.of(workspace).run(self.cluster)
 
     def _repairing(
         self, workspace: Workspace, rows: Sequence[int], attempt: Callable[[Workspace, Sequence[int]], Result]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Self
 
 from sobolev_batch.batch.analysis.kinds import ComparisonKind, Meshes, ProximityKind, WitnessKind
 from sobolev_batch.batch.cluster.execution import Cluster, describe_failure
@@ -28,19 +29,18 @@ class Comparer:
     """
 
     workspace: Workspace
-    meshes: Meshes = field(init=False)
-    kinds: tuple[ComparisonKind, ...] = field(init=False)
-    unwanted: tuple[ComparisonKind, ...] = field(init=False)
+    meshes: Meshes
+    kinds: tuple[ComparisonKind, ...]
+    unwanted: tuple[ComparisonKind, ...]
 
-    def __post_init__(self) -> None:
-        meshes = Meshes(self.workspace)
+    @classmethod
+    def of(cls, workspace: Workspace) -> Self:
+        """Return the comparisons of a workspace, by the kinds that its study asks for."""
+        meshes, names = Meshes(workspace), workspace.store.location.names()
         every_kind: tuple[ComparisonKind, ...] = WitnessKind(meshes), ProximityKind(meshes)
-        names = self.workspace.store.location.names()
-        object.__setattr__(self, "meshes", meshes)
-        object.__setattr__(self, "kinds", tuple(kind for kind in every_kind if kind.is_wanted))
-        object.__setattr__(
-            self, "unwanted", tuple(kind for kind in every_kind if not kind.is_wanted and kind.name in names)
-        )
+        kinds = tuple(kind for kind in every_kind if kind.is_wanted)
+        unwanted = tuple(kind for kind in every_kind if not kind.is_wanted and kind.name in names)
+        return cls(workspace, meshes, kinds, unwanted)
 
     @property
     def is_done(self) -> bool:
