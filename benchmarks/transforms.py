@@ -40,7 +40,7 @@ class Case:
         dtype: of both pipelines.
         threads: of both NUFFTs.
         upsampling: of the paper's.
-        goal: what the package's field may err; both have the same eps.
+        error_target: what the package's field may err; both have the same eps.
     """
 
     mesh: sb.Mesh
@@ -48,7 +48,7 @@ class Case:
     dtype: ComplexDtype
     threads: int
     upsampling: float
-    goal: ErrorTarget
+    error_target: ErrorTarget
 
     @classmethod
     @cache
@@ -56,7 +56,7 @@ class Case:
         """An icosphere on a lattice up to 5 cycles per unit length."""
         mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
         upsampling = faster_upsampling(mesh, lattice, eps=_EPS[dtype], dtype=dtype, threads=effort.threads)
-        return cls(mesh, lattice, dtype, effort.threads, upsampling, goal_of_the_paper(mesh))
+        return cls(mesh, lattice, dtype, effort.threads, upsampling, error_target_of_the_paper(mesh))
 
     def fresh_mesh(self) -> sb.Mesh:
         """The mesh as `fresh` leaves it."""
@@ -64,7 +64,7 @@ class Case:
 
     def ours(self, mesh: sb.Mesh) -> Complexes:
         """The package's transform, on half the lattice."""
-        settings = choose_settings(mesh, self.lattice, self.goal, TransformSettings(dtype=self.dtype))
+        settings = choose_settings(mesh, self.lattice, self.error_target, TransformSettings(dtype=self.dtype))
         same_eps = replace(settings, eps=_EPS[self.dtype])
         return transform_block(mesh, self.lattice, self.lattice.half, same_eps, Execution(threads=self.threads)).values
 
@@ -92,7 +92,7 @@ class Case:
         return ours, relative_distance(self.papers(self.mesh), self.lattice, ORDER)
 
 
-def goal_of_the_paper(mesh: sb.Mesh) -> ErrorTarget:
+def error_target_of_the_paper(mesh: sb.Mesh) -> ErrorTarget:
     """The error of a field that keeps the digits of its mesh's distance to the unit sphere."""
     distance = sb.distance(mesh, sb.Sphere(), ORDER, rtol=1e-2)["distance"].item()
     return ErrorTarget((ORDER,), (_FIELD_ERROR * distance,))
@@ -100,7 +100,7 @@ def goal_of_the_paper(mesh: sb.Mesh) -> ErrorTarget:
 
 def settings_of_the_paper(mesh: sb.Mesh, lattice: sb.Lattice, dtype: ComplexDtype) -> TransformSettings:
     """The settings that items 1 and 3 arrive at for a mesh."""
-    settings = choose_settings(mesh, lattice, goal_of_the_paper(mesh), TransformSettings(dtype=dtype))
+    settings = choose_settings(mesh, lattice, error_target_of_the_paper(mesh), TransformSettings(dtype=dtype))
     return replace(settings, eps=_EPS[dtype])
 
 

@@ -81,3 +81,8 @@ class ClusterError(SobolevBatchError):
 
 class AddressError(ClusterError, InputError):
     """The address of a scheduler is malformed, or its network is not to be trusted."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error in one line, or the name of its type if it has none."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""A run of a study: missing fields become tasks, and stored fields become tables."""
+"""A run of a study: pending fields become tasks, and stored fields become tables."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def run(
         StudyError, MeshError, LatticeError: The study cannot be carried out.
         AccuracyError: The accuracy that the study asks for is out of reach; nothing was computed.
         StoreError: The store cannot be reached or written, belongs to another study, or is being
-            written by another run (ClaimError).
+            written by another run (LockError).
         ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice; or
             the scheduler was lost.
         InputError: The memory is not a size, or too little for a worker.
@@ -165,7 +165,7 @@ def carry_out(
     workspace = Workspace.prepared(location, plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
-        if not workspace.missing and are_tabulated(workspace) and Comparer(workspace).is_done:
+        if not workspace.pending and are_tabulated(workspace) and Comparer.of(workspace).is_done:
             return Summary._of(workspace, set(), {})
         with clients as client:
             heartbeat.cluster = client.scheduler.address
@@ -199,12 +199,12 @@ class _Run:
 
     def carry_out(self, workspace: Workspace) -> Summary:
         """Compute, on larger lattices until the accuracy is reached, and compare."""
-        missing = workspace.missing
-        workspace.withdraw_results_of(missing)
+        rows = workspace.pending
+        workspace.withdraw_results_of(rows)
         computed: set[int] = set()
         for rounds_left in reversed(range(_MOST_ROUNDS)):
-            repaired, distances = self._repairing(workspace, missing, self._compute)
-            computed.update(missing, repaired)
+            repaired, distances = self._repairing(workspace, rows, self._compute)
+            computed.update(rows, repaired)
             choice = _larger_lattice(workspace.plan, distances) if rounds_left else None
             if choice is None:
                 break
@@ -213,37 +213,37 @@ class _Run:
                 workspace = Workspace.prepared(workspace.store.location, workspace.plan.with_choice(choice))
             self.heartbeat.write("running")
             workspace.withdraw_lost_fields()
-            missing = workspace.missing
+            rows = workspace.pending
         repaired, not_compared = self._repairing(workspace, (), self._compare)
         return Summary._of(workspace, computed | repaired, not_compared)
 
-    def _compute(self, workspace: Workspace, missing: Sequence[int]) -> NormEstimate | None:
-        """Compute fields and tables, and return the distances to the reference if they are new."""
-        compute_fields(self.cluster, workspace, missing)
+    def _compute(self, workspace: Workspace, rows: Sequence[int]) -> NormEstimate | None:
+        """Compute the fields of rows and the tables, and return the distances to the reference if they are new."""
+        compute_fields(self.cluster, workspace, rows)
         return tabulate_fields(self.cluster, workspace)
 
-    def _compare(self, workspace: Workspace, damaged: Sequence[int]) -> dict[str, str]:
-        """Make the comparisons, and return those that could not be made."""
-        if damaged:
-            self._compute(workspace, damaged)
-        return Comparer(workspace).run(self.cluster)
+    def _compare(self, workspace: Workspace, rows: Sequence[int]) -> dict[str, str]:
+        """Compute the fields of rows again, make the comparisons, and return those that could not be made."""
+        if rows:
+            self._compute(workspace, rows)
+        return Comparer.of(workspace).run(self.cluster)
 
     def _repairing(
-        self, workspace: Workspace, missing: Sequence[int], attempt: Callable[[Workspace, Sequence[int]], Result]
+        self, workspace: Workspace, rows: Sequence[int], attempt: Callable[[Workspace, Sequence[int]], Result]
     ) -> tuple[set[int], Result]:
         """Repeat an attempt with the rows that turn out damaged, and return these rows and its result."""
         repaired: set[int] = set()
         for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
             try:
-                return repaired, attempt(workspace, missing)
+                return repaired, attempt(workspace, rows)
             except DamageError as error:
                 if not attempts_left:
                     raise
                 _log.warning("%s", error)
                 # Where one is damaged, others may be.
-                missing = damaged_rows(self.cluster, workspace)
-                workspace.withdraw(missing, "its values are not what was stored")
-                repaired.update(missing)
+                rows = damaged_rows(self.cluster, workspace)
+                workspace.withdraw(rows, "its values are not what was stored")
+                repaired.update(rows)
         raise AssertionError("unreachable: the last attempt returns or raises")
 
 

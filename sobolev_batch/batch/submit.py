@@ -98,7 +98,7 @@ def submit(study: Study, store: str | Path | Location, client: Client, *, timeou
     except BaseException:
         release(location, lock)
         raise
-    return Submission(workspace.store.path, len(plan.rows), len(workspace.missing))
+    return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
 
 
 def _hand_over(study: Study, store: Store, lock: Lock, client: Client, timeout_seconds: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,19 +122,13 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
             if on_progress is not None:
                 on_progress(done, len(complete))
     tables = Tables(store).damaged()
-    comparisons = {kind: _damaged_comparisons(store, kind, complete) for kind in KINDS}
+    comparisons = {kind: _damaged_records(store, kind) for kind in KINDS}
+    comparisons["witness"] |= _damaged_witnesses(store, complete)
     withdraw = lock is not None and bool(damaged or tables or any(comparisons.values()))
     if lock is not None and withdraw:
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
-        # From a table, as long as there are some.
-        store.repair_labels()
-        Tables(store).invalidate()
-        for row in damaged:
-            store.write_record(row, None)
-        for kind, rows in comparisons.items():
-            for row in rows:
-                ComparisonRecords(store, kind).write(row, None)
+        _withdraw(store, damaged, comparisons)
     return Verification(
         store.path,
         len(complete),
@@ -146,19 +140,33 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
     )
 
 
-def _damaged_comparisons(store: Store, kind: Kind, complete: Mapping[int, Record]) -> dict[int, str]:
-    """Return the damage of the comparisons of one kind, by their rows."""
-    records = ComparisonRecords(store, kind)
-    damaged = {row: f"the record of its {kind} is damaged ({what})" for row, what in records.damaged().items()}
+def _withdraw(store: Store, fields: Iterable[int], comparisons: Mapping[Kind, Iterable[int]]) -> None:
+    """Withdraw the tables, and the records of damaged fields and comparisons."""
+    # From a table, as long as there are some.
+    store.repair_labels()
+    Tables(store).invalidate()
+    for row in fields:
+        store.write_record(row, None)
+    for kind, rows in comparisons.items():
+        for row in rows:
+            ComparisonRecords(store, kind).write(row, None)
+
+
+def _damaged_records(store: Store, kind: Kind) -> dict[int, str]:
+    damaged = ComparisonRecords(store, kind).damaged()
+    return {row: f"the record of its {kind} is damaged ({what})" for row, what in damaged.items()}
+
+
+def _damaged_witnesses(store: Store, complete: Mapping[int, Record]) -> dict[int, str]:
+    witnesses = Witnesses(store)
     # Those that readers do not find are still to be made.
-    if kind == "witness" and Witnesses(store).are_listed():
-        for row, record in enumerate(records.read()):
-            if record is not None and record.status == "complete" and row in complete:
-                try:
-                    Witnesses(store).read(row, complete[row].facts.vertices, record.checksum)
-                except DamageError as error:
-                    damaged[row] = f"its witness function is damaged ({error.what})"
-    return damaged
+    if not witnesses.are_listed():
+        return {}
+    records = complete_records(ComparisonRecords(store, "witness").read())
+    counts = {row: record.facts.vertices for row, record in complete.items()}
+    checksums = {row: record.checksum for row, record in records.items() if row in complete}
+    damaged = witnesses.damaged(counts, checksums)
+    return {row: f"its witness function is damaged ({what})" for row, what in damaged.items()}
 
 
 def _damage_of(store: Store, row: int, record: Record) -> str:

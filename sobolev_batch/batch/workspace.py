@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.comparison_records import ComparisonRecord
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
@@ -15,6 +16,8 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan, Row
 
 _log = logging.getLogger(__name__)
+
+AnyRecord = TypeVar("AnyRecord", Record, ComparisonRecord)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,7 @@ class Workspace:
         return complete_records(self.records)
 
     @property
-    def missing(self) -> list[int]:
+    def pending(self) -> list[int]:
         """Rows whose fields are to be computed."""
         return [i for i, record in enumerate(self.records) if record is None or not record.completes(self.rows[i].key)]
 
@@ -81,7 +84,7 @@ class Workspace:
             self.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
 
     def withdraw(self, rows: Iterable[int], reason: str) -> None:
-        """Withdraw the records of damaged fields, which makes them missing."""
+        """Withdraw the records of damaged fields, which makes them pending."""
         for i in rows:
             _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
             self.store.write_record(i, None)
@@ -97,6 +100,6 @@ class Workspace:
             )
 
 
-def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
-    """Return the records of fields that are complete, by their rows."""
+def complete_records(records: Sequence[AnyRecord | None]) -> dict[int, AnyRecord]:
+    """Return the records that are complete, by their rows."""
     return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}

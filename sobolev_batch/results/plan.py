@@ -16,6 +16,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -212,8 +213,5 @@ def _stored_keys(location: Location) -> dict[str, str]:
     if not store.exists() or store.is_unfinished:
         return {}
     store.attributes()
-    return {
-        label: record.key
-        for label, record in zip(store.labels(), store.records(), strict=True)
-        if record is not None and record.status == "complete"
-    }
+    labels = store.labels()
+    return {labels[row]: record.key for row, record in complete_records(store.records()).items()}

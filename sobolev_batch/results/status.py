@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sobolev_batch.batch.storage.timestamps import age_seconds
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, missing_comparisons
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, failed_comparisons
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.formatting import duration
 
@@ -64,7 +65,7 @@ class Status:
         # Nothing is read of comparisons that the study does not ask for.
         comparisons = {kind: ComparisonRecords(opened, kind) for kind in KINDS}
         notes = {kind: records.read() for kind, records in comparisons.items() if records.name in opened.documents}
-        complete = {row for row, record in enumerate(records) if record is not None and record.status == "complete"}
+        complete = complete_records(records)
         return cls(
             str(place),
             len(complete),
@@ -74,7 +75,7 @@ class Status:
                 for label, record in zip(labels, records, strict=True)
                 if record is not None and record.status == "failed"
             },
-            missing_comparisons(labels, notes, complete),
+            failed_comparisons(labels, notes, complete),
             run,
             Tables(opened).attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,

@@ -13,7 +13,7 @@ import xarray as xr
 from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
-from sobolev_batch.spectral.errors.a_priori import Goal, choose_settings
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.errors.probe import Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe, probe_block
@@ -158,32 +158,32 @@ def compute_field(
 def field_for(
     surface: Surface,
     lattice: Lattice,
-    goal: Goal,
+    target: ErrorTarget,
     settings: TransformSettings,
     execution: Execution = ON_CPU,
     *,
     sample: Sample | None = None,
 ) -> Field:
-    """Return the field of a surface with an error within a goal, as far as its probe can tell.
+    """Return the field of a surface with an error within a target, as far as its probe can tell.
 
     Args:
         surface: Surface in units of length.
         lattice: Lattice of the field.
-        goal: Largest error of the field.
+        target: Largest error of the field.
         settings: Settings whose dtype and quadrature are kept.
         execution: See `compute_field`.
         sample: See `compute_field`.
 
     Returns:
-        The first of a few attempts that keeps the goal, or the last.
+        The first of a few attempts that meets the target, or the last.
     """
     if isinstance(surface, Sphere):
-        return compute_field(surface, lattice, settings, goal.orders, sample=sample)
+        return compute_field(surface, lattice, settings, target.orders, sample=sample)
     for _ in range(_ATTEMPTS):
-        settled = choose_settings(surface, lattice, goal, settings)
-        field = compute_field(surface, lattice, settled, goal.orders, execution, sample=sample)
-        excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, goal.orders)) / goal.norms))
+        chosen = choose_settings(surface, lattice, target, settings)
+        field = compute_field(surface, lattice, chosen, target.orders, execution, sample=sample)
+        excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, target.orders)) / target.norms))
         if excess <= 1:
             break
-        goal = goal.tightened(2 * excess)
+        target = target.tightened(2 * excess)
     return field

@@ -22,7 +22,7 @@ from sobolev_batch import (
     proportion,
     run,
 )
-from sobolev_batch.batch.analysis import reduce as tabulation
+from sobolev_batch.batch.analysis import reduce
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support.studies import SMALL_LATTICE, small_table, variable
@@ -105,7 +105,7 @@ def test_tables_of_an_older_version_are_made_anew(
     client: Client, study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(tabulation, "TABLES_VERSION", tabulation.TABLES_VERSION - 1)
+        patch.setattr(reduce, "TABLES_VERSION", reduce.TABLES_VERSION - 1)
         run(study, store_path, client)
     steps: list[Progress] = []
     again = run(study, store_path, client, on_progress=steps.append)

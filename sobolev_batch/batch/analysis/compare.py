@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Self
 
 from sobolev_batch.batch.analysis.kinds import ComparisonKind, Meshes, ProximityKind, WitnessKind
-from sobolev_batch.batch.cluster.execution import Cluster, failure_reason
+from sobolev_batch.batch.cluster.execution import Cluster, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, missing_comparisons
+from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecord, failed_comparisons
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.workspace import Workspace
 
@@ -28,19 +29,18 @@ class Comparer:
     """
 
     workspace: Workspace
-    meshes: Meshes = field(init=False)
-    kinds: tuple[ComparisonKind, ...] = field(init=False)
-    unwanted: tuple[ComparisonKind, ...] = field(init=False)
+    meshes: Meshes
+    kinds: tuple[ComparisonKind, ...]
+    unwanted: tuple[ComparisonKind, ...]
 
-    def __post_init__(self) -> None:
-        meshes = Meshes(self.workspace)
+    @classmethod
+    def of(cls, workspace: Workspace) -> Self:
+        """Return the comparisons of a workspace, by the kinds that its study asks for."""
+        meshes, names = Meshes(workspace), workspace.store.location.names()
         every_kind: tuple[ComparisonKind, ...] = WitnessKind(meshes), ProximityKind(meshes)
-        names = self.workspace.store.location.names()
-        object.__setattr__(self, "meshes", meshes)
-        object.__setattr__(self, "kinds", tuple(kind for kind in every_kind if kind.is_wanted))
-        object.__setattr__(
-            self, "unwanted", tuple(kind for kind in every_kind if not kind.is_wanted and kind.name in names)
-        )
+        kinds = tuple(kind for kind in every_kind if kind.is_wanted)
+        unwanted = tuple(kind for kind in every_kind if not kind.is_wanted and kind.name in names)
+        return cls(workspace, meshes, kinds, unwanted)
 
     @property
     def is_done(self) -> bool:
@@ -51,7 +51,7 @@ class Comparer:
         listed = Store.open(self.workspace.store.location)
         for kind in self.kinds:
             records = kind.records.read()
-            if kind.missing(records) or not kind.is_finished(listed, records):
+            if kind.pending(records) or not kind.is_finished(listed, records):
                 return False
         return True
 
@@ -72,17 +72,17 @@ class Comparer:
         for kind in self.unwanted:
             kind.records.remove()
             self.workspace.store.remove(kind.name)
-        missing = {kind: self._prepare(kind) for kind in self.kinds}
-        total = sum(map(len, missing.values()))
+        pending = {kind: self._prepare(kind) for kind in self.kinds}
+        total = sum(map(len, pending.values()))
         if total:
             steps = Steps(cluster.notify, "comparisons", total)
-            for kind, rows in missing.items():
+            for kind, rows in pending.items():
                 self._make(kind, rows, cluster, steps)
         records = {kind.name: kind.records.read() for kind in self.kinds}
         for kind in self.kinds:
             kind.finish(records[kind.name])
         self.workspace.store.consolidate()
-        return missing_comparisons(self.workspace.labels, records, self.meshes.rows)
+        return failed_comparisons(self.workspace.labels, records, self.meshes.rows)
 
     def _hide(self) -> None:
         """Have readers find no comparison until all are made: rows may be those of other fields or orders."""
@@ -95,23 +95,23 @@ class Comparer:
         """Create the group of a kind, and return the meshes whose comparison is to be made."""
         kind.create()
         records = kind.records.read()
-        missing = kind.missing(records)
+        pending = kind.pending(records)
         # A record that stays would speak for the values of another mesh, were that mesh to come back after an
         # end in the middle.
-        kept = set(self.meshes.rows) - set(missing)
+        kept = set(self.meshes.rows) - set(pending)
         for i, record in enumerate(records):
             if record is not None and i not in kept:
                 kind.records.write(i, None)
-        return missing
+        return pending
 
-    def _make(self, kind: ComparisonKind, missing: Sequence[int], cluster: Cluster, steps: Steps) -> None:
+    def _make(self, kind: ComparisonKind, pending: Sequence[int], cluster: Cluster, steps: Steps) -> None:
         records = kind.records
-        tasks = [kind.task(i, cluster.workers.allowed_bytes_per_task) for i in missing]
+        tasks = [kind.task(i, cluster.workers.allowed_bytes_per_task) for i in pending]
         projected_bytes = max((task.projected_bytes for task in tasks), default=0.0)
         for task, outcome in cluster.run(tasks, projected_bytes):
             label = self.workspace.rows[task.row].label
             if not isinstance(outcome, ComparisonRecord):
-                reason = failure_reason(outcome)
+                reason = describe_failure(outcome)
                 _log.error("%s: %s: %s", label, kind.name, reason)
                 records.write(task.row, ComparisonRecord(kind.key(task.row), "failed", reason))
             steps.advance(label)

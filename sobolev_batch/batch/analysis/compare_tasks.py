@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.store.comparison_records import ComparisonRecord, ComparisonRecords, Kind
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.witness_array import Witnesses
-from sobolev_batch.errors import InputError, MeshError, StoreError
+from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.witness import Evaluation
 from sobolev_batch.spectral.shells import SobolevWeights
@@ -89,7 +89,7 @@ class Comparison:
         except Exception as error:
             if not isinstance(error, InputError):
                 _log.error("%s: %s failed for a reason that is not its mesh's", self.mesh.label, kind, exc_info=error)
-            record = ComparisonRecord(self.key, "failed", " ".join(str(error).split()) or type(error).__name__)
+            record = ComparisonRecord(self.key, "failed", one_line(error))
         record = replace(record, seconds=time.perf_counter() - started)
         ComparisonRecords(self.store, kind).write(self.mesh.row, record)
         return record

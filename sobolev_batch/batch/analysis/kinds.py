@@ -40,7 +40,7 @@ _VERTEX_BYTES, _VALUE_BYTES = 48.0, 24.0
 # Two fields, and the chunk that is being read.
 _BLOCKS_HELD = 3
 
-Lines = Sequence[ComparisonRecord | None]
+Records = Sequence[ComparisonRecord | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,18 +131,18 @@ class ComparisonKind(ABC):
         """Create the group of the comparisons, or keep the one that the store has."""
 
     @abstractmethod
-    def finish(self, records: Lines) -> None:
+    def finish(self, records: Records) -> None:
         """Have readers find the comparisons."""
 
     @abstractmethod
-    def is_finished(self, listed: Store, records: Lines) -> bool:
+    def is_finished(self, listed: Store, records: Records) -> bool:
         """Return True where readers of a store find the comparisons."""
 
-    def missing(self, records: Lines) -> list[int]:
+    def pending(self, records: Records) -> list[int]:
         """Return the meshes whose comparison is to be made."""
         return [i for i in self.meshes.rows if not self.has_record(i, records)]
 
-    def has_record(self, i: int, records: Lines) -> bool:
+    def has_record(self, i: int, records: Records) -> bool:
         """Return True where a mesh was compared with what there is now."""
         record = records[i]
         return record is not None and record.completes(self.key(i))
@@ -188,14 +188,14 @@ class WitnessKind(ComparisonKind):
         settings = WitnessSettings(plan.lattice, plan.blocks, plan.study.witness, transform_bytes)
         return Task(compare_by_witness, (self.comparison(i), settings), projected_bytes, row=i)
 
-    def missing(self, records: Lines) -> list[int]:
+    def pending(self, records: Records) -> list[int]:
         """Return the meshes without a record, and those of which values are lost."""
-        missing = set(super().missing(records))
-        if len(missing) < len(self.meshes.rows):
+        pending = set(super().pending(records))
+        if len(pending) < len(self.meshes.rows):
             witnesses = Witnesses(self.store)
             whole = witnesses.complete_rows(self.meshes.vertex_counts) if witnesses.exist() else set()
-            missing |= set(self.meshes.rows) - whole
-        return sorted(missing)
+            pending |= set(self.meshes.rows) - whole
+        return sorted(pending)
 
     def create(self) -> None:
         """Create the array, of as many vertices as the largest mesh has."""
@@ -204,14 +204,14 @@ class WitnessKind(ComparisonKind):
         Witnesses(self.store).create(workspace.labels, self.study.witness, workspace.plan.reference, max(1, vertices))
         self.records.create(len(workspace.rows))
 
-    def finish(self, records: Lines) -> None:
+    def finish(self, records: Records) -> None:
         """Remove values without a record, and list the array."""
         # A task that outlives the run which submitted it may have written others.
         counts = {i: count for i, count in self.meshes.vertex_counts.items() if self.has_record(i, records)}
         Witnesses(self.store).remove_unused(counts)
         Witnesses(self.store).list_for_readers()
 
-    def is_finished(self, listed: Store, records: Lines) -> bool:
+    def is_finished(self, listed: Store, records: Records) -> bool:
         """Return True where the root lists the array."""
         return Witnesses(listed).are_listed()
 
@@ -250,16 +250,16 @@ class ProximityKind(ComparisonKind):
             Tables(self.store).write(_PROXIMITY_GROUP, self._dataset([None] * rows))
         self.records.create(rows)
 
-    def finish(self, records: Lines) -> None:
+    def finish(self, records: Records) -> None:
         """Write the table."""
         Tables(self.store).write(_PROXIMITY_GROUP, self._dataset(records))
 
-    def is_finished(self, listed: Store, records: Lines) -> bool:
+    def is_finished(self, listed: Store, records: Records) -> bool:
         """Return True where the table is made from these records."""
         attributes = Tables(listed).attributes(_PROXIMITY_GROUP)
         return attributes is not None and attributes.get("digest") == self._digest(self._current(records))
 
-    def _dataset(self, records: Lines) -> xr.Dataset:
+    def _dataset(self, records: Records) -> xr.Dataset:
         """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN."""
         records = self._current(records)
 
@@ -277,7 +277,7 @@ class ProximityKind(ComparisonKind):
         variables = {name: ("mesh", values) for name, values in columns.items()}
         return describe(xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes))
 
-    def _current(self, records: Lines) -> list[ComparisonRecord | None]:
+    def _current(self, records: Records) -> list[ComparisonRecord | None]:
         """Return the records of the meshes and points that there are now."""
         rows = set(self.meshes.rows)
         return [
@@ -285,6 +285,6 @@ class ProximityKind(ComparisonKind):
             for i, record in enumerate(records)
         ]
 
-    def _digest(self, records: Lines) -> str:
+    def _digest(self, records: Records) -> str:
         lines = [None if record is None else record.to_json() for record in records]
         return hashlib.sha256(json.dumps([self.meshes.workspace.labels, lines]).encode()).hexdigest()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,10 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     steps = Steps(cluster.notify, "reduction", len(tasks))
     results = _Results.empty(workspace)
     for task, outcome in cluster.results(tasks, projected_bytes):
-        results.enter(outcome, *task.arguments)
+        if task.function == reducer.norms:
+            results.enter_norms(outcome, *task.arguments)
+        else:
+            results.enter_tile(outcome, *task.arguments)
         steps.advance()
     reference = workspace.reference
     if every_pair:
@@ -90,15 +94,18 @@ class _Results:
         shapes = (4, orders, rows), (4, orders, rows), (3, orders, rows), (4, orders, rows, others)
         return cls(*(np.full(shape, np.nan) for shape in shapes))
 
-    def enter(self, outcome: Any, rows: Any, others: Any = None) -> None:
-        """Enter the outcome of a task for some rows, or for pairs of rows and others."""
-        if others is None:
-            for table, values in zip((self.norms, self.to_reference, self.proportions), outcome, strict=True):
-                table[..., rows] = np.stack(list(values))
-        else:
-            pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
-            self.distances[..., i[:, None], j] = pairs
-            self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
+    def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
+        """Enter the outcome of `Reducer.norms` for some rows."""
+        norms, to_reference, proportions = outcome
+        self.norms[..., rows] = np.stack(list(norms))
+        self.to_reference[..., rows] = np.stack(list(to_reference))
+        self.proportions[..., rows] = np.stack(list(proportions))
+
+    def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
+        """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
+        pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
+        self.distances[..., i[:, None], j] = pairs
+        self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
 
 def make_reducer(workspace: Workspace) -> Reducer:
@@ -116,7 +123,7 @@ def make_reducer(workspace: Workspace) -> Reducer:
         lattice=plan.lattice,
         blocks=plan.blocks,
         orders=orders,
-        center=reference if reference in complete else None,
+        reference=reference if reference in complete else None,
         areas=areas,
         errors=errors,
         widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),

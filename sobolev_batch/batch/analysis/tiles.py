@@ -36,7 +36,7 @@ class Reducer:
         lattice: Lattice of the fields.
         blocks: Blocks of the lattice, one chunk each.
         orders: Sobolev orders s.
-        center: Row of the reference, or None if it has no field.
+        reference: Row of the reference, or None if it has no field.
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.
         widths: Widths of all surfaces together (13,), see `Extent`.
@@ -49,7 +49,7 @@ class Reducer:
     lattice: Lattice
     blocks: tuple[Block, ...]
     orders: tuple[float, ...]
-    center: int | None
+    reference: int | None
     areas: Reals
     errors: Reals
     widths: Reals
@@ -96,36 +96,36 @@ class Reducer:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
     def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Proportion]:
-        """Return norms of rows, distances to the center and their decomposition, each over (orders, rows).
+        """Return norms of rows, distances to the reference and their decomposition, each over (orders, rows).
 
-        Without a center, all but the norms is NaN.
+        Without the reference's field, all but the norms are NaN.
         """
         own = np.zeros((len(rows), self.lattice.shell_count))
-        to_center, products = np.zeros_like(own), np.zeros_like(own)
-        of_center = np.zeros(self.lattice.shell_count)
+        to_reference, products = np.zeros_like(own), np.zeros_like(own)
+        of_reference = np.zeros(self.lattice.shell_count)
         for number, block in enumerate(self.blocks):
-            center = None if self.center is None else self._read([self.center], number)[0]
-            if center is not None:
-                of_center += shell_sums(center, None, self.lattice, block)
+            reference = None if self.reference is None else self._read([self.reference], number)[0]
+            if reference is not None:
+                of_reference += shell_sums(reference, None, self.lattice, block)
             for batch in _slices(len(rows), self._read_at_once):
                 values = self._read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
-                if center is not None:
-                    values -= center
-                    to_center[batch] += shell_sums(values, None, self.lattice, block)
-                    centers = np.broadcast_to(center, values.shape)
-                    products[batch] += shell_sums(values, centers, self.lattice, block)
+                if reference is not None:
+                    values -= reference
+                    to_reference[batch] += shell_sums(values, None, self.lattice, block)
+                    references = np.broadcast_to(reference, values.shape)
+                    products[batch] += shell_sums(values, references, self.lattice, block)
         of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
         norms = self._estimate(sums_of_shells(own, self.weights), *of_rows)
-        if self.center is None:
+        if self.reference is None:
             unknown = np.full_like(norms.values, np.nan)
             return norms, NormEstimate(*[unknown] * 4), Proportion(*[unknown] * 3)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
-        apart = np.array([row != self.center for row in rows], dtype=np.float64)
-        areas = (of_rows[0] + self.areas[self.center]) * apart
-        errors = (of_rows[1] + self.errors[:, [self.center]]) * apart
-        distances = self._estimate(sums_of_shells(to_center, self.weights), areas, errors)
-        return norms, distances, Proportion.of_shells(to_center, products, of_center, self.weights)
+        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
+        areas = (of_rows[0] + self.areas[self.reference]) * apart
+        errors = (of_rows[1] + self.errors[:, [self.reference]]) * apart
+        distances = self._estimate(sums_of_shells(to_reference, self.weights), areas, errors)
+        return norms, distances, Proportion.of_shells(to_reference, products, of_reference, self.weights)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances of rows to other rows, over (orders, rows, others).
@@ -165,13 +165,13 @@ class Reducer:
         """
         block = self.blocks[number]
         arrangement = Arrangement.of(self.weights, block)
-        center = None if self.center is None else self._read([self.center], number)
+        reference = None if self.reference is None else self._read([self.reference], number)
 
         def read(fields: Sequence[int], buffer: Complexes) -> Complexes:
             for batch in _slices(len(fields), self._read_at_once):
                 values = self._read(fields[batch], number).astype(np.complex128, copy=False)
-                if center is not None:
-                    values -= center
+                if reference is not None:
+                    values -= reference
                 np.take(values.reshape(len(values), -1), arrangement.order, axis=1, out=buffer[batch], mode="clip")
             return buffer[: len(fields)]
 

@@ -175,7 +175,7 @@ class Cluster:
         return outcomes
 
 
-def failure_reason(error: BaseException) -> str:
+def describe_failure(error: BaseException) -> str:
     """Return why a task failed, in one line."""
     return str(error) if isinstance(error, ClusterError) else f"{type(error).__name__}: {error}"
 

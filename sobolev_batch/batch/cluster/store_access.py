@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 _PROCESS = uuid.uuid4().hex
 
 
-def require_store_access(client: Client, location: Location, claim: Lock) -> None:
+def require_store_access(client: Client, location: Location, lock: Lock) -> None:
     """Check that all workers see the store that this process has locked.
 
     Drivers and credentials differ between processes: a store that this process reaches, a worker may not. And a
@@ -27,7 +27,7 @@ def require_store_access(client: Client, location: Location, claim: Lock) -> Non
     Raises:
         StoreError: A worker does not see it; the message names the worker.
     """
-    for worker, answer in client.run(_look, location, claim, on_error="return").items():
+    for worker, answer in client.run(_look, location, lock, on_error="return").items():
         if isinstance(answer, BaseException):
             # A worker that has just gone says nothing about the store; tasks will tell.
             _log.warning("the worker %s does not say whether it reaches %s: %s", worker, location, answer)
@@ -42,10 +42,10 @@ def require_store_access(client: Client, location: Location, claim: Lock) -> Non
             raise StoreError(f"the worker {worker} cannot use the store: {problem}")
 
 
-def _look(location: Location, claim: Lock) -> tuple[str, str]:
+def _look(location: Location, lock: Lock) -> tuple[str, str]:
     """Return the process that runs this, and why it does not see the store."""
     try:
-        sees_lock = claim.is_held(location)
+        sees_lock = lock.is_held(location)
     except StoreError as error:
         return _this_process(), str(error)
     elsewhere = f"{location} is another place there; name one that all machines share"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task, failure_reason
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.fields.graph import field_task
 from sobolev_batch.batch.fields.sizing import size_rows
@@ -17,7 +17,7 @@ from sobolev_batch.batch.workspace import Workspace
 _log = logging.getLogger(__name__)
 
 
-def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int]) -> None:
+def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:
     """Compute the fields of rows, and take their records into the workspace.
 
     Raises:
@@ -25,9 +25,9 @@ def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int
         ClusterError: The scheduler was lost, or the lattice fits into no worker.
     """
     plan, store, rows = workspace.plan, workspace.store, workspace.rows
-    steps = Steps(cluster.notify, "fields", len(missing))
+    steps = Steps(cluster.notify, "fields", len(pending))
     workers = cluster.workers.with_backend(plan.study.backend)
-    sizes, refused = size_rows(plan, [rows[i] for i in missing], workers)
+    sizes, refused = size_rows(plan, [rows[i] for i in pending], workers)
 
     def take(i: int, record: Record) -> None:
         workspace.records[i] = record
@@ -39,15 +39,15 @@ def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int
         store.write_record(i, record)
         take(i, record)
 
-    for i in missing:
+    for i in pending:
         if rows[i].label in refused:
             give_up(i, refused[rows[i].label])
     settings = FieldSettings.of(plan)
 
     def tasks() -> Iterator[Task]:
-        for rank, i in enumerate(i for i in missing if rows[i].label in sizes):
+        for rank, i in enumerate(i for i in pending if rows[i].label in sizes):
             row = rows[i]
-            job = Job(store, i, row, settings, plan.aim(row), sizes[row.label].allowed_bytes)
+            job = Job(store, i, row, settings, plan.distance_target(row), sizes[row.label].allowed_bytes)
             yield field_task(job, sizes[row.label], rank)
 
     # A mesh in batches occupies all workers by itself, and its batches the scratch space.
@@ -60,6 +60,6 @@ def compute_fields(cluster: Cluster, workspace: Workspace, missing: Sequence[int
         if isinstance(outcome, Record):
             take(task.row, outcome)
         else:
-            give_up(task.row, failure_reason(outcome))
+            give_up(task.row, describe_failure(outcome))
     if is_split:
         store.scratch.discard()

@@ -20,7 +20,7 @@ from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
-from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError
+from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.a_priori import choose_settings
 from sobolev_batch.spectral.errors.probe import join
@@ -63,7 +63,7 @@ class Job:
         index: Index of the row in the store.
         row: Row of the plan.
         settings: Settings of all fields.
-        aim: Accuracy that the field is computed for, if the study asks for one.
+        distance_target: Accuracy that the field is computed for, if the study asks for one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
     """
 
@@ -71,7 +71,7 @@ class Job:
     index: int
     row: Row
     settings: FieldSettings
-    aim: DistanceTarget | None = None
+    distance_target: DistanceTarget | None = None
     allowed_bytes: float | None = None
 
     def load(self) -> Surface:
@@ -88,19 +88,22 @@ class Job:
 
     def transform_settings(self, surface: Surface) -> TransformSettings:
         """Return the settings of a field that is computed block by block, from its a priori error."""
-        if self.aim is None or isinstance(surface, Sphere):
+        if self.distance_target is None or isinstance(surface, Sphere):
             return self.settings.transform
-        return choose_settings(surface, self.settings.lattice, self.aim.error_target(surface), self.settings.transform)
+        return choose_settings(
+            surface, self.settings.lattice, self.distance_target.error_target(surface), self.settings.transform
+        )
 
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
         if isinstance(error, LatticeError):
-            advice = "" if self.aim is None else "; it was chosen for surfaces that reach less far: name another store"
-            return f"{error}{advice}"
+            if self.distance_target is None:
+                return str(error)
+            return f"{error}; it was chosen for surfaces that reach less far: name another store"
         if isinstance(error, InputError):
             return str(error)
         _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
-        return " ".join(str(error).split()) or type(error).__name__
+        return one_line(error)
 
 
 @dataclass(frozen=True)
@@ -150,9 +153,9 @@ def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
     """Compute and store a field of one block; its facts have the number of points alone."""
     lattice, transform = job.settings.lattice, job.settings.transform
     execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
-    if job.aim is not None and not isinstance(surface, Sphere):
-        goal = job.aim.error_target(surface)
-        field = field_for(surface, lattice, goal, transform, execution)
+    if job.distance_target is not None and not isinstance(surface, Sphere):
+        error_target = job.distance_target.error_target(surface)
+        field = field_for(surface, lattice, error_target, transform, execution)
     else:
         field = compute_field(surface, lattice, transform, job.settings.orders, execution)
     checksum = job.store.write_field(job.index, lattice.place(lattice.half), field.values)

@@ -48,7 +48,7 @@ class ComparisonRecords(RecordTable[ComparisonRecord]):
         super().__init__(store, f"{RECORDS}/{kind}", ComparisonRecord)
 
 
-def missing_comparisons(
+def failed_comparisons(
     labels: Sequence[str], records: Mapping[Kind, Sequence[ComparisonRecord | None]], rows: Container[int]
 ) -> dict[str, str]:
     """Return the comparisons that failed, with their reasons, by the labels of the meshes.

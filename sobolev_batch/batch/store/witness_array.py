@@ -101,6 +101,21 @@ class Witnesses:
             raise DamageError(f"{self.store.path}: {WITNESS} is damaged ({problem})", problem)
         return values
 
+    def damaged(self, counts: Mapping[int, int], checksums: Mapping[int, int]) -> dict[int, str]:
+        """Return the damage of the functions of rows that have some.
+
+        Args:
+            counts: Number of vertices of each row.
+            checksums: Checksum of the functions of each of these rows.
+        """
+        damaged = {}
+        for row, checksum in checksums.items():
+            try:
+                self.read(row, counts[row], checksum)
+            except DamageError as error:
+                damaged[row] = error.what
+        return damaged
+
     def remove_unused(self, counts: Mapping[int, int]) -> None:
         """Remove the chunks of rows without functions, and those beyond the vertices of others.
 

@@ -90,8 +90,8 @@ class Plan:
         """Bytes of one stored field."""
         return self.lattice.half.size * self.item_bytes
 
-    def aim(self, row: Row) -> DistanceTarget | None:
-        """Return the aim of the field of a row, if an accuracy is asked for."""
+    def distance_target(self, row: Row) -> DistanceTarget | None:
+        """Return the accuracy that the field of a row is computed for, if an accuracy is asked for."""
         if self.study.accuracy is None:
             return None
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
@@ -230,7 +230,7 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
         "transform": [study.transform.eps, choice.dtype, study.transform.quadrature.method],
         "numerics": NUMERICS_VERSION,
-        # The aim of a field follows from its distance to the reference.
+        # The target of a field follows from its distance to the reference.
         "accuracy": choice.basis,
     }
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()

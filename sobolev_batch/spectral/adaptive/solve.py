@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Self
 
 import numpy as np
@@ -120,14 +119,12 @@ class Solution:
     Attributes:
         estimate: Numbers with their errors, each (orders,).
         lattice: Lattice of the fields.
-        is_pilot: True if the lattice is a small one that only shows how large distances are.
         fields: Fields of the surfaces.
         sums: Sums of the difference of the fields.
     """
 
     estimate: NormEstimate
     lattice: Lattice
-    is_pilot: bool
     fields: tuple[Field, ...]
     sums: Sums
 
@@ -172,6 +169,14 @@ class DistanceTarget:
         return error_target(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
 
 
+@dataclass(frozen=True)
+class _Step:
+    """A lattice to compute on, and True if it is a small one that only shows how large distances are."""
+
+    lattice: Lattice
+    is_pilot: bool
+
+
 def solve(problem: Problem) -> Solution:
     """Compute a norm or a distance to an accuracy.
 
@@ -182,18 +187,21 @@ def solve(problem: Problem) -> Solution:
         AccuracyError: A pilot shows that the accuracy cannot be met within the memory.
     """
     inexact = max(1, sum(needs_probe(surface, TransformSettings()) for surface in problem.surfaces))
-
-    def plan(samples: Samples, lattice: Lattice, before: Solution | None, is_pilot: bool) -> _Round:
-        values = before.estimate.values if before else _ESTIMATE_CAUTION * estimate(samples, problem.orders)
+    step = _first_step(problem)
+    values: Reals | None = None
+    for rounds_left in reversed(range(_ROUNDS)):
+        samples = problem.samples(step.lattice)
+        if values is None:
+            values = _ESTIMATE_CAUTION * estimate(samples, problem.orders)
         problem.require_above_rounding(values)
-        accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
+        accuracy = _of_pilot(problem.accuracy) if step.is_pilot else problem.accuracy
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(inexact)
-        return target, problem.dtype(lattice, target)
-
-    for solution in islice(_solutions(problem, plan), _ROUNDS):
-        near_duplicates = solution.estimate.values <= problem.rounding
-        if np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
+        solution = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
+        values = solution.estimate.values
+        near_duplicates = values <= problem.rounding
+        if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
             break
+        step = _next_step(problem, step, solution.sums)
     return solution
 
 
@@ -203,68 +211,52 @@ def run_pilot(problem: Problem) -> Pilot:
     Raises:
         AccuracyError: The accuracy cannot be met within the memory.
     """
-
-    def plan(samples: Samples, lattice: Lattice, before: Solution | None, is_pilot: bool) -> _Round:
+    step = _first_step(problem)
+    while True:
+        samples = problem.samples(step.lattice)
         values = estimate(samples, problem.orders)
-        return error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(
-            _PAIR
-        ), "complex128"
-
-    for solution in _solutions(problem, plan):
+        target = error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(_PAIR)
+        solution = _compute(problem, step.lattice, samples, target, "complex128")
         values = solution.estimate.values
         problem.require_above_rounding(values)
-        needed, is_pilot = _next_lattice(problem, solution)
-        if not is_pilot:
+        step = _next_step(problem, step, solution.sums)
+        if not step.is_pilot:
             break
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
-    return Pilot(values, needed, problem.dtype(needed, target) == "complex64")
+    return Pilot(values, step.lattice, problem.dtype(step.lattice, target) == "complex64")
 
 
-_Round = tuple[ErrorTarget, ComplexDtype]
+def _first_step(problem: Problem) -> _Step:
+    return _Step(*first_lattice(problem.support, problem.orders, problem.accuracy))
 
 
-def _solutions(
-    problem: Problem, plan: Callable[[Samples, Lattice, Solution | None, bool], _Round]
-) -> Iterator[Solution]:
-    """Yield solutions, each on the lattice that the sums of the one before call for.
-
-    Args:
-        problem: Norm or distance to compute.
-        plan: Function that returns the error target and the dtype of the fields of a round.
-    """
-    lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
-    solution = None
-    while True:
-        samples = problem.samples(lattice)
-        target, dtype = plan(samples, lattice, solution, is_pilot)
-        settings = TransformSettings(dtype=dtype)
-        fields = tuple(
-            field_for(surface, lattice, target, settings, Execution(threads=problem.threads), sample=sample)
-            for surface, sample in zip(problem.surfaces, samples, strict=True)
-        )
-        solution = _solution(problem, lattice, is_pilot, fields)
-        yield solution
-        lattice, is_pilot = _next_lattice(problem, solution)
+def _next_step(problem: Problem, step: _Step, sums: Sums) -> _Step:
+    """Return the step on the lattice that the sums of a step call for, or on a larger pilot's."""
+    weights = SobolevWeights(step.lattice, problem.orders)
+    try:
+        lattice = refined(sums, weights, problem.support, problem.accuracy, problem.label)
+    except AccuracyError:
+        larger = larger_pilot(step.lattice, problem.accuracy) if step.is_pilot else None
+        if larger is None:
+            raise
+        return _Step(larger, is_pilot=True)
+    return _Step(lattice, is_pilot=False)
 
 
-def _solution(problem: Problem, lattice: Lattice, is_pilot: bool, fields: tuple[Field, ...]) -> Solution:
+def _compute(
+    problem: Problem, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype
+) -> Solution:
+    """Compute the norm or distance on a lattice, from fields with an error within a target."""
+    settings, execution = TransformSettings(dtype=dtype), Execution(threads=problem.threads)
+    fields = tuple(
+        field_for(surface, lattice, target, settings, execution, sample=sample)
+        for surface, sample in zip(problem.surfaces, samples, strict=True)
+    )
     weights = SobolevWeights(lattice, problem.orders)
     difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
-    return Solution(estimate_norms(sums, weights, problem.support, errors), lattice, is_pilot, fields, sums)
-
-
-def _next_lattice(problem: Problem, solution: Solution) -> tuple[Lattice, bool]:
-    """Return the lattice of the next round, and True if it is but a larger pilot."""
-    weights = SobolevWeights(solution.lattice, problem.orders)
-    try:
-        return refined(solution.sums, weights, problem.support, problem.accuracy, problem.label), False
-    except AccuracyError:
-        larger = larger_pilot(solution.lattice, problem.accuracy) if solution.is_pilot else None
-        if larger is None:
-            raise
-        return larger, True
+    return Solution(estimate_norms(sums, weights, problem.support, errors), lattice, fields, sums)
 
 
 def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:

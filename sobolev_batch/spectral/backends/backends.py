@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 import finufft
 import numpy as np
 
-from sobolev_batch.errors import BackendError, InputError
+from sobolev_batch.errors import BackendError, InputError, one_line
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.arrays import Array
 from sobolev_batch.spectral.backends.costs import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
@@ -229,8 +229,3 @@ def try_out(backend: Gpu) -> None:
         raise BackendError(f"the GPU fails a trial transform: {one_line(error)}; is its driver up to date?") from error
     if not np.allclose(values, 1.0, rtol=0.0, atol=1e-8):
         raise BackendError(f"the GPU computes wrong values: {values.flat[0]} instead of 1")
-
-
-def one_line(error: Exception) -> str:
-    """Return the message of an error in one line, or its type if it has none."""
-    return " ".join(str(error).split()) or type(error).__name__

@@ -201,8 +201,3 @@ def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> R
     """Return ∫ (1+r²)^s energy(r) 4πr² dr by the midpoint rule (orders,)."""
     step = radii[1] - radii[0]
     return np.array([np.sum((1 + radii**2) ** order * energy * 4 * np.pi * radii**2) * step for order in orders])
-
-
-# Names of before, for callers that are being rewritten.
-Goal = ErrorTarget
-settle = choose_settings

@@ -10,8 +10,8 @@ from functools import singledispatch
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu, one_line
+from sobolev_batch.errors import InputError, LatticeError, one_line
+from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.exact.spheres import sphere_block

@@ -62,11 +62,11 @@ def run_and_count(study: sb.Study, path: Path, client: Client | None) -> tuple[S
     """A run, and the labels of the comparisons that it made."""
     made: list[str] = []
 
-    def note(progress: Progress) -> None:
+    def count_step(progress: Progress) -> None:
         if progress.stage == "comparisons" and progress.label:
             made.append(progress.label)
 
-    return sb.run(study, path, client, on_progress=note), made
+    return sb.run(study, path, client, on_progress=count_step), made
 
 
 def assert_right(path: Path, study: sb.Study) -> None:
@@ -251,7 +251,7 @@ def forbid_the_first(patched: pytest.MonkeyPatch) -> None:
 
 
 def test_another_member_becomes_the_reference(store_path: Path, client: Client) -> None:
-    """Whose own note, of a failure even, speaks for nothing any more."""
+    """Whose own record, of a failure even, speaks for nothing any more."""
 
     def study(member: str) -> sb.Study:
         return asking(reference={"source": "family", "family": "ico", "member": member}, scaling={"mode": "none"})
@@ -280,7 +280,7 @@ def test_notes_of_what_is_not_asked_for_any_more_go(store_path: Path, client: Cl
 
 
 def test_a_task_that_outlives_its_run_is_not_believed(store: Path, client: Client) -> None:
-    """It writes values of other orders into the array of the next run, and a note of its own."""
+    """It writes values of other orders into the array of the next run, and a record of its own."""
     other, straggler = (
         asking(witness={"orders": [-3.0, -5.0]}),
         ComparisonRecord("of another run", "complete", checksum=1),
@@ -376,8 +376,8 @@ def test_blocks_and_parts_of_the_lattice_add_up(
     comparison = Comparison(here, "key", stored[3], stored[-1], plan.similarity)
     # Here and not on a worker, so that each block is evaluated in parts.
     monkeypatch.setattr("sobolev_batch.spectral.metrics.witness.BLOCK_SAMPLES", 300)
-    note = compare_by_witness(comparison, WitnessSettings(plan.lattice, plan.blocks, ORDERS, 1e8))
-    assert note.status == "complete", note.reason
+    record = compare_by_witness(comparison, WitnessSettings(plan.lattice, plan.blocks, ORDERS, 1e8))
+    assert record.status == "complete", record.reason
     assert_right(store_path, study)
 
 
@@ -487,10 +487,10 @@ def test_nothing_is_left_of_a_mesh_whose_comparison_fails_later(
 
 
 def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path: Path, client: Client) -> None:
-    """The old mesh may come back after a run for another one that ended between its values and their note."""
+    """The old mesh may come back after a run for another one that ended between its values and their record."""
     place = tmp_path / "s.zarr"
     sb.run(of_files(files), place, client)
-    old = {note.key for note in ComparisonRecords(Store.open(place), "witness").read() if note is not None}
+    old = {record.key for record in ComparisonRecords(Store.open(place), "witness").read() if record is not None}
     assert len(old) == 2
     for name, level in (("a.ply", 2), ("b.ply", 1)):
         write_sphere(files / name, level, radius=0.7)
@@ -501,7 +501,9 @@ def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path
 
     with pytest.raises(Killed):
         sb.run(of_files(files), place, client, on_progress=end)
-    assert not old & {note.key for note in ComparisonRecords(Store.open(place), "witness").read() if note is not None}
+    assert not old & {
+        record.key for record in ComparisonRecords(Store.open(place), "witness").read() if record is not None
+    }
 
 
 def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, client: Client) -> None:
@@ -525,10 +527,10 @@ def test_a_mesh_that_has_changed_is_not_compared(store: Path) -> None:
         if record is not None
     ]
     changed = StoredMesh(1, "ico/1", plan.rows[2].member, stored[1].digest, stored[1].checksums)
-    note = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity), 100)
-    assert note.status == "failed"
-    assert "is not the mesh whose field is stored" in note.reason
-    assert ComparisonRecords(here, "proximity").read()[1] == note
+    record = compare_by_proximity(Comparison(here, "key", changed, stored[-1], plan.similarity), 100)
+    assert record.status == "failed"
+    assert "is not the mesh whose field is stored" in record.reason
+    assert ComparisonRecords(here, "proximity").read()[1] == record
 
 
 def test_a_mesh_that_failed_is_left_out(store_path: Path, tmp_path: Path, client: Client) -> None:
@@ -551,7 +553,7 @@ def test_too_little_memory_is_foreseen(store: Path, client: Client) -> None:
     study = asking(witness={"orders": [-2.0]})
     here, plan = Store.open(store), make_plan(study)
     small = Workers((WorkerInfo("tcp://small", 1, 2e8, "cpu", ""),))
-    reasons = Comparer(Workspace.of(here, plan)).run(Cluster(client, small))
+    reasons = Comparer.of(Workspace.of(here, plan)).run(Cluster(client, small))
     assert sorted(reasons) == ["ico/0", "ico/1", "ico/2", "ico/3"]
     assert reasons["ico/0"].startswith("no witness: it takes about")
     assert "start workers with more memory" in reasons["ico/0"]
@@ -628,8 +630,8 @@ def test_sections_that_make_no_sense(section: dict[str, Any], words: str) -> Non
 
 
 def test_notes_survive_as_text() -> None:
-    note = ComparisonRecord("key", "complete", "", {"chamfer": 0.1}, 7, 0.5)
-    assert ComparisonRecord.from_json(note.to_json()) == note
+    record = ComparisonRecord("key", "complete", "", {"chamfer": 0.1}, 7, 0.5)
+    assert ComparisonRecord.from_json(record.to_json()) == record
     assert ComparisonRecord.from_json("") is None
     with pytest.raises(sb.DamageError):
         ComparisonRecord.from_json('{"key": 1')

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
 
 ROWS = 11
-CENTER = 4
+REFERENCE = 4
 TWINS = 2, 9
 
 
@@ -50,7 +50,7 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
         lattice=plan.lattice,
         blocks=plan.blocks,
         orders=study.orders,
-        center=CENTER,
+        reference=REFERENCE,
         areas=np.ones(ROWS),
         errors=np.zeros((2, ROWS)),
         widths=np.ones(13),
@@ -97,7 +97,7 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
 
 
 def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows, others = [0, 2, CENTER], [0, 2, CENTER, 7, 9]
+    rows, others = [0, 2, REFERENCE], [0, 2, REFERENCE, 7, 9]
     by_products = reducer.tile(rows, others)
     reducer = replace(reducer, tile_bytes=3 * 16 * reducer.blocks[0].size)
     monkeypatch.setattr(Reducer, "_block_sums", None)
@@ -124,25 +124,25 @@ def test_tiles_whose_others_are_all_other_rows(
 
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
-    norms, to_center, parts = reducer.norms([1, 3, CENTER])
+    norms, to_reference, parts = reducer.norms([1, 3, REFERENCE])
     weights = SobolevWeights(reducer.lattice, reducer.orders).per_shell
-    for found, values in (norms, fields), (to_center, fields - fields[CENTER]):
-        sums = shell_sums(values[[1, 3, CENTER]], None, reducer.lattice, reducer.lattice.half)
+    for found, values in (norms, fields), (to_reference, fields - fields[REFERENCE]):
+        sums = shell_sums(values[[1, 3, REFERENCE]], None, reducer.lattice, reducer.lattice.half)
         assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)
     # The parts of each distance are those of the library, whatever the chunks.
     for row, area, shape in zip([1, 3], parts.area.T, parts.shape.T, strict=False):
         known = fourier_transform(Sphere(0.1), reducer.lattice)
-        alone = proportion(known.copy(data=fields[row]), known.copy(data=fields[CENTER]), reducer.orders)
+        alone = proportion(known.copy(data=fields[row]), known.copy(data=fields[REFERENCE]), reducer.orders)
         assert area == pytest.approx(alone["area_part"].values, rel=1e-10)
         assert shape == pytest.approx(alone["shape_part"].values, rel=1e-12)
-    assert (parts.area**2 + parts.shape**2)[:, :2] == pytest.approx(to_center.values[:, :2] ** 2, rel=1e-12)
+    assert (parts.area**2 + parts.shape**2)[:, :2] == pytest.approx(to_reference.values[:, :2] ** 2, rel=1e-12)
     assert (parts.area[:, 2] == 0).all()
     assert (parts.shape[:, 2] == 0).all()
 
 
-def test_without_a_center_there_are_norms_alone(reducer: Reducer) -> None:
-    norms, to_center, parts = replace(reducer, center=None).norms([1, 3])
+def test_without_a_reference_there_are_norms_alone(reducer: Reducer) -> None:
+    norms, to_reference, parts = replace(reducer, reference=None).norms([1, 3])
     assert norms.values == pytest.approx(reducer.norms([1, 3])[0].values, rel=1e-14)
-    for found in (*to_center, *parts):
+    for found in (*to_reference, *parts):
         assert found.shape == norms.values.shape
         assert np.isnan(found).all()

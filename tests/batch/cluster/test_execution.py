@@ -9,7 +9,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import ClusterError, DamageError, StoreError, Study, run
-from sobolev_batch.batch.cluster.execution import Cluster, Task, failure_reason
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Progress
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
@@ -30,7 +30,7 @@ def test_each_task_comes_back_with_its_outcome(cluster: Cluster) -> None:
     outcomes = {task.row: outcome for task, outcome in cluster.run(Task(divmod, (7, k), row=k) for k in range(3))}
     assert (outcomes[1], outcomes[2]) == ((7, 0), (3, 1))
     assert isinstance(outcomes[0], ZeroDivisionError)
-    assert failure_reason(outcomes[0]).startswith("ZeroDivisionError: ")
+    assert describe_failure(outcomes[0]).startswith("ZeroDivisionError: ")
     with pytest.raises(ZeroDivisionError):
         list(cluster.results([Task(divmod, (7, 0))]))
 
@@ -57,7 +57,9 @@ def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path:
     outcomes = [outcome for _, outcome in cluster.run([*large, Task(abs, (-4,), 1e6)], 3e9, in_flight=1)]
     assert outcomes.pop() == 4
     assert all(isinstance(outcome, ClusterError) for outcome in outcomes)
-    assert failure_reason(outcomes[0]).startswith("it takes about 3.0GB in one task, and no worker has more than 2.0GB")
+    assert describe_failure(outcomes[0]).startswith(
+        "it takes about 3.0GB in one task, and no worker has more than 2.0GB"
+    )
     assert len(outcomes) == 5
     assert not (tmp_path / "calls").exists()
 

@@ -51,11 +51,11 @@ def test_one_device_serves_one_worker_and_studies_use_what_there_is(
     mixed: str, finished_store: Path, tmp_path: Path
 ) -> None:
     with remote_client(mixed) as client:
-        crew = prepare_workers(client)
-        assert sorted(member.backend for member in crew.members) == ["cpu", "cpu", "gpu"]
-        notes = sorted(member.note for member in crew.members if member.backend == "cpu")
+        workers = prepare_workers(client)
+        assert sorted(member.backend for member in workers.members) == ["cpu", "cpu", "gpu"]
+        notes = sorted(member.note for member in workers.members if member.backend == "cpu")
         assert notes[0].startswith("no GPU left: other workers have all of the 1 that it may use")
-        (equipped,) = (member for member in crew.members if member.backend == "gpu")
+        (equipped,) = (member for member in workers.members if member.backend == "gpu")
         assert equipped.note.startswith("fake, ")
         declared = client.scheduler_info(n_workers=-1)["workers"]
         assert [address for address in declared if declared[address]["resources"].get(GPU)] == [equipped.address]

@@ -47,10 +47,10 @@ def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
 
 
 def test_workers_declare_their_memory(client: Client) -> None:
-    crew = prepare_workers(client)
-    assert crew.threads == 2
+    workers = prepare_workers(client)
+    assert workers.threads == 2
     workers = client.scheduler_info(n_workers=-1)["workers"]
-    for member in crew.members:
+    for member in workers.members:
         assert member.backend == "cpu"
         assert member.note
         declared = workers[member.address]["resources"]

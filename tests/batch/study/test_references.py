@@ -192,16 +192,16 @@ def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
     assert make_plan(Study.from_table(egg_table())).similarity.scale == 0.5
 
 
-def test_aims_of_smooth_references_are_met_by_settings() -> None:
+def test_error_targets_of_smooth_references_are_met_by_settings() -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]
     plan = make_plan(Study.from_table(table))
-    aim = plan.aim(next(row for row in plan.rows if row.label == "reference"))
-    assert isinstance(aim, DistanceTarget)
+    target = plan.distance_target(next(row for row in plan.rows if row.label == "reference"))
+    assert isinstance(target, DistanceTarget)
     assert plan.sample is not None
     assert np.abs(plan.sample.exact).max() > 0
-    goal = aim.error_target(Torus(2.0 / 2.8, 0.8 / 2.8))
-    assert all(norm > 0 for norm in goal.norms)
+    error_target = target.error_target(Torus(2.0 / 2.8, 0.8 / 2.8))
+    assert all(norm > 0 for norm in error_target.norms)
 
 
 def test_smooth_surfaces_cannot_be_decimated() -> None:

@@ -19,7 +19,7 @@ from sobolev_batch.spectral.backends import backends, cuda
 from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.backends.costs import GPU_COSTS
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.errors.a_priori import Goal
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
@@ -217,9 +217,9 @@ def test_fields_carry_their_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Device().backend()
     mesh = icosphere(2)
     assert compute_field(mesh, LATTICE, TransformSettings(), [-2.0], Execution(backend)).backend == "cufinufft"
-    goal = Goal((-2.0,), (1e-3,))
-    assert field_for(mesh, LATTICE, goal, TransformSettings(), Execution(backend)).backend == "cufinufft"
-    assert field_for(Sphere(), LATTICE, goal, TransformSettings(), Execution(backend)).backend == "closed form"
+    target = ErrorTarget((-2.0,), (1e-3,))
+    assert field_for(mesh, LATTICE, target, TransformSettings(), Execution(backend)).backend == "cufinufft"
+    assert field_for(Sphere(), LATTICE, target, TransformSettings(), Execution(backend)).backend == "closed form"
     monkeypatch.setattr(backends, "gpu_backend", lambda: backend)
     attributes = {name: fourier_transform(mesh, LATTICE, backend=name).attrs["backend"] for name in ("gpu", "auto")}
     assert attributes == {"gpu": "cufinufft", "auto": "cufinufft"}

@@ -37,7 +37,7 @@ MESHES = {
 
 @pytest.mark.parametrize("order", [-2.0, -5.0, -10.0])
 @pytest.mark.parametrize("name", MESHES)
-def test_settled_fields_keep_their_goal_and_are_not_wasteful(name: str, order: float) -> None:
+def test_chosen_fields_keep_their_goal_and_are_not_wasteful(name: str, order: float) -> None:
     mesh = MESHES[name]
     exact = fourier_transform(mesh, LATTICE, 1e-13)
     scale = norm(exact, order)["norm"].item()
@@ -99,6 +99,6 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
 
 def test_settings_keep_precision_and_quadrature() -> None:
     given = TransformSettings(dtype="complex64")
-    settled = choose_settings(BOX, LATTICE, ErrorTarget((-2.0,), (1e-9,)), given)
-    assert replace(settled, eps=given.eps, tolerance=given.tolerance) == given
-    assert settled.eps == 2e-7
+    chosen = choose_settings(BOX, LATTICE, ErrorTarget((-2.0,), (1e-9,)), given)
+    assert replace(chosen, eps=given.eps, tolerance=given.tolerance) == given
+    assert chosen.eps == 2e-7

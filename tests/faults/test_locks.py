@@ -28,9 +28,9 @@ DRIVER = """
 import sys
 import threading
 import sobolev_batch as sb
-from sobolev_batch.batch.store import heartbeat as journal
+from sobolev_batch.batch.store import heartbeat
 
-journal.HEARTBEAT_SECONDS = 0.05
+heartbeat.HEARTBEAT_SECONDS = 0.05
 
 def pause(progress):
     if progress.done == 2:
@@ -90,7 +90,7 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
     assert "is no longer its own" in said
 
 
-def test_the_claim_of_another_machine_is_released_by_hand(
+def test_the_lock_of_another_machine_is_released_by_hand(
     study: Study, store_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run(study, store_path, workers=1)
@@ -105,7 +105,7 @@ def test_the_claim_of_another_machine_is_released_by_hand(
 
 def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     child = subprocess.Popen(
-        [sys.executable, "-c", CLAIMING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", LOCKING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
     )
     assert child.stdout is not None
     child.stdout.readline()
@@ -127,7 +127,7 @@ def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     assert not (tmp_path / "store").exists()
 
 
-CLAIMING = """
+LOCKING = """
 import sys
 import threading
 from sobolev_batch.batch.storage.lock import Lock, acquire
@@ -141,7 +141,7 @@ threading.Event().wait()
 
 
 @pytest.mark.parametrize("before", [None, "dead"])
-@pytest.mark.parametrize("place", ["folder", "memory://claims/a"])
+@pytest.mark.parametrize("place", ["folder", "memory://locks/a"])
 def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Path) -> None:
     location = Location.of(place if ":" in place else tmp_path / place)
     here = Lock.of_this_process()
@@ -165,7 +165,7 @@ def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Pa
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}'])
-def test_a_claim_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
+def test_a_lock_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
     location = Location.of(tmp_path / "store")
     location.create(LOCK_KEY, text)
     with pytest.raises(LockError, match="a process that has not written its name"):
@@ -183,7 +183,7 @@ def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, st
     with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d s ago"):
         release(store_path)
     assert release(store_path, force=True) == elsewhere
-    # A claim that was just taken, before any sign of life; a store that cannot be read.
+    # A lock that was just taken, before any sign of life; a store that cannot be read.
     (store_path / "zarr.json").write_text("")
     Location.of(store_path).create(LOCK_KEY, replace(elsewhere, since=utc_now()).to_json())
     with pytest.raises(LockError, match="was alive"):
@@ -194,7 +194,7 @@ def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, st
 def test_the_undead_count_as_gone(tmp_path: Path) -> None:
     """A process that has ended and whose parent has not asked how."""
     child = subprocess.Popen(
-        [sys.executable, "-c", CLAIMING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", LOCKING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
     )
     assert child.stdout is not None
     child.stdout.readline()
@@ -206,7 +206,7 @@ def test_the_undead_count_as_gone(tmp_path: Path) -> None:
     child.communicate()
 
 
-def test_a_full_disk_leaves_no_claim(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_lock(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path / "store")], check=False)
     assert done.returncode == 0
     assert Lock.read(Location.of(tmp_path / "store")) is None
