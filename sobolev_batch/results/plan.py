@@ -29,14 +29,9 @@ class StudyPlan:
     """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
 
     Attributes:
-        study: Study.
-        store: Path or URL of its store.
-        labels: Labels of all surfaces, the reference among them.
-        reference: Label of the reference.
+        store: Path or URL of the study's store.
         stored: Labels of the surfaces whose fields the store has already.
         refused: Reason for each surface that fits into no worker, by label.
-        memory_bytes: Projected peak memory of each surface's largest task, by label.
-        task_count: Number of tasks, if nothing were stored.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -51,17 +46,37 @@ class StudyPlan:
     (('ico/0', 'ico/1', 'reference'), Lattice(xi_max=2.0, M=8), ())
     """
 
-    study: Study
     store: str
-    labels: tuple[str, ...]
-    reference: str
     stored: tuple[str, ...]
     refused: dict[str, str]
-    memory_bytes: dict[str, float]
-    task_count: int
     _plan: Plan = field(repr=False)
     _workers: Workers = field(repr=False)
-    _layouts: dict[str, TaskSizes] = field(repr=False)
+    _sizes: dict[str, TaskSizes] = field(repr=False)
+
+    @property
+    def study(self) -> Study:
+        """Study."""
+        return self._plan.study
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of all surfaces, the reference among them."""
+        return tuple(row.label for row in self._plan.rows)
+
+    @property
+    def reference(self) -> str:
+        """Label of the reference."""
+        return self._plan.reference
+
+    @property
+    def memory_bytes(self) -> dict[str, float]:
+        """Projected peak memory of each surface's largest task, by label."""
+        return {label: size.projected_bytes for label, size in self._sizes.items()}
+
+    @property
+    def task_count(self) -> int:
+        """Number of tasks, if nothing were stored."""
+        return sum(size.task_count for size in self._sizes.values())
 
     @property
     def lattice(self) -> Lattice:
@@ -143,13 +158,13 @@ class StudyPlan:
             f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
         )
         chunks = len(self._plan.blocks)
-        yield "tasks", f"{self.task_count} for {len(self._layouts)} surfaces; chunks of the lattice: {chunks}"
-        for label, layout in self._layouts.items():
-            if layout.batches > 1:
-                yield "split", f"{label} into {layout.batches} batches of triangles"
-        if self.memory_bytes:
-            largest = max(self.memory_bytes, key=lambda label: self.memory_bytes[label])
-            yield "memory", f"up to {format_bytes(self.memory_bytes[largest])} in a task, of {largest}"
+        yield "tasks", f"{self.task_count} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}"
+        for label, size in self._sizes.items():
+            if size.batches > 1:
+                yield "split", f"{label} into {size.batches} batches of triangles"
+        if self._sizes:
+            largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
+            yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
         for label, reason in self.refused.items():
             yield "refused", f"{label}: {reason}"
 
@@ -185,20 +200,15 @@ def plan(
     location = default_store(study) if store is None else Location.of(store)
     study_plan = make_plan(study, stored_choice(location))
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
-    layouts, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
+    sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
     stored = _stored_keys(location)
     return StudyPlan(
-        study,
-        str(location),
-        tuple(row.label for row in study_plan.rows),
-        study_plan.reference,
-        tuple(row.label for row in study_plan.rows if row.key and stored.get(row.label) == row.key),
-        refused,
-        {label: layout.projected_bytes for label, layout in layouts.items()},
-        sum(layout.task_count for layout in layouts.values()),
-        study_plan,
-        workers,
-        layouts,
+        store=str(location),
+        stored=tuple(row.label for row in study_plan.rows if row.key and stored.get(row.label) == row.key),
+        refused=refused,
+        _plan=study_plan,
+        _workers=workers,
+        _sizes=sizes,
     )
 
 

@@ -47,10 +47,10 @@ def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
 
 
 def test_workers_declare_their_memory(client: Client) -> None:
-    workers = prepare_workers(client)
-    assert workers.threads == 2
+    prepared = prepare_workers(client)
+    assert prepared.threads == 2
     workers = client.scheduler_info(n_workers=-1)["workers"]
-    for member in workers.members:
+    for member in prepared.members:
         assert member.backend == "cpu"
         assert member.note
         declared = workers[member.address]["resources"]
