@@ -50,7 +50,7 @@ _BYTES_PER_TRIANGLE = {
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    r"""Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
+    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
 
     The format follows from the name. Coordinates keep the precision of the file. Polygons are cut into fans
     of triangles, which is exact for convex ones. STL and glTF repeat vertices, so those that coincide exactly
@@ -68,7 +68,8 @@ def read_mesh(path: str | Path) -> Mesh:
     >>> import sobolev_batch as sb
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder, "triangle.off")
-    ...     _ = path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    ...     with path.open("w") as file:
+    ...         print("OFF", "3 1 0", "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", sep=chr(10), file=file)
     ...     sb.read_mesh(path)
     Mesh(3 vertices, 1 triangles)
     """
