@@ -18,7 +18,7 @@ PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 test: $(READY)  ## the tests
 	$(PYTEST) -n 3
 
-test-fast: $(READY)  ## the tests of the numerics, in less than a minute
+test-fast: $(READY)  ## the tests of surfaces and numerics, one to two minutes
 	$(PYTEST) -n 2 -m "not slow" tests/surfaces tests/spectral
 
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs

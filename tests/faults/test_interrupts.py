@@ -1,4 +1,4 @@
-"""Ctrl-C and its like: the command ends within seconds, says how to continue, and continues."""
+"""Ctrl-C and its like: the command ends, says how to continue, and continues."""
 
 from __future__ import annotations
 
