@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
@@ -30,7 +31,11 @@ def main() -> None:
         git = ["git", "-C", str(_ROOT), "worktree"]
         subprocess.run([*git, "add", "--detach", "--quiet", str(other), options.revision], check=True)
         try:
-            figures = _measured({"this": _ROOT, "other": other}, options.only, options.turns)
+            roots = {"this": _ROOT, "other": other}
+            checkouts = {
+                name: _Checkout.installed(root, Path(folder) / f"{name}-installed") for name, root in roots.items()
+            }
+            figures = _measured(checkouts, options.only, options.turns)
         finally:
             subprocess.run([*git, "remove", "--force", str(other)], check=True)
     rows = []
@@ -40,8 +45,22 @@ def main() -> None:
     print(tabulate(rows, ("item", "what", "this", options.revision, "ratio"), disable_numparse=True))
 
 
+@dataclass(frozen=True)
+class _Checkout:
+    """A checkout, and the folder into which it was installed: its sources are found by its own entry points."""
+
+    root: Path
+    packages: Path
+
+    @classmethod
+    def installed(cls, root: Path, packages: Path) -> _Checkout:
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+        subprocess.run([*pip, "--target", str(packages), str(root)], check=True)
+        return cls(root, packages)
+
+
 def _measured(
-    checkouts: dict[str, Path], items: list[str], turns: int
+    checkouts: dict[str, _Checkout], items: list[str], turns: int
 ) -> dict[tuple[str, str], dict[str, list[float]]]:
     """The package's own figures of each row with a unit, by item and description, for each checkout."""
     figures: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -54,11 +73,11 @@ def _measured(
     return {row: of_each for row, of_each in figures.items() if len(of_each) == len(checkouts)}
 
 
-def _figures(checkout: Path, item: str) -> dict[str, float]:
+def _figures(checkout: _Checkout, item: str) -> dict[str, float]:
     with tempfile.NamedTemporaryFile(suffix=".md") as table:
         command = [sys.executable, "-m", "benchmarks", "--only", item, "--repeats", "3", "--markdown", table.name]
-        environment = {**os.environ, "PYTHONPATH": str(checkout)}
-        subprocess.run(command, cwd=checkout, env=environment, check=True, stdout=subprocess.DEVNULL)
+        environment = {**os.environ, "PYTHONPATH": str(checkout.packages)}
+        subprocess.run(command, cwd=checkout.root, env=environment, check=True, stdout=subprocess.DEVNULL)
         text = Path(table.name).read_text(encoding="utf-8")
     rows = re.findall(r"^\| *\S+ *\| *(.+?) *\| *([\d.e+-]+) (?:s|kB|MB|GB) *\|", text, re.MULTILINE)
     return {what: float(figure) for what, figure in rows}
