@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,6 +25,12 @@ _SIGNS = {
     "browser": {"browser", "reader"},
 }
 _CLUSTER_FOLDERS = ("faults", "soak")
+
+
+def pytest_configure() -> None:
+    """Let processes that tests start hear Ctrl-C, also where the shell runs the tests in the background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

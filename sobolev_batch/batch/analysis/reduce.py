@@ -30,7 +30,7 @@ from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 2
+TABLES_VERSION = 3
 
 Reals = NDArray[np.float64]
 

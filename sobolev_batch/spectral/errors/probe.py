@@ -24,8 +24,9 @@ Complexes = NDArray[np.complex128]
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle and a frequency in between.
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
-# The estimate comes from few draws: it is raised by this over the root of their number.
-_CAUTION = 3.0
+# Standard errors by which the mean of few draws, some of which may carry it, is raised. Of 720 errors of NUFFTs of
+# smooth surfaces, five exceeded the mean by six of them, two by eight.
+_CAUTION = 8.0
 # Ranges of |ξ| that represent an error of the same size at every frequency.
 _BANDS = 8
 
@@ -74,8 +75,11 @@ class Probe:
         """
         if not self.shells:
             return np.zeros(len(weights.orders))
-        squares = weights.per_shell[:, list(self.shells)] @ np.array(self.sums)
-        return np.asarray(np.sqrt(squares) * (1 + _CAUTION / np.sqrt(len(self.shells))))
+        parts = weights.per_shell[:, list(self.shells)] * np.array(self.sums)
+        squares = parts.sum(axis=1)
+        # The fewer draws carry the sum, the less it tells.
+        shares = parts / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
+        return np.asarray(np.sqrt(squares * (1 + _CAUTION * np.sqrt(np.sum(shares**2, axis=1)))))
 
 
 def draw_count(triangles: int) -> int:

@@ -66,7 +66,7 @@ def test_coarse_quadrature_is_noticed(degree: int) -> None:
     true_error = norm((rough - exact), ORDERS)["norm"].values
     reported = norm(rough, ORDERS)["discretisation"].values
     assert (reported > true_error).all()
-    assert (reported < 4 * true_error).all()
+    assert (reported < 6 * true_error).all()
 
 
 def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> None:

@@ -5,10 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sobolev_batch import Ellipsoid, InputError, Lattice, Sphere, icosphere, norm
+from sobolev_batch import (
+    Ellipsoid,
+    InputError,
+    Lattice,
+    Mesh,
+    Sphere,
+    Torus,
+    distance,
+    fourier_transform,
+    icosphere,
+    norm,
+)
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
-from sobolev_batch.spectral.errors.probe import draw
+from sobolev_batch.spectral.errors.probe import draw, measure
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate, needs_probe
+from sobolev_batch.spectral.fields import PROBED_ORDERS
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -23,6 +36,24 @@ def test_norms_are_estimated_from_a_few_frequencies(surface: Surface) -> None:
     squares = np.mean([estimate([sample], ORDERS) ** 2 for sample in samples], axis=0)
     expected = norm(surface, ORDERS, lattice=LATTICE)["norm"].values
     assert np.sqrt(squares) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("eps", [1e-3, 1e-6])
+@pytest.mark.parametrize("surface", [icosphere(3), Torus(0.9, 0.3)])
+def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: Surface, eps: float) -> None:
+    field, exact = (fourier_transform(surface, LATTICE, accuracy, threads=1) for accuracy in (eps, 1e-14))
+    true_errors = distance(field, exact, ORDERS)["distance"].values
+    degree = 2 if isinstance(surface, Mesh) else 16
+    covered, ratios = [], []
+    for seed in range(100):
+        draws = draw(LATTICE, PROBED_ORDERS, degree, 32, seed)
+        places = draws.places(LATTICE.half)
+        probe = measure(draws, field.values[places], exact.values[places].astype(np.complex128))
+        reported = probe.norms(SobolevWeights(LATTICE, ORDERS))
+        covered.append(reported >= true_errors)
+        ratios.append(reported / true_errors)
+    assert np.mean(covered) >= 0.98
+    assert np.median(ratios) < 3
 
 
 def test_closed_forms_need_a_probe_in_single_precision_alone() -> None:
