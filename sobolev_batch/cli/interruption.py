@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from types import FrameType
@@ -24,6 +25,8 @@ def raise_when_asked() -> None:
     Python only reports an exception that a signal raises within a finalizer. It is then raised again.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
+        signal.signal(signal.SIGINT, _interrupt)
     if not hasattr(signal, "setitimer"):  # Windows
         return
     report = sys.unraisablehook
@@ -52,4 +55,15 @@ def ignore_requests() -> None:
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
+    _silence_cancellations()
     raise Terminated
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _silence_cancellations()
+    raise KeyboardInterrupt
+
+
+def _silence_cancellations() -> None:
+    """Keep the event loop of Dask's client from printing a traceback for each call that the request cancels."""
+    logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
