@@ -1,16 +1,20 @@
-"""The lattice of frequencies, its half with xi_z >= 0, and rectangular blocks of it."""
+"""Lattices of frequencies, and rectangular blocks of them: the half with xi_z >= 0, or turned and shifted ones."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import ClassVar, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
 
 from sobolev_batch.errors import LatticeError
 
@@ -19,6 +23,12 @@ LARGEST_M = 2048
 # Beyond this and its inverse, volumes of cells and periods leave double precision.
 _LOWEST_XI_MAX = 1e-50
 AXES = ("xi_x", "xi_y", "xi_z")
+# The cube's volume is that of a ball of this radius, in units of half its side.
+_BALL = (6 / math.pi) ** (1 / 3)
+# Layers of an octave's lattice with ξ_z < 0, over which it fades out, and the width of the fading in layers.
+_FADED_LAYERS, _FADING_LAYERS = 3, 1.2
+
+Axes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -74,8 +84,67 @@ class Block:
         return x, y, z
 
 
+class FrequencyLattice(ABC):
+    """Equally spaced frequencies along three orthogonal axes.
+
+    Attributes:
+        tolerates_images: True if the images of surfaces at the period 1/h cancel on average over many lattices; else
+            surfaces must lie within the period.
+    """
+
+    tolerates_images: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def spacing(self) -> float:
+        """Distance h between neighbouring frequencies, in cycles per unit length."""
+
+    @property
+    @abstractmethod
+    def half(self) -> Block:
+        """Block of all samples."""
+
+    @property
+    @abstractmethod
+    def highest_frequency(self) -> float:
+        """Largest |ξ| at which samples count, in cycles per unit length."""
+
+    @property
+    @abstractmethod
+    def radial_range(self) -> tuple[float, float]:
+        """Range of |ξ| over which errors of samples count, for predictions."""
+
+    @property
+    def shift(self) -> tuple[float, float, float]:
+        """Shift of all samples along the lattice's axes, in units of the spacing."""
+        return 0.0, 0.0, 0.0
+
+    @property
+    def rotation(self) -> NDArray[np.float64] | None:
+        """Rotation (3, 3) that takes coordinates of surfaces to the lattice's axes; None for none."""
+        return None
+
+    @property
+    def half_period(self) -> float:
+        """Bound 1/(2h) on the |coordinates| of surfaces, in units of length."""
+        return 1 / (2 * self.spacing)
+
+    def frequencies(self, block: Block) -> Axes:
+        """Return the frequencies along the lattice's three axes in a block, in cycles per unit length."""
+        x, y, z = (self.spacing * (block.indices(axis).astype(np.float64) + self.shift[axis]) for axis in range(3))
+        return x, y, z
+
+    def split(self, largest_size: int) -> tuple[Block, ...]:
+        """Return equal blocks that make up the lattice: see `Block.split`."""
+        return self.half.split(largest_size)
+
+    def place(self, block: Block) -> tuple[slice, slice, slice]:
+        """Return the slices of a block in an array of the whole lattice."""
+        return block.place_in(self.half)
+
+
 @dataclass(frozen=True)
-class Lattice:
+class Lattice(FrequencyLattice):
     """The frequencies xi = h k with h = 2 xi_max / M and k = -M/2..M/2 on each axis.
 
     A surface measure is real, so its transform at -xi is the conjugate of that at xi. Only the Hermitian half with
@@ -115,14 +184,14 @@ class Lattice:
         return 2 * self.xi_max / self.M
 
     @property
-    def half_period(self) -> float:
-        """Bound 1/(2h) on the |coordinates| of surfaces, in units of length."""
-        return 1 / (2 * self.spacing)
-
-    @property
     def highest_frequency(self) -> float:
         """Length |xi| of the cube's corners, in cycles per unit length."""
         return math.sqrt(3) * self.xi_max
+
+    @property
+    def radial_range(self) -> tuple[float, float]:
+        """Range of |xi| of a ball with the volume of the cube."""
+        return 0.0, _BALL * self.xi_max
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -135,16 +204,11 @@ class Lattice:
         return Block((-self.M // 2, -self.M // 2, 0), self.shape)
 
     @cached_property
-    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def axes(self) -> Axes:
         """Frequencies along xi_x, xi_y, xi_z of the half lattice, float64, in cycles per unit length."""
         return self.frequencies(self.half)
 
-    def frequencies(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the frequencies along the three axes of a block, in cycles per unit length."""
-        x, y, z = (self.spacing * block.indices(axis).astype(np.float64) for axis in range(3))
-        return x, y, z
-
-    def axis_weights(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def axis_weights(self, block: Block) -> Axes:
         """Return the weights of the trapezoidal rule along the three axes of a block, with the factor h.
 
         Their products integrate over the whole cube: samples at the ends of an axis count half, and samples with
@@ -170,14 +234,6 @@ class Lattice:
         """Number of values that `shells` can take: 3 (M/2)^2 + 1."""
         return 3 * (self.M // 2) ** 2 + 1
 
-    def split(self, largest_size: int) -> tuple[Block, ...]:
-        """Return equal blocks that make up the half lattice: see `Block.split`."""
-        return self.half.split(largest_size)
-
-    def place(self, block: Block) -> tuple[slice, slice, slice]:
-        """Return the slices of a block in an array of the half lattice."""
-        return block.place_in(self.half)
-
     @classmethod
     def of(cls, field: xr.DataArray) -> Lattice:
         """Return the lattice of a field.
@@ -198,3 +254,77 @@ class Lattice:
                     f"M {lattice.M}; select whole fields, not parts of them"
                 )
         return lattice
+
+
+@dataclass(frozen=True)
+class OctaveLattice(FrequencyLattice):
+    """The frequencies h Rᵀ (k + o) of a lattice that is turned by R and shifted by o, both drawn at random.
+
+    Over all shifts, the sum over such a lattice has the integral as its expectation, whatever the spacing: the images
+    of the surfaces average out. So a lattice of the same size serves each octave of |ξ|, at twice the spacing.
+
+    The integrands are even, so one half of space counts for both. Samples fade out across its boundary
+    (`half_weights`), since a sharp edge would cut some cells of the lattice in two.
+
+    Attributes:
+        lowest: Least |ξ| at which samples count, in cycles per unit length.
+        highest: Largest |ξ| at which samples count.
+        M: Samples along the x and y axis, even; the z axis has half as many and three more.
+        quaternion: Rotation R as a unit quaternion (x, y, z, w).
+        offset: Shift o in units of the spacing, each from 0 to 1.
+    """
+
+    lowest: float
+    highest: float
+    M: int
+    quaternion: tuple[float, float, float, float]
+    offset: tuple[float, float, float]
+
+    tolerates_images: ClassVar[bool] = True
+
+    @classmethod
+    def random(cls, lowest: float, highest: float, M: int, rng: np.random.Generator) -> Self:
+        """Draw the rotation and shift of a lattice."""
+        x, y, z, w = Rotation.random(rng=rng).as_quat().tolist()
+        i, j, k = rng.random(3).tolist()
+        return cls(lowest, highest, M, (x, y, z, w), (i, j, k))
+
+    @property
+    def spacing(self) -> float:
+        """Distance h between neighbouring frequencies, in cycles per unit length."""
+        return 2 * self.highest / self.M
+
+    @property
+    def half(self) -> Block:
+        """Samples with ξ_z > 0 along the lattice's axis, and the layers below that fade out."""
+        start, faded = -self.M // 2, _FADED_LAYERS
+        return Block((start, start, -faded), (self.M, self.M, self.M // 2 + faded))
+
+    @property
+    def highest_frequency(self) -> float:
+        """Largest |ξ| at which samples count; those beyond it are computed with a larger error."""
+        return self.highest
+
+    @property
+    def radial_range(self) -> tuple[float, float]:
+        """Range of |ξ| in which samples count."""
+        return self.lowest, self.highest
+
+    @cached_property
+    def rotation(self) -> NDArray[np.float64]:
+        """Rotation R as a matrix (3, 3)."""
+        matrix: NDArray[np.float64] = Rotation.from_quat(self.quaternion).as_matrix()
+        return matrix
+
+    @property
+    def shift(self) -> tuple[float, float, float]:
+        """Shift of all samples along the lattice's axes, in units of the spacing."""
+        return self.offset
+
+    def half_weights(self) -> NDArray[np.float64]:
+        """Return the weight of each layer of samples along the z axis, float64: 2 inside, fading to 0 across ξ_z = 0.
+
+        The weights of a frequency and of its negative add up to 2.
+        """
+        layers = self.half.indices(2) + self.offset[2]
+        return np.asarray(1 + erf(layers / _FADING_LAYERS))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.lattice_selection import lattice_of
-from sobolev_batch.spectral.adaptive.solve import Pilot, Problem, run_pilot
+from sobolev_batch.spectral.adaptive.problem import Problem
+from sobolev_batch.spectral.adaptive.solve import Pilot, run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support

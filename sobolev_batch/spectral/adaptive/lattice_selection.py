@@ -70,6 +70,15 @@ def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy)
     return lattice_of(highest, period, most), 2 * highest * period > most
 
 
+def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> Lattice:
+    """Return a small lattice whose period holds the surfaces and their images apart, for the innermost frequencies.
+
+    Octaves of larger lattices measure the rest, so that its M can be the same for every accuracy.
+    """
+    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
+    return lattice_of(_HIGHEST_FREQUENCY, period, min(_PILOT_M, accuracy.largest_intervals))
+
+
 def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
     """Return a pilot that sees further than one on which an accuracy seemed out of reach, or None."""
     intervals = min(_LARGER_PILOT_M, accuracy.largest_intervals)

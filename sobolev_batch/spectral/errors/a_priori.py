@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, rule_ranges, typical_errors
 from sobolev_batch.spectral.transform.settings import COARSEST_EPS, FINEST_EPS, TransformSettings
@@ -41,8 +41,6 @@ _BINS = 48
 _RADII = 32
 _LOOSEST_TOLERANCE = 0.1
 _STEPS_PER_DECADE = 4
-# The cube's volume is that of a ball of this radius, in units of half its side.
-_BALL = (6 / np.pi) ** (1 / 3)
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class ErrorTarget:
         return ErrorTarget(self.orders, tuple(norm / factor for norm in self.norms))
 
 
-def permits_single(surface: Surface, lattice: Lattice, target: ErrorTarget) -> bool:
+def permits_single(surface: Surface, lattice: FrequencyLattice, target: ErrorTarget) -> bool:
     """Tell whether single precision meets a target: its rounding is 1e-7 of the area at every frequency."""
     rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(_weight_masses(lattice, target.orders))
     return bool(np.all(rounding <= _NUFFT_FRACTION * np.array(target.norms)))
@@ -70,13 +68,13 @@ def permits_single(surface: Surface, lattice: Lattice, target: ErrorTarget) -> b
 
 @singledispatch
 def choose_settings(
-    surface: Surface, lattice: Lattice, target: ErrorTarget, settings: TransformSettings
+    surface: Surface, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> TransformSettings:
     """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
 
     Args:
         surface: Surface of the field, a mesh or a parametrised one.
-        lattice: Lattice of the field.
+        lattice: FrequencyLattice of the field.
         target: Largest permitted error.
         settings: Settings whose dtype and quadrature are kept.
 
@@ -92,14 +90,16 @@ def choose_settings(
 
 
 @choose_settings.register
-def _(surface: Mesh, lattice: Lattice, target: ErrorTarget, settings: TransformSettings) -> TransformSettings:
+def _(surface: Mesh, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings) -> TransformSettings:
     rules = ErrorTarget(target.orders, tuple((1 - _NUFFT_FRACTION) * np.array(target.norms)))
     eps = _nufft_eps(surface.area, len(surface.triangles), lattice, target, settings)
     return replace(settings, eps=eps, tolerance=loosest_tolerance(surface, lattice, rules))
 
 
 @choose_settings.register
-def _(surface: Smooth, lattice: Lattice, target: ErrorTarget, settings: TransformSettings) -> TransformSettings:
+def _(
+    surface: Smooth, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+) -> TransformSettings:
     # The tolerance bounds the error at every single frequency: assume it at all of them.
     masses = _weight_masses(lattice, target.orders)
     rest = (1 - _NUFFT_FRACTION) * np.array(target.norms)
@@ -107,7 +107,9 @@ def _(surface: Smooth, lattice: Lattice, target: ErrorTarget, settings: Transfor
     return replace(settings, eps=eps, tolerance=float(np.min(rest / (surface.area * np.sqrt(masses)))))
 
 
-def _nufft_eps(area: float, points: int, lattice: Lattice, target: ErrorTarget, settings: TransformSettings) -> float:
+def _nufft_eps(
+    area: float, points: int, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+) -> float:
     """Return the largest eps with which the NUFFT of so many points keeps to its fraction of a target."""
     masses = _weight_masses(lattice, target.orders)
     spread = _NUFFT_ERROR + 1 / math.sqrt(points)
@@ -115,7 +117,7 @@ def _nufft_eps(area: float, points: int, lattice: Lattice, target: ErrorTarget, 
     return min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS)
 
 
-def loosest_tolerance(mesh: Mesh, lattice: Lattice, target: ErrorTarget) -> float:
+def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, target: ErrorTarget) -> float:
     """Return the largest tolerance of the triangle rules whose error is predicted to meet a target."""
     sizes = SizeHistogram.of(mesh)
     decades = math.log10(_LOOSEST_TOLERANCE / FINEST_TOLERANCE)
@@ -156,7 +158,7 @@ class SizeHistogram:
         sums = [np.bincount(classes, values, count).astype(np.float64, copy=False) for values in (areas, areas * areas)]
         return cls(edges[:-1], edges[1:], *sums)
 
-    def quadrature_error(self, lattice: Lattice, orders: Sequence[float], tolerance: float) -> Reals:
+    def quadrature_error(self, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float) -> Reals:
         """Predict the norm of the quadrature's part of a field's error (orders,).
 
         The even parts of the triangles' errors add up like the surface's transform itself, whose
@@ -187,13 +189,14 @@ def _interpolated_errors(rule: TriangleRule, phases: Reals) -> tuple[Reals, Real
     return first, second
 
 
-def _radii(lattice: Lattice) -> Reals:
-    radii: Reals = (np.arange(_RADII) + 0.5) / _RADII * _BALL * lattice.xi_max
+def _radii(lattice: FrequencyLattice) -> Reals:
+    low, high = lattice.radial_range
+    radii: Reals = low + (np.arange(_RADII) + 0.5) / _RADII * (high - low)
     return radii
 
 
-def _weight_masses(lattice: Lattice, orders: Sequence[float]) -> Reals:
-    """Return ∫ (1+|ξ|²)^s over the lattice's cube (orders,)."""
+def _weight_masses(lattice: FrequencyLattice, orders: Sequence[float]) -> Reals:
+    """Return ∫ (1+|ξ|²)^s over the range of a lattice (orders,)."""
     return _radial_integrals(np.ones(_RADII), _radii(lattice), orders)
 
 

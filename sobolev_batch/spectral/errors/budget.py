@@ -8,7 +8,7 @@ docs/numerics.md explains the laws and how well they hold.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -89,12 +89,14 @@ class NormEstimate:
         truncation: Bound on the part beyond xi_max, which can only add to the value.
         aliasing: Estimate of the change by the lattice's spacing, either way.
         discretisation: Bound on the error by the triangle rules and the NUFFT.
+        statistical: Bound on the error by random frequencies, which holds with a probability; zero without these.
     """
 
     values: Reals
     truncation: Reals
     aliasing: Reals
     discretisation: Reals
+    statistical: Reals = field(default_factory=lambda: np.zeros(()))
 
     def __iter__(self) -> Iterator[Reals]:
         yield from (self.values, self.truncation, self.aliasing, self.discretisation)
@@ -102,12 +104,18 @@ class NormEstimate:
     @property
     def errors(self) -> Reals:
         """Total error: the true value differs from the reported one by no more."""
-        return self.truncation + self.aliasing + self.discretisation
+        return self.truncation + self.aliasing + self.discretisation + self.statistical
 
     def named(self, name: str) -> dict[str, Reals]:
         """Return the values under a name, the error and its parts under theirs."""
-        parts = {"truncation": self.truncation, "aliasing": self.aliasing, "discretisation": self.discretisation}
-        return {name: self.values, "error": self.errors, **parts}
+        return {
+            name: self.values,
+            "error": self.errors,
+            "truncation": self.truncation,
+            "aliasing": self.aliasing,
+            "discretisation": self.discretisation,
+            "statistical": np.broadcast_to(self.statistical, self.values.shape),
+        }
 
 
 def add_sums(sums: Sequence[Sums]) -> Sums:
@@ -147,10 +155,16 @@ def estimate_norms(sums: Sums, weights: SobolevWeights, support: Support, discre
     return NormEstimate(
         values,
         np.sqrt(totals + tails) - values,
-        # The larger of the two sides: the square may come out too large as well as too small.
-        np.maximum(np.sqrt(totals + images) - values, values - np.sqrt(np.maximum(totals - images, 0.0))),
+        change_of_root(totals, images),
         discretisation,
     )
+
+
+def change_of_root(totals: Reals, changes: Reals) -> Reals:
+    """Return how much the root of totals changes at most if the totals are off by some changes, either way."""
+    values = np.sqrt(totals)
+    lower = np.sqrt(np.maximum(totals - changes, 0.0))
+    return np.asarray(np.maximum(np.sqrt(totals + changes) - values, values - lower))
 
 
 def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: float | None = None) -> Reals:

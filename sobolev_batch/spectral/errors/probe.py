@@ -75,11 +75,17 @@ class Probe:
         """
         if not self.shells:
             return np.zeros(len(weights.orders))
-        parts = weights.per_shell[:, list(self.shells)] * np.array(self.sums)
-        squares = parts.sum(axis=1)
-        # The fewer draws carry the sum, the less it tells.
-        shares = parts / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
-        return np.asarray(np.sqrt(squares * (1 + _CAUTION * np.sqrt(np.sum(shares**2, axis=1)))))
+        return norms_of_draws(weights.per_shell[:, list(self.shells)] * np.array(self.sums))
+
+
+def norms_of_draws(parts: Reals) -> Reals:
+    """Return norms of an error (orders,) from the contributions of draws to their squares (orders, P), raised.
+
+    The fewer draws carry the sum, the less it tells, and the more it is raised.
+    """
+    squares = parts.sum(axis=1)
+    shares = parts / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
+    return np.asarray(np.sqrt(squares * (1 + _CAUTION * np.sqrt(np.sum(shares**2, axis=1)))))
 
 
 def draw_count(triangles: int) -> int:

@@ -13,7 +13,7 @@ from scipy.integrate import IntegrationWarning, quad
 from scipy.special import gamma, kv
 
 from sobolev_batch.errors import OrderError
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
 
@@ -32,15 +32,16 @@ def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArra
     return np.asarray(sphere.area * np.sinc(2 * sphere.radius * lengths) * phases)
 
 
-def sphere_block(sphere: Sphere, lattice: Lattice, block: Block) -> NDArray[np.complex128]:
+def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> NDArray[np.complex128]:
     """Return the transform of a sphere on a block of the lattice, complex128 (block.shape)."""
     x, y, z = lattice.frequencies(block)
     lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)
     values = (sphere.area * np.sinc(2 * sphere.radius * lengths)).astype(np.complex128)
+    center = np.array(sphere.center) if lattice.rotation is None else lattice.rotation @ sphere.center
     for axis, frequencies in enumerate((x, y, z)):
         shape = [1, 1, 1]
         shape[axis] = -1
-        values *= np.exp(-2j * np.pi * sphere.center[axis] * frequencies).reshape(shape)
+        values *= np.exp(-2j * np.pi * center[axis] * frequencies).reshape(shape)
     return values
 
 

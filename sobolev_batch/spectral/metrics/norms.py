@@ -15,7 +15,8 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import byte_count
-from sobolev_batch.spectral.adaptive.solve import Problem, solve
+from sobolev_batch.spectral.adaptive.problem import Problem
+from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm

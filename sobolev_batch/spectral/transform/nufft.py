@@ -11,13 +11,13 @@ from sobolev_batch.spectral.backends.arrays import Array, combine, cosine_and_si
 from sobolev_batch.spectral.backends.backends import CPU, Backend, NufftPlan, evaluation_plan
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.memory import Batching, sub_blocks
 
 
 def transform_points(
-    batches: Iterable[WeightedPoints], lattice: Lattice, block: Block, spec: NufftSpec, backend: Backend = CPU
+    batches: Iterable[WeightedPoints], lattice: FrequencyLattice, block: Block, spec: NufftSpec, backend: Backend = CPU
 ) -> tuple[Array, int]:
     """Return Σ_j w_j exp(-2πi ξ·x_j) at the frequencies ξ of a block, by a type-1 nonuniform FFT.
 
@@ -44,11 +44,16 @@ def transform_points(
         count += len(points.weights)
         if plan is None:
             plan = backend.plan(backend.costs.with_oversampling(spec, count))
-        angles = scale * points.coordinates
-        # setpts keeps references, not copies: `angles` lives until execute has returned.
-        plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype, like=row) for row in angles))
+        turned = points.coordinates if lattice.rotation is None else combine(lattice.rotation, points.coordinates)
+        angles = scale * turned
+        # Whole turns change the strengths of a shifted lattice, and nothing else.
+        folded = angles - 2 * np.pi * np.rint(angles / (2 * np.pi)) if lattice.tolerates_images else angles
+        # setpts keeps references, not copies: the angles live until execute has returned.
+        plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype, like=row) for row in folded))
         for sub_block, (x, y, z) in sub_blocks(block, spec.shape):
-            values = plan.execute(_shifted_strengths(points.weights, angles, sub_block, spec.dtype))
+            values = plan.execute(
+                _shifted_strengths(points.weights, angles, _first_mode(sub_block, lattice), spec.dtype)
+            )
             if total is None and spec.shape == block.shape:
                 total = values
             elif total is None:
@@ -58,7 +63,7 @@ def transform_points(
                 total[x, y, z] += values[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start]
             # Free the memory before the next values and the next batch are made.
             del values
-        del points, angles
+        del points, turned, angles, folded
     if total is None:
         total = backend.upload(np.zeros(block.shape, dtype=spec.dtype))
     return total, count
@@ -94,7 +99,7 @@ def evaluate_at(
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype) for row in angles))
         for sub_block, (x, y, z) in sub_blocks(block, spec.shape):
             # The conjugates of these phase shifts move the window of modes to the sub-block.
-            shifts = _shifted_strengths(ones, angles, sub_block, spec.dtype)
+            shifts = _shifted_strengths(ones, angles, _first_mode(sub_block, lattice), spec.dtype)
             for i, whole in enumerate(coefficients):
                 # Sub-blocks at the high ends extend beyond the block.
                 modes = np.zeros(spec.shape, dtype=spec.dtype)
@@ -104,17 +109,21 @@ def evaluate_at(
     return values
 
 
-def _shifted_strengths(weights: Array, angles: Array, block: Block, dtype: ComplexDtype) -> Array:
-    """Return strengths whose modes are those of a block.
+def _first_mode(block: Block, lattice: FrequencyLattice) -> NDArray[np.float64]:
+    """Return the shift (3,), in spacings, that moves FINUFFT's modes to a block.
 
-    FINUFFT's modes of an axis of n samples start at -(n // 2). A phase shift of the strengths moves that window to
-    the start of the block, at no cost in the FFT.
+    FINUFFT's modes of an axis of n samples start at -(n // 2).
     """
-    shift = np.array([start + count // 2 for start, count in zip(block.start, block.shape, strict=True)])
+    corner = [start + count // 2 for start, count in zip(block.start, block.shape, strict=True)]
+    return np.array(corner, dtype=np.float64) + lattice.shift
+
+
+def _shifted_strengths(weights: Array, angles: Array, shift: NDArray[np.float64], dtype: ComplexDtype) -> Array:
+    """Return strengths whose modes are shifted: a phase factor, at no cost in the FFT."""
     strengths = np.empty(len(weights), dtype=dtype, like=weights)
     axes = np.flatnonzero(shift)
     if axes.size:
-        cosines, sines = cosine_and_sine(combine(shift[axes].astype(np.float64), angles[axes.tolist()]))
+        cosines, sines = cosine_and_sine(combine(shift[axes], angles[axes.tolist()]))
         np.multiply(cosines, weights, out=strengths.real, casting="same_kind")
         np.multiply(sines, -weights, out=strengths.imag, casting="same_kind")
     else:

@@ -8,7 +8,7 @@ from typing import get_args
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.dtypes import ComplexDtype
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.memory import DEFAULT_BATCH
@@ -58,11 +58,11 @@ class TransformSettings:
         object.__setattr__(self, "quadrature", quadrature)
         object.__setattr__(self, "tolerance", eps if tolerance is None else tolerance)
 
-    def plan(self, surface: Surface, lattice: Lattice) -> QuadraturePlan:
+    def plan(self, surface: Surface, lattice: FrequencyLattice) -> QuadraturePlan:
         """Return the quadrature plan of a surface for a lattice."""
         return QuadraturePlan.of(surface, lattice.highest_frequency, self.tolerance, self.quadrature)
 
-    def lowest_degree(self, surface: Surface, lattice: Lattice) -> int:
+    def lowest_degree(self, surface: Surface, lattice: FrequencyLattice) -> int:
         """Return the lowest degree among the rules of a surface: see `QuadraturePlan.lowest_degree`."""
         return self.plan(surface, lattice).lowest_degree
 

@@ -15,7 +15,7 @@ from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.exact.spheres import sphere_block
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan, unknown_surface
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
@@ -56,7 +56,7 @@ class Transformed:
 
 def transform_block(
     surface: Surface,
-    lattice: Lattice,
+    lattice: FrequencyLattice,
     block: Block,
     settings: TransformSettings,
     execution: Execution = ON_CPU,
@@ -107,7 +107,7 @@ def projected_bytes(
 class _Target:
     """The arguments of `transform_block`, without the surface."""
 
-    lattice: Lattice
+    lattice: FrequencyLattice
     block: Block
     settings: TransformSettings
     execution: Execution
@@ -129,10 +129,11 @@ def _(surface: Sphere, target: _Target) -> Transformed:
 @_transform.register(Smooth)
 def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
     lattice, execution = target.lattice, target.execution
-    require_inside(surface, lattice)
+    if isinstance(lattice, Lattice):
+        require_inside(surface, lattice)
     plan = target.plan or target.settings.plan(surface, lattice)
     low, high = surface.bounds
-    fill = float(np.prod((high - low) / (2 * lattice.half_period)))
+    fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
     task = _QuadratureTransform(plan, lattice, target.block, target.settings, execution, fill)
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
     batching = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
@@ -156,7 +157,7 @@ class _QuadratureTransform:
     """
 
     plan: QuadraturePlan
-    lattice: Lattice
+    lattice: FrequencyLattice
     block: Block
     settings: TransformSettings
     execution: Execution
@@ -218,7 +219,7 @@ class _QuadratureTransform:
         return _OUT_OF_MEMORY
 
 
-def _closed_form(sphere: Sphere, lattice: Lattice, block: Block, dtype: ComplexDtype) -> Complexes:
+def _closed_form(sphere: Sphere, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
     values: Complexes = np.empty(block.shape, dtype=dtype)
     step = max(1, _SAMPLES // math.prod(block.shape[1:]))
     for first in range(0, block.shape[0], step):

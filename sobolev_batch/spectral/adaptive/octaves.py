@@ -1,0 +1,340 @@
+"""Norms and distances whose tail is measured: a small lattice, octaves around it, and the limit beyond them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
+from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
+from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_of_root, sums_of_shells
+from sobolev_batch.spectral.errors.samples import estimate
+from sobolev_batch.spectral.fields import Field, field_for
+from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
+from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond
+from sobolev_batch.spectral.octaves.normals import FaceNormals
+from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
+from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
+from sobolev_batch.spectral.octaves.sums import OctaveSums, octave_sums, statistical_errors, window_integral
+from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.surface import Surface
+
+Reals = NDArray[np.float64]
+
+_ROUNDS = 6
+_MOST_OCTAVES = 24
+# Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
+_LIMIT_FRACTION = 0.4
+# Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
+_USUAL_OCTAVES, _QUANTILE = 6, 2.9
+# Samples along an axis of the first lattice of an octave, and of the largest one.
+_FIRST_M, _LARGEST_M = 64, 192
+# Draws of an octave: the fewest, the most, and the time that draws may take beside a lattice, as a fraction of its.
+_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 64, 200_000, 0.5
+# Uniform directions among the draws, beside a lattice and without one.
+_UNIFORM_BESIDE_LATTICE, _UNIFORM_ALONE = 0.1, 0.5
+# Deviation of |field|² over its mean among draws, on curved surfaces and on flat faces.
+_CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
+# Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength.
+_GROWTH = 4.0
+# Seconds for a quadrature point, a lattice of `_FIRST_M`, and a pair of a triangle and a frequency; measured, rough.
+_POINT_SECONDS, _LATTICE_SECONDS, _PAIR_SECONDS = 3.5e-7, 0.15, 3e-7
+# Quadrature points for each square of half a wavelength.
+_POINTS_PER_SQUARE = 4.0
+# Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
+_MOST_SMOOTH_NODES = 2e6
+
+
+@dataclass(frozen=True, eq=False)
+class Core:
+    """The innermost frequencies: fields on a small lattice, under a smooth step.
+
+    Attributes:
+        lattice: Lattice of the fields.
+        fields: Fields of the surfaces.
+        squares: Squared norm of their difference under the step for each order (orders,).
+        images: Bound on the change of the squares by the lattice's spacing (orders,).
+        errors: Norms of the fields' own errors (orders,).
+        energy: Energy ∫_{|ξ|=r} |field|² dS in the outer range of the lattice.
+    """
+
+    lattice: Lattice
+    fields: tuple[Field, ...]
+    squares: Reals
+    images: Reals
+    errors: Reals
+    energy: float
+
+    @classmethod
+    def of(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
+        """Return the core of a problem; the step ends at the cutoff."""
+        samples = problem.samples(lattice)
+        values = ESTIMATE_CAUTION * estimate(samples, problem.orders)
+        problem.require_above_rounding(values)
+        # The octaves' values have errors of their own.
+        target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
+            2 * problem.inexact_count
+        )
+        settings = TransformSettings(dtype=problem.dtype(lattice, target))
+        fields = tuple(
+            field_for(surface, lattice, target, settings, Execution(threads=problem.threads), sample=sample)
+            for surface, sample in zip(problem.surfaces, samples, strict=True)
+        )
+        weights = SobolevWeights(lattice, problem.orders)
+        sums = shell_sums(_difference([one.values for one in fields]), None, lattice, lattice.half)
+        step = smooth_step(lattice.spacing * np.sqrt(np.arange(lattice.shell_count)), cutoff)
+        stepped = sums_of_shells(step * sums, weights)
+        errors = np.sum([one.quality.probe.norms(weights) for one in fields], axis=0)
+        images = aliased(stepped, weights, problem.support.widths)
+        energy = float(sums_of_shells(sums, weights).outer[1])
+        return cls(lattice, fields, np.maximum(stepped.totals, 0.0), images, errors, energy)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredOctave:
+    """An octave: where it was sampled, the surfaces' values there, and their integrals.
+
+    Attributes:
+        values: Values of each surface.
+        sums: Integrals of the squared difference.
+    """
+
+    values: tuple[OctaveValues, ...]
+    sums: OctaveSums
+
+    @property
+    def sampling(self) -> OctaveSampling:
+        """Samples of the octave, common to all surfaces."""
+        return self.values[0].sampling
+
+    def error_norms(self, orders: Sequence[float]) -> Reals:
+        """Return the norms of the values' own errors (orders,), those of all surfaces added."""
+        return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class OctaveSolution:
+    """A norm or distance with a measured tail.
+
+    Attributes:
+        estimate: Numbers with their errors, each (orders,).
+        core: The innermost frequencies.
+        octaves: The octaves around them.
+    """
+
+    estimate: NormEstimate
+    core: Core
+    octaves: tuple[MeasuredOctave, ...]
+
+
+def solve_in_octaves(problem: Problem, seed: int = 0) -> OctaveSolution:
+    """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
+
+    Args:
+        problem: Surfaces, orders and accuracy.
+        seed: Seed of the random frequencies. The same seed gives the same result.
+
+    Returns:
+        The solution of the first of a few rounds that meets the accuracy, or of the last.
+
+    Raises:
+        AccuracyError: The accuracy lies below the rounding of fields.
+    """
+    search = _Search.begin(problem, seed)
+    for _ in range(_ROUNDS):
+        search.measure_outwards()
+        solution = search.solution()
+        if np.all(problem.accuracy.met(solution.estimate)) or not search.refine():
+            break
+    return solution
+
+
+class _Search:
+    """Octaves that are added and refined until the accuracy is met."""
+
+    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator) -> None:
+        self.problem = problem
+        self.core = core
+        self.cutoff = cutoff
+        self.rng = rng
+        self.octaves: list[MeasuredOctave] = []
+        self.normals = FaceNormals.of(problem.surfaces)
+        self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
+
+    @classmethod
+    def begin(cls, problem: Problem, seed: int) -> Self:
+        lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
+        return cls(problem, Core.of(problem, lattice, lattice.xi_max), lattice.xi_max, np.random.default_rng(seed))
+
+    @property
+    def squares(self) -> Reals:
+        """Squared norms of all that has been measured (orders,)."""
+        return np.asarray(self.core.squares + sum(octave.sums.squares for octave in self.octaves))
+
+    @property
+    def tail_changes(self) -> Reals:
+        """Largest permitted error of the squares by the tail (orders,)."""
+        parts = np.array([self.problem.accuracy.truncation_part(order) for order in self.problem.orders])
+        return np.asarray(2 * parts * self.squares)
+
+    @property
+    def permitted_variances(self) -> Reals:
+        """Largest permitted variance of the squares (orders,)."""
+        return np.asarray(((1 - _LIMIT_FRACTION) * self.tail_changes / _QUANTILE) ** 2)
+
+    def measure_outwards(self) -> None:
+        """Add octaves until what lies beyond them is known well enough, or no more can be had."""
+        while len(self.octaves) < _MOST_OCTAVES and not self._knows_the_rest():
+            octave = Octave(self.cutoff, len(self.octaves) + 1)
+            if octave.highest > self._resolvable_frequency():
+                break
+            self.octaves.append(self._measured(self._first_sampling(octave)))
+
+    def solution(self) -> OctaveSolution:
+        """Return the numbers by what has been measured so far."""
+        orders = self.problem.orders
+        squares, changes = self.squares, np.zeros(len(orders))
+        if self.octaves:
+            last = self.octaves[-1]
+            rest, changes = beyond(last.sampling.octave, last.sums, self.limit, orders)
+            squares = squares + rest
+        errors = np.sqrt(
+            self.core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
+        )
+        found = NormEstimate(
+            np.sqrt(squares),
+            change_of_root(squares, changes),
+            change_of_root(squares, self.core.images),
+            errors,
+            change_of_root(squares, statistical_errors([octave.sums for octave in self.octaves])),
+        )
+        return OctaveSolution(found, self.core, tuple(self.octaves))
+
+    def refine(self) -> bool:
+        """Take more samples where they are needed most; tell whether any could be taken."""
+        refined = False
+        accuracy = self.problem.accuracy
+        values = np.sqrt(self.squares)
+        if np.any(change_of_root(self.squares, self.core.images) > accuracy.aliasing_part * values):
+            lattice = self.core.lattice
+            larger = 2 * round(0.575 * lattice.M)
+            if larger <= accuracy.largest_intervals:
+                self.core = Core.of(
+                    self.problem, Lattice(larger * lattice.spacing * lattice.M / larger / 2, larger), self.cutoff
+                )
+                refined = True
+        permitted = self.permitted_variances
+        totals = np.sum([octave.sums.variances for octave in self.octaves], axis=0)
+        order = int(np.argmax(totals / permitted))
+        if totals[order] > permitted[order]:
+            each = permitted[order] / len(self.octaves)
+            for number, octave in enumerate(self.octaves):
+                sampling = self._finer_sampling(octave, order, each)
+                if sampling is not None:
+                    self.octaves[number] = self._measured(sampling, octave)
+                    refined = True
+        return refined
+
+    def _knows_the_rest(self) -> bool:
+        if not self.octaves:
+            return False
+        last = self.octaves[-1]
+        _, changes = beyond(last.sampling.octave, last.sums, self.limit, self.problem.orders)
+        return bool(np.all(changes <= _LIMIT_FRACTION * self.tail_changes))
+
+    def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
+        problem = self.problem
+        values = np.sqrt(self.squares)
+        target = error_target(values, problem.orders, problem.accuracy, problem.area)
+        target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
+        execution = Execution(threads=problem.threads)
+        found = tuple(
+            octave_values(surface, sampling, target, execution, known.values[number] if known else None)
+            for number, surface in enumerate(problem.surfaces)
+        )
+        differences = [_difference(parts) for parts in zip(*(one.values for one in found), strict=True)]
+        return MeasuredOctave(found, octave_sums(sampling, differences, problem.orders))
+
+    def _first_sampling(self, octave: Octave) -> OctaveSampling:
+        """Return the sampling that is predicted to be the cheapest one."""
+        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energy
+        energy = min(_GROWTH * energy, max(self.limit.value, energy))
+        parts = energy * np.array([window_integral(octave, order) for order in self.problem.orders])
+        deviation = _FLAT_DEVIATION if self.normals else _CURVED_DEVIATION
+        permitted = np.sqrt(self.permitted_variances / _USUAL_OCTAVES)
+        count = int(np.clip(np.max(deviation * parts / permitted) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
+        lattice_seconds = self._lattice_seconds(octave, _FIRST_M)
+        if self._draws_exactly(octave) and count * self._draw_seconds < lattice_seconds:
+            return OctaveSampling(octave, (), self._drawn(octave, count, _UNIFORM_ALONE))
+        beside = 0
+        if self.normals and self._draws_exactly(octave):
+            affordable = _DRAWS_FRACTION * lattice_seconds / self._draw_seconds
+            beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
+        lattice = OctaveLattice.random(octave.lowest, octave.highest, _FIRST_M, self.rng)
+        return OctaveSampling(octave, (lattice,), self._drawn(octave, beside, _UNIFORM_BESIDE_LATTICE))
+
+    def _finer_sampling(self, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
+        """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
+        sampling, sums = octave.sampling, octave.sums
+        excess = float(sums.variances[order]) / permitted
+        if excess <= 1:
+            return None
+        lattices, drawn = sampling.lattices, sampling.drawn
+        count = int(min(len(drawn) * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
+        from_draws = sums.drawn_variances[order] > sums.lattice_variances[order]
+        if not lattices and count * self._draw_seconds > self._lattice_seconds(sampling.octave, _FIRST_M):
+            beside = len(drawn) if self.normals else 0
+            lattices, from_draws = (self._lattice(sampling.octave, _FIRST_M),), False
+            drawn = self._drawn(sampling.octave, beside, _UNIFORM_BESIDE_LATTICE)
+        elif from_draws:
+            drawn = self._drawn(sampling.octave, count, drawn.uniform_fraction)
+        else:
+            intervals = 2 * round(lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
+            lattices = (*lattices, self._lattice(sampling.octave, min(intervals, _LARGEST_M)))
+        return replace(sampling, lattices=lattices, drawn=drawn)
+
+    def _lattice(self, octave: Octave, intervals: int) -> OctaveLattice:
+        return OctaveLattice.random(octave.lowest, octave.highest, intervals, self.rng)
+
+    def _drawn(self, octave: Octave, count: int, uniform_fraction: float) -> DrawnFrequencies:
+        return DrawnFrequencies.random(octave, count, self.normals, uniform_fraction, self.rng)
+
+    @property
+    def _draw_seconds(self) -> float:
+        triangles = sum(len(surface.triangles) for surface in self.problem.surfaces if isinstance(surface, Mesh))
+        return _PAIR_SECONDS * (triangles + 100)
+
+    def _lattice_seconds(self, octave: Octave, intervals: int) -> float:
+        points = sum(_points(surface, octave.highest) for surface in self.problem.surfaces)
+        return points * _POINT_SECONDS + _LATTICE_SECONDS * (intervals / _FIRST_M) ** 3
+
+    def _draws_exactly(self, octave: Octave) -> bool:
+        """Tell whether all surfaces have exact values at single frequencies of an octave."""
+        smooth = [surface for surface in self.problem.surfaces if isinstance(surface, Smooth)]
+        return all(_points(surface, octave.highest) < _MOST_SMOOTH_NODES / 16 for surface in smooth)
+
+    def _resolvable_frequency(self) -> float:
+        """Return the frequency up to which all surfaces can be transformed."""
+        smooth = [surface.area for surface in self.problem.surfaces if isinstance(surface, Smooth)]
+        return float((_MOST_SMOOTH_NODES / (4 * _POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
+
+
+def _points(surface: Surface, frequency: float) -> float:
+    """Return about how many quadrature points a surface needs up to a frequency."""
+    if not isinstance(surface, Mesh | Smooth):
+        return 0.0
+    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
+    return max(1.5 * triangles, _POINTS_PER_SQUARE * surface.area * (2 * frequency) ** 2)
+
+
+def _difference(values: Sequence[NDArray[np.complexfloating]]) -> NDArray[np.complexfloating]:
+    """Return the only field, or the difference of two."""
+    return values[0] if len(values) == 1 else values[0] - values[1]

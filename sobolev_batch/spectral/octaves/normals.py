@@ -1,0 +1,111 @@
+"""Flat faces: the directions in which their transforms concentrate, and frequencies drawn around these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Surface
+
+Reals = NDArray[np.float64]
+
+# Normals whose entries agree to this many parts are one direction.
+_DIRECTION_PARTS = 500
+# A direction counts if the faces along it hold this fraction of the area; so many directions at most.
+_LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
+# Width of the spots around a normal: a fraction of |ξ| · 2π · size of the faces, whose transform falls off there.
+_SPOT_FRACTION = 0.5
+# Entries along this direction decide which of two opposite normals is taken.
+_UPWARDS = np.array([0.3, 0.5, 0.81])
+_NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class FaceNormals:
+    """Directions of the flat faces of some surfaces, and a density of directions that follows them.
+
+    The transform of a flat face is concentrated around its normal, in a spot as wide as the inverse size of the face,
+    and falls off from there like the inverse third power. So does the density around each normal n, which is
+    (1 + κ²) / (4π (1 + κ² sin²θ)^(3/2)) at an angle θ to n, with κ in proportion to |ξ| times the size.
+
+    Attributes:
+        directions: Unit normals, float64 (n, 3); the density is the same at opposite directions.
+        shares: Area of the faces along each normal over that along all of them, float64 (n,).
+        sizes: Typical width of these faces, float64 (n,), in units of length.
+        total_share: Area of these faces over the area of all surfaces.
+    """
+
+    directions: Reals
+    shares: Reals
+    sizes: Reals
+    total_share: float
+
+    @classmethod
+    def of(cls, surfaces: Sequence[Surface]) -> Self:
+        """Return the normals of the flat faces of surfaces; none for curved ones."""
+        found = [_main_normals(surface) for surface in surfaces if isinstance(surface, Mesh)]
+        directions, areas, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))
+        total = float(areas.sum())
+        shares = areas / max(total, np.finfo(np.float64).tiny)
+        return cls(directions, shares, sizes, total / sum(surface.area for surface in surfaces))
+
+    def __bool__(self) -> bool:
+        return len(self.shares) > 0
+
+    def draw(self, radii: Reals, rng: np.random.Generator) -> Reals:
+        """Draw a unit direction for each |ξ| (n,) by the density, float64 (n, 3)."""
+        chosen = rng.choice(len(self.shares), len(radii), p=self.shares)
+        axes = self.directions[chosen]
+        squares = self._concentrations(radii, self.sizes[chosen])
+        levels = rng.random(len(radii))
+        # The distribution of u = |cos θ| is u / √(1 + κ² - κ² u²), which inverts in closed form.
+        cosines = levels * np.sqrt((1 + squares) / (1 + squares * levels**2))
+        sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
+        turns = 2 * np.pi * rng.random(len(radii))
+        across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
+        signs = np.where(rng.random(len(radii)) < 0.5, 1.0, -1.0)
+        return np.asarray((signs * cosines)[:, None] * axes + sines[:, None] * sideways)
+
+    def density(self, directions: Reals, radii: Reals) -> Reals:
+        """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
+        total = np.zeros(len(radii))
+        for axis, share, size in zip(self.directions, self.shares, self.sizes, strict=True):
+            squares = self._concentrations(radii, size)
+            sines = np.maximum(1 - (directions @ axis) ** 2, 0.0)
+            total += share / (4 * np.pi) * (1 + squares) / (1 + squares * sines) ** 1.5
+        return total
+
+    @staticmethod
+    def _concentrations(radii: Reals, sizes: Reals | float) -> Reals:
+        """Return κ² of the density."""
+        return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
+
+
+def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
+    """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
+    corners = mesh.vertices[mesh.triangles]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(crosses, axis=1)
+    kept = doubled > 0
+    normals, areas, corners = crosses[kept] / doubled[kept, None], doubled[kept] / 2, corners[kept]
+    normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
+    _, members = np.unique(np.round(normals * _DIRECTION_PARTS), axis=0, return_inverse=True)
+    members = members.ravel()
+    sums = np.bincount(members, weights=areas)
+    largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
+    largest = largest[sums[largest] > _LEAST_SHARE * areas.sum()]
+    faces = [members == group for group in largest]
+    directions = np.array([areas[face] @ normals[face] for face in faces]).reshape(-1, 3)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    # Between the width of one triangle and that of all faces along the normal: spots of both lie there.
+    sizes = [
+        np.sqrt(np.ptp(corners[face].reshape(-1, 3), axis=0).max() * np.sqrt(areas[face].mean())) for face in faces
+    ]
+    return directions, sums[largest], np.array(sizes)
