@@ -18,7 +18,7 @@ def tree() -> xr.DataTree:
         {
             "distance": (("mesh", "order"), distance),
             **dict.fromkeys(("error", "truncation"), (("mesh", "order"), distance / 1000)),
-            **dict.fromkeys(("aliasing", "discretisation"), (("mesh", "order"), 0 * distance)),
+            **dict.fromkeys(("aliasing", "discretisation", "statistical"), (("mesh", "order"), 0 * distance)),
             "relative": (("mesh", "order"), distance / 4),
             "relative_error": (("mesh", "order"), distance / 4000),
             "area_part": (("mesh", "order"), 0.6 * distance),

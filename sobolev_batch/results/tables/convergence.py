@@ -24,6 +24,7 @@ _NUMBERS = (
     "truncation",
     "aliasing",
     "discretisation",
+    "statistical",
     "relative",
     "relative_error",
     "area_part",
@@ -114,7 +115,7 @@ def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
 
     Returns:
         Columns order, mesh, family, name, level, status, reason, triangles, edge_length (mean), distance (to the
-        reference), error and its parts truncation, aliasing and discretisation, relative and relative_error (over the
+        reference), error and its parts truncation, aliasing, discretisation and statistical, relative and relative_error (over the
         norm of the reference), area_part and shape_part (what a change of total area alone explains of the distance,
         and the rest: their squares add up to its square), rate (observed order of convergence in the edge length) and
         rate_error, resolved (the distance exceeds its error), within (the error is as small as the study asks

@@ -19,7 +19,7 @@ from sobolev_batch.results.tables.text import Format, machine_table, printed_tab
 
 Reals = NDArray[np.float64]
 
-_COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation")
+_COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 # A longer printed matrix cannot be read.
 _MOST_MESHES = 20
 _LINE_LENGTH = 100
@@ -69,7 +69,7 @@ class Matrix:
 def matrix(
     store: AnyStore,
     order: float,
-    values: Literal["distance", "error", "truncation", "aliasing", "discretisation"] = "distance",
+    values: Literal["distance", "error", "truncation", "aliasing", "discretisation", "statistical"] = "distance",
 ) -> pd.DataFrame:
     """Return the distances of every mesh to every other as a matrix.
 
@@ -109,7 +109,7 @@ def matrix(
 def matrix_frame(tree: xr.DataTree, order: float) -> pd.DataFrame:
     """Return the distances of one order in long form: one row for each pair of meshes.
 
-    Columns order, mesh, other, distance, error, truncation, aliasing, discretisation.
+    Columns order, mesh, other, distance, error, truncation, aliasing, discretisation, statistical.
     """
     distances = finished_group(tree, "distances", load=False)
     chosen = distances[list(_COLUMNS)].sel(order=chosen_orders(distances, order)[0]).load()

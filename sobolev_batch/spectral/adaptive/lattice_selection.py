@@ -129,7 +129,7 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
     if highest is None:
         excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
         worst = int(np.argmax(excess))
-        reachable = _rounded_up(_REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol)
+        reachable = rounded_up(_REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol)
         advice = f"about {reachable:g} can be reached; ask for that, allow more memory, or take"
         if reachable >= 1:
             advice = "not even one digit can be reached; allow more memory or take"
@@ -180,7 +180,7 @@ def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
     return next(filter(suffices, accumulate(repeat(1.01), mul, initial=float(widths.max()))))
 
 
-def _rounded_up(value: float) -> float:
+def rounded_up(value: float) -> float:
     """Round up to two digits: an estimate has no more."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.ceil(value / unit) * unit

@@ -9,13 +9,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
-from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
+from sobolev_batch.errors import AccuracyError
+from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, rounded_up
+from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond
+from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
@@ -38,7 +39,9 @@ _USUAL_OCTAVES, _QUANTILE = 6, 2.9
 # Samples along an axis of the first lattice of an octave, and of the largest one.
 _FIRST_M, _LARGEST_M = 64, 192
 # Draws of an octave: the fewest, the most, and the time that draws may take beside a lattice, as a fraction of its.
-_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 64, 200_000, 0.5
+_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 64, 1_000_000, 0.5
+# The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
+_FEWEST_FLAT_DRAWS = 20_000
 # Uniform directions among the draws, beside a lattice and without one.
 _UNIFORM_BESIDE_LATTICE, _UNIFORM_ALONE = 0.1, 0.5
 # Deviation of |field|² over its mean among draws, on curved surfaces and on flat faces.
@@ -46,9 +49,13 @@ _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
 # Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength.
 _GROWTH = 4.0
 # Seconds for a quadrature point, a lattice of `_FIRST_M`, and a pair of a triangle and a frequency; measured, rough.
-_POINT_SECONDS, _LATTICE_SECONDS, _PAIR_SECONDS = 3.5e-7, 0.15, 3e-7
+_POINT_SECONDS, _LATTICE_SECONDS, _PAIR_SECONDS = 3.5e-7, 0.15, 2.5e-8
 # Quadrature points for each square of half a wavelength.
 _POINTS_PER_SQUARE = 4.0
+# Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
+_OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
+# An accuracy called reachable must hold when it is asked for.
+_REACHABLE_MARGIN = 1.3
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -120,22 +127,7 @@ class MeasuredOctave:
         return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class OctaveSolution:
-    """A norm or distance with a measured tail.
-
-    Attributes:
-        estimate: Numbers with their errors, each (orders,).
-        core: The innermost frequencies.
-        octaves: The octaves around them.
-    """
-
-    estimate: NormEstimate
-    core: Core
-    octaves: tuple[MeasuredOctave, ...]
-
-
-def solve_in_octaves(problem: Problem, seed: int = 0) -> OctaveSolution:
+def solve_in_octaves(problem: Problem, seed: int) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     Args:
@@ -143,18 +135,20 @@ def solve_in_octaves(problem: Problem, seed: int = 0) -> OctaveSolution:
         seed: Seed of the random frequencies. The same seed gives the same result.
 
     Returns:
-        The solution of the first of a few rounds that meets the accuracy, or of the last.
+        The solution of the first of a few rounds that meets the accuracy.
 
     Raises:
-        AccuracyError: The accuracy lies below the rounding of fields.
+        AccuracyError: The accuracy lies below the rounding of fields, or would take too many samples.
     """
     search = _Search.begin(problem, seed)
     for _ in range(_ROUNDS):
         search.measure_outwards()
         solution = search.solution()
-        if np.all(problem.accuracy.met(solution.estimate)) or not search.refine():
+        if np.all(problem.accuracy.met(solution.estimate)):
+            return solution
+        if not search.refine():
             break
-    return solution
+    raise _out_of_reach(problem, solution.estimate)
 
 
 class _Search:
@@ -166,6 +160,7 @@ class _Search:
         self.cutoff = cutoff
         self.rng = rng
         self.octaves: list[MeasuredOctave] = []
+        self.seconds = 0.0
         self.normals = FaceNormals.of(problem.surfaces)
         self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
 
@@ -198,13 +193,12 @@ class _Search:
                 break
             self.octaves.append(self._measured(self._first_sampling(octave)))
 
-    def solution(self) -> OctaveSolution:
+    def solution(self) -> Solution:
         """Return the numbers by what has been measured so far."""
         orders = self.problem.orders
         squares, changes = self.squares, np.zeros(len(orders))
         if self.octaves:
-            last = self.octaves[-1]
-            rest, changes = beyond(last.sampling.octave, last.sums, self.limit, orders)
+            rest, changes = self._beyond()
             squares = squares + rest
         errors = np.sqrt(
             self.core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
@@ -216,7 +210,8 @@ class _Search:
             errors,
             change_of_root(squares, statistical_errors([octave.sums for octave in self.octaves])),
         )
-        return OctaveSolution(found, self.core, tuple(self.octaves))
+        highest = max([self.cutoff, *(octave.sampling.octave.highest for octave in self.octaves)])
+        return Solution(found, self.core.lattice, self.core.fields, len(self.octaves), highest)
 
     def refine(self) -> bool:
         """Take more samples where they are needed most; tell whether any could be taken."""
@@ -236,22 +231,26 @@ class _Search:
         order = int(np.argmax(totals / permitted))
         if totals[order] > permitted[order]:
             each = permitted[order] / len(self.octaves)
-            for number, octave in enumerate(self.octaves):
-                sampling = self._finer_sampling(octave, order, each)
-                if sampling is not None:
-                    self.octaves[number] = self._measured(sampling, octave)
+            finer = {n: self._finer_sampling(octave, order, each) for n, octave in enumerate(self.octaves)}
+            samplings = {n: sampling for n, sampling in finer.items() if sampling is not None}
+            if self.seconds + sum(map(self._seconds, samplings.values())) <= _MOST_SECONDS:
+                for number, sampling in samplings.items():
+                    self.octaves[number] = self._measured(sampling, self.octaves[number])
                     refined = True
         return refined
 
     def _knows_the_rest(self) -> bool:
         if not self.octaves:
             return False
-        last = self.octaves[-1]
-        _, changes = beyond(last.sampling.octave, last.sums, self.limit, self.problem.orders)
-        return bool(np.all(changes <= _LIMIT_FRACTION * self.tail_changes))
+        return bool(np.all(self._beyond()[1] <= _LIMIT_FRACTION * self.tail_changes))
+
+    def _beyond(self) -> tuple[Reals, Reals]:
+        octaves, sums = zip(*((octave.sampling.octave, octave.sums) for octave in self.octaves), strict=True)
+        return beyond(octaves, sums, self.limit, self.problem.orders)
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
+        self.seconds += self._seconds(sampling)
         values = np.sqrt(self.squares)
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
@@ -267,15 +266,21 @@ class _Search:
         """Return the sampling that is predicted to be the cheapest one."""
         energy = self.octaves[-1].sums.energy if self.octaves else self.core.energy
         energy = min(_GROWTH * energy, max(self.limit.value, energy))
-        parts = energy * np.array([window_integral(octave, order) for order in self.problem.orders])
+        orders = self.problem.orders
+        inside = np.array([window_integral(octave, order) for order in orders])
+        outside = np.array([tail_integral(octave.highest, order) for order in orders])
         deviation = _FLAT_DEVIATION if self.normals else _CURVED_DEVIATION
-        permitted = np.sqrt(self.permitted_variances / _USUAL_OCTAVES)
-        count = int(np.clip(np.max(deviation * parts / permitted) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
+        # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
+        own = np.sqrt(self.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
+        further = _LIMIT_FRACTION * self.tail_changes / (_QUANTILE * energy * outside)
+        count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
         lattice_seconds = self._lattice_seconds(octave, _FIRST_M)
-        if self._draws_exactly(octave) and count * self._draw_seconds < lattice_seconds:
-            return OctaveSampling(octave, (), self._drawn(octave, count, _UNIFORM_ALONE))
+        alone = max(count, _FEWEST_FLAT_DRAWS) if self.normals else count
+        alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / self._draw_seconds)))
+        if self._can_draw and alone * self._draw_seconds < lattice_seconds:
+            return OctaveSampling(octave, (), self._drawn(octave, alone, _UNIFORM_ALONE))
         beside = 0
-        if self.normals and self._draws_exactly(octave):
+        if self.normals and self._can_draw:
             affordable = _DRAWS_FRACTION * lattice_seconds / self._draw_seconds
             beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
         lattice = OctaveLattice.random(octave.lowest, octave.highest, _FIRST_M, self.rng)
@@ -316,15 +321,37 @@ class _Search:
         points = sum(_points(surface, octave.highest) for surface in self.problem.surfaces)
         return points * _POINT_SECONDS + _LATTICE_SECONDS * (intervals / _FIRST_M) ** 3
 
-    def _draws_exactly(self, octave: Octave) -> bool:
-        """Tell whether all surfaces have exact values at single frequencies of an octave."""
-        smooth = [surface for surface in self.problem.surfaces if isinstance(surface, Smooth)]
-        return all(_points(surface, octave.highest) < _MOST_SMOOTH_NODES / 16 for surface in smooth)
+    def _seconds(self, sampling: OctaveSampling) -> float:
+        """Predict the processor time of all samples of an octave."""
+        lattices = sum(self._lattice_seconds(sampling.octave, lattice.M) for lattice in sampling.lattices)
+        return lattices + len(sampling.drawn) * self._draw_seconds
+
+    @property
+    def _can_draw(self) -> bool:
+        """Tell whether single frequencies are cheaper than whole lattices; sums over many nodes are not."""
+        return not any(isinstance(surface, Smooth) for surface in self.problem.surfaces)
 
     def _resolvable_frequency(self) -> float:
         """Return the frequency up to which all surfaces can be transformed."""
         smooth = [surface.area for surface in self.problem.surfaces if isinstance(surface, Smooth)]
         return float((_MOST_SMOOTH_NODES / (4 * _POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
+
+
+def _out_of_reach(problem: Problem, found: NormEstimate) -> AccuracyError:
+    """Return the error that says what can be reached."""
+    relative = found.errors / found.values
+    worst = int(np.argmax(relative))
+    order, rtol = problem.orders[worst], problem.accuracy.rtol
+    reachable = rounded_up(_REACHABLE_MARGIN * float(relative[worst]))
+    advice = f"about {reachable:g} can be reached; ask for that, or take a more negative order"
+    if reachable >= 1:
+        advice = "not even one digit can be reached; take a more negative order"
+    return AccuracyError(
+        f"{problem.label}: rtol {rtol:g} is out of reach at order {order:g} with as many frequencies as can be "
+        f"sampled in some minutes; {advice}",
+        rtol,
+        reachable,
+    )
 
 
 def _points(surface: Surface, frequency: float) -> float:

@@ -13,9 +13,9 @@ from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
-from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.errors.budget import NormEstimate, Support
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
-from sobolev_batch.spectral.fields import USUAL_DEGREE
+from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.extent import Extent
@@ -128,3 +128,22 @@ def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
     x, y, z = ((lowest + highest) / 2).tolist()
     move = Similarity(1.0, (x, y, z))
     return [move.apply(surface) for surface in surfaces]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Norms or distances, and how they were computed.
+
+    Attributes:
+        estimate: Numbers with their errors, each (orders,).
+        lattice: Lattice of the fields.
+        fields: Fields of the surfaces.
+        octaves: Number of octaves that were measured beyond the lattice.
+        highest_frequency: Largest |ξ| that was sampled, in cycles per unit length.
+    """
+
+    estimate: NormEstimate
+    lattice: Lattice
+    fields: tuple[Field, ...]
+    octaves: int
+    highest_frequency: float

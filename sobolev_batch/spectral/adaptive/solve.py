@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, larger_pilot, refined
-from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, error_target
+from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
+from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.budget import Sums, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.errors.samples import Sample, estimate
-from sobolev_batch.spectral.fields import Field, field_for
+from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
@@ -24,27 +25,12 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 Reals = NDArray[np.float64]
 
 _ROUNDS = 4
+# From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.
+_OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
 # The error of a pair is divided evenly between its two fields.
 _PAIR = 2
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Norms or distances on one lattice.
-
-    Attributes:
-        estimate: Numbers with their errors, each (orders,).
-        lattice: Lattice of the fields.
-        fields: Fields of the surfaces.
-        sums: Sums of the difference of the fields.
-    """
-
-    estimate: NormEstimate
-    lattice: Lattice
-    fields: tuple[Field, ...]
-    sums: Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +81,39 @@ class _Step:
     is_pilot: bool
 
 
-def solve(problem: Problem) -> Solution:
+def solve(problem: Problem, seed: int = 0) -> Solution:
     """Compute a norm or a distance to an accuracy.
+
+    Where a small lattice reaches far enough, or the accuracy is high, it is computed on one lattice. Else what lies
+    beyond a small lattice is measured in octaves.
+
+    Args:
+        problem: Surfaces, orders and accuracy.
+        seed: Seed of the random frequencies of octaves.
 
     Returns:
         The solution of the first of a few rounds that meets the accuracy, or of the last.
 
     Raises:
-        AccuracyError: A pilot shows that the accuracy cannot be met within the memory.
+        AccuracyError: The accuracy lies below the rounding of fields, or is out of reach.
     """
     step = _first_step(problem)
+    rtol = problem.accuracy.rtol
+    if step.is_pilot and rtol >= _OCTAVES_FIRST and not _near_duplicates(problem, step.lattice):
+        return solve_in_octaves(problem, seed)
+    try:
+        return _solve_on_lattices(problem, step)
+    except AccuracyError:
+        if rtol < _OCTAVES_AT_ALL:
+            raise
+    return solve_in_octaves(problem, seed)
+
+
+def _near_duplicates(problem: Problem, lattice: Lattice) -> bool:
+    return bool(np.any(estimate(problem.samples(lattice), problem.orders) <= problem.rounding))
+
+
+def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
     values: Reals | None = None
     for rounds_left in reversed(range(_ROUNDS)):
         samples = problem.samples(step.lattice)
@@ -113,12 +122,12 @@ def solve(problem: Problem) -> Solution:
         problem.require_above_rounding(values)
         accuracy = _of_pilot(problem.accuracy) if step.is_pilot else problem.accuracy
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(problem.inexact_count)
-        solution = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
+        solution, sums = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
         values = solution.estimate.values
         near_duplicates = values <= problem.rounding
         if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
             break
-        step = _next_step(problem, step, solution.sums)
+        step = _next_step(problem, step, sums)
     return solution
 
 
@@ -133,10 +142,10 @@ def run_pilot(problem: Problem) -> Pilot:
         samples = problem.samples(step.lattice)
         values = estimate(samples, problem.orders)
         target = error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(_PAIR)
-        solution = _compute(problem, step.lattice, samples, target, "complex128")
+        solution, sums = _compute(problem, step.lattice, samples, target, "complex128")
         values = solution.estimate.values
         problem.require_above_rounding(values)
-        step = _next_step(problem, step, solution.sums)
+        step = _next_step(problem, step, sums)
         if not step.is_pilot:
             break
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
@@ -162,7 +171,7 @@ def _next_step(problem: Problem, step: _Step, sums: Sums) -> _Step:
 
 def _compute(
     problem: Problem, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype
-) -> Solution:
+) -> tuple[Solution, Sums]:
     """Compute the norm or distance on a lattice, from fields with an error within a target."""
     settings, execution = TransformSettings(dtype=dtype), Execution(threads=problem.threads)
     fields = tuple(
@@ -173,7 +182,8 @@ def _compute(
     difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
-    return Solution(estimate_norms(sums, weights, problem.support, errors), lattice, fields, sums)
+    found = estimate_norms(sums, weights, problem.support, errors)
+    return Solution(found, lattice, fields, 0, lattice.xi_max), sums
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:

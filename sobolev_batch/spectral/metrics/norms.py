@@ -46,6 +46,7 @@ def norm(
     lattice: Lattice | None = None,
     rtol: float | None = None,
     memory: float | str | None = None,
+    seed: int = 0,
 ) -> xr.Dataset:
     """Return the Sobolev norm ||a||_s of a surface's area measure, with its error.
 
@@ -56,6 +57,7 @@ def norm(
         lattice: Lattice to transform a surface on. A field brings its own.
         rtol: Largest relative error, in place of a lattice; see `distance`.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
+        seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
 
     Returns:
         Dataset over `order` with `norm`, its `error`, and the three parts of the error: `truncation`
@@ -77,7 +79,7 @@ def norm(
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _to_accuracy("norm", (a,), order, lattice, _accuracy(rtol, memory))
+        return _to_accuracy("norm", (a,), order, lattice, _accuracy(rtol, memory), seed)
     _refuse_memory(memory)
     if isinstance(a, Sphere) and lattice is None:
         values = np.array([sphere_norm(a, s) for s in orders])
@@ -130,6 +132,7 @@ def distance(
     lattice: Lattice | None = None,
     rtol: float | None = None,
     memory: float | str | None = None,
+    seed: int = 0,
 ) -> xr.Dataset:
     """Return the Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
@@ -142,6 +145,7 @@ def distance(
             eps and dtype are then chosen, and chosen again where the error of the result is too large. The
             attributes of the dataset hold the last choice.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
+        seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
 
     Returns:
         Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. With
@@ -162,7 +166,7 @@ def distance(
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _to_accuracy("distance", (a, b), order, lattice, _accuracy(rtol, memory))
+        return _to_accuracy("distance", (a, b), order, lattice, _accuracy(rtol, memory), seed)
     _refuse_memory(memory)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         values = np.array([sphere_distance(a, b, s) for s in orders])
@@ -183,7 +187,7 @@ def _refuse_memory(memory: float | str | None) -> None:
 
 
 def _to_accuracy(
-    name: str, operands: Sequence[Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy
+    name: str, operands: Sequence[Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
 ) -> xr.Dataset:
     """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen."""
     surfaces = [operand for operand in operands if not isinstance(operand, xr.DataArray)]
@@ -191,12 +195,15 @@ def _to_accuracy(
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     for surface in surfaces:
         check_surface(surface)
-    solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1))
+    solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1), seed)
     settings = [field.settings for field in solution.fields]
     attributes = {
         "rtol": accuracy.rtol,
         "xi_max": solution.lattice.xi_max,
         "M": solution.lattice.M,
+        "octaves": solution.octaves,
+        "highest_frequency": solution.highest_frequency,
+        "seed": seed,
         "dtype": settings[0].dtype,
         "eps": [setting.eps for setting in settings],
         "tolerance": [setting.tolerance for setting in settings],

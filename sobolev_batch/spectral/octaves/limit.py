@@ -23,8 +23,9 @@ _TRIANGLES = 2000
 # Surfaces coincide where they are closer than this fraction of their size, and a point is within a triangle if it is
 # outside by no more than this fraction of it.
 _CLOSENESS, _MARGIN = 1e-8, 1e-9
-# The energy may swing beyond its limit by this fraction of its distance from there.
-_OVERSHOOT = 0.3
+# Least ratio of the energy's distances from its limit in neighbouring octaves, and the fraction of the next distance by
+# which the energy may exceed the limit.
+_FASTEST_FALL, _OVERSHOOT = 0.25, 0.3
 
 
 @dataclass(frozen=True)
@@ -61,20 +62,25 @@ class EnergyLimit:
         return cls(max(value, 0.0), variance**0.5)
 
 
-def beyond(octave: Octave, sums: OctaveSums, limit: EnergyLimit, orders: Sequence[float]) -> tuple[Reals, Reals]:
+def beyond(
+    octaves: Sequence[Octave], sums: Sequence[OctaveSums], limit: EnergyLimit, orders: Sequence[float]
+) -> tuple[Reals, Reals]:
     """Return the integrals beyond the last octave (orders,), and how far off they may be.
 
-    The energy there lies between that of the last octave and its limit, which it may exceed a little.
+    The energy there lies between that of the last octave and its limit, which it may exceed a little. The nearer it has
+    come to the limit from one octave to the next, the nearer it comes beyond.
     """
-    low, high = sorted((sums.energy, limit.value))
-    swing = _OVERSHOOT * (high - low)
-    middle = (low + high) / 2
-    error = (high - low) / 2 + swing + 3 * float(np.hypot(sums.energy_deviation, limit.deviation))
-    tails = np.array([_tail_integral(octave.highest, order) for order in orders])
-    return middle * tails, error * tails
+    limit_value, last = limit.value, sums[-1]
+    deficit, before = (limit_value - octave.energy for octave in (last, sums[-2] if len(sums) > 1 else last))
+    # Where the energy happens to cross its limit, it was farther away before.
+    gap = max(abs(deficit), _FASTEST_FALL * abs(before))
+    fall = float(np.clip(abs(deficit / before), _FASTEST_FALL, 1.0)) if before else 1.0
+    tails = np.array([tail_integral(octaves[-1].highest, order) for order in orders])
+    noise = 3 * float(np.hypot(fall * last.energy_deviation, limit.deviation))
+    return (limit_value - fall * deficit / 2) * tails, ((0.5 + _OVERSHOOT) * fall * gap + noise) * tails
 
 
-def _tail_integral(cutoff: float, order: float) -> float:
+def tail_integral(cutoff: float, order: float) -> float:
     """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
 
     def integrand(radius: float) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
 from sobolev_batch.spectral.errors.probe import norms_of_draws
 from sobolev_batch.spectral.errors.samples import exact_transform_of
+from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling, SamplePart
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
@@ -82,7 +83,7 @@ def octave_values(
             continue
         if number == len(sampling.lattices):
             same = known is not None and known.sampling.drawn is sampling.drawn
-            values.append(known.values[-1] if known and same else exact_transform_of(surface, part.frequencies))
+            values.append(known.values[-1] if known and same else _at_frequencies(surface, part.frequencies))
             continue
         values.append(_on_lattice(surface, sampling.lattices[number], target, execution)[part.places])
         if not isinstance(surface, Sphere):
@@ -103,6 +104,14 @@ def _on_lattice(
     return transform_block(surface, lattice, lattice.half, settings, execution).values
 
 
+def _at_frequencies(surface: Surface, frequencies: Reals) -> Complexes:
+    return (
+        sampled_transform(surface, frequencies)
+        if isinstance(surface, Mesh)
+        else exact_transform_of(surface, frequencies)
+    )
+
+
 def _checks(
     surface: Surface, part: SamplePart, values: NDArray[np.complexfloating], orders: Sequence[float], seed: int
 ) -> tuple[Reals, Reals]:
@@ -112,5 +121,5 @@ def _checks(
     by_order = part.weights * [(1 + part.radii**2) ** order for order in orders]
     chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
     chosen = np.random.default_rng(seed).choice(len(chances), count, p=chances)
-    differences = values[chosen] - exact_transform_of(surface, part.frequencies[chosen])
+    differences = values[chosen] - _at_frequencies(surface, part.frequencies[chosen])
     return part.radii[chosen], part.weights[chosen] * np.abs(differences) ** 2 / (count * chances[chosen])

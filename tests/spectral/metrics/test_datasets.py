@@ -53,7 +53,8 @@ def test_closed_forms_have_no_lattice() -> None:
 def test_settings_of_an_accuracy_are_attributes() -> None:
     dataset = distance(icosphere(0), Sphere(), [-5.0], rtol=0.1)
     assert dataset["within"].attrs["long_name"]
-    assert {"kernel", "rtol", "xi_max", "M", "dtype", "eps", "tolerance", "points"} == set(dataset.attrs)
+    chosen = {"kernel", "rtol", "xi_max", "M", "octaves", "highest_frequency", "seed"}
+    assert chosen | {"dtype", "eps", "tolerance", "points"} == set(dataset.attrs)
 
 
 def test_witness_keeps_the_points() -> None:

@@ -1,0 +1,177 @@
+"""Octaves: the partition, random lattices, drawn frequencies, and the sums over them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad
+
+from sobolev_batch import Mesh, Sphere, Torus, icosphere
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget
+from sobolev_batch.spectral.exact.triangles import exact_transform
+from sobolev_batch.spectral.lattice import OctaveLattice
+from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.normals import FaceNormals
+from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
+from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
+from sobolev_batch.spectral.octaves.sums import octave_sums, statistical_errors
+from sobolev_batch.spectral.octaves.values import octave_values
+from sobolev_batch.surfaces.shapes.surface import Surface
+from tests.support.rectangles import Rectangles
+
+Reals = NDArray[np.float64]
+
+OCTAVE = Octave(2.0, 1)
+ORDERS = (-1.0, -2.0)
+BOX = Rectangles.box((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2)).mesh()
+TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
+
+
+def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
+    rng = np.random.default_rng(seed)
+    lattices = [OctaveLattice.random(OCTAVE.lowest, OCTAVE.highest, intervals, rng)] if intervals else []
+    drawn = DrawnFrequencies.random(OCTAVE, draws, FaceNormals.of([surface]), 0.3, rng)
+    return OctaveSampling(OCTAVE, tuple(lattices), drawn)
+
+
+def sphere_integral(order: float) -> float:
+    """∫ window (1+r²)^s |σ^|² over an octave, for the unit sphere."""
+
+    def integrand(r: float) -> float:
+        value = 2 * np.sin(2 * np.pi * r) / r
+        return float(OCTAVE.window(np.array(r)) * (1 + r * r) ** order * value**2 * 4 * np.pi * r * r)
+
+    return float(quad(integrand, OCTAVE.lowest, OCTAVE.highest, limit=200)[0])
+
+
+def test_the_ball_and_its_octaves_are_a_partition_of_one() -> None:
+    radii = np.linspace(0, 60, 2001)
+    octaves = [Octave(5.0, index) for index in range(1, 5)]
+    total = smooth_step(radii, 5.0) + sum(octave.window(radii) for octave in octaves)
+    assert total == pytest.approx(smooth_step(radii, octaves[-1].highest), abs=1e-15)
+    assert (total[radii <= 40] == 1).all()
+    for octave in octaves:
+        assert not octave.window(radii[(radii <= octave.lowest) | (radii >= octave.highest)]).any()
+
+
+@pytest.mark.parametrize("surface", [icosphere(2), Sphere(0.8, (0.1, 0.2, -0.4)), Torus(0.8, 0.3), BOX])
+def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surface) -> None:
+    sampling = sampling_of(surface, 3)
+    values = octave_values(surface, sampling, TARGET)
+    part = next(sampling.parts())
+    chosen = np.random.default_rng(0).integers(len(part.radii), size=20)
+    if isinstance(surface, Mesh):
+        expected = exact_transform(surface, part.frequencies[chosen])
+    else:
+        nodes, weights = surface_nodes(surface)
+        expected = np.asarray(np.exp(-2j * np.pi * part.frequencies[chosen] @ nodes) @ weights, np.complex128)
+    assert np.abs(values.values[0][chosen] - expected).max() < 1e-4 * surface.area
+    assert (values.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
+
+
+def surface_nodes(surface: Surface) -> tuple[Reals, Reals]:
+    """Nodes (3, n) and weights of a sphere or torus, by rules of their angles."""
+    turns = 2 * np.pi * np.arange(200) / 200
+    if isinstance(surface, Torus):
+        u, v = (angles.ravel() for angles in np.meshgrid(turns, turns))
+        ring = 0.8 + 0.3 * np.cos(v)
+        nodes = np.stack([ring * np.cos(u), ring * np.sin(u), 0.3 * np.sin(v)])
+        return nodes, 0.3 * ring * (2 * np.pi / 200) ** 2
+    heights, weights = np.polynomial.legendre.leggauss(100)
+    z, u = (angles.ravel() for angles in np.meshgrid(heights, turns))
+    across = np.sqrt(1 - z**2)
+    nodes = 0.8 * np.stack([across * np.cos(u), across * np.sin(u), z]) + np.array([[0.1], [0.2], [-0.4]])
+    return nodes, 0.64 * np.tile(weights, (200, 1)).ravel() * 2 * np.pi / 200
+
+
+@pytest.mark.parametrize(("intervals", "draws"), [(8, 0), (0, 400), (8, 300)])
+def test_sums_over_an_octave_are_right_within_their_standard_errors(intervals: int, draws: int) -> None:
+    # The lattice is far too coarse for the sphere: every image overlaps the next.
+    expected = np.array([sphere_integral(order) for order in ORDERS])
+    scores = []
+    for seed in range(60):
+        sampling = sampling_of(Sphere(), seed, intervals, draws)
+        values = octave_values(Sphere(), sampling, TARGET)
+        sums = octave_sums(sampling, values.values, ORDERS)
+        scores.append((sums.squares - expected) / np.sqrt(sums.variances))
+    # Without a random shift, or with wrong weights, the mean would be off by several standard errors of a mean.
+    assert np.abs(np.mean(scores, axis=0)).max() < 4 / np.sqrt(60)
+    assert np.mean(np.abs(scores) < 3) > 0.95
+
+
+def test_draws_follow_their_density() -> None:
+    normals = FaceNormals.of([BOX])
+    assert normals.total_share == pytest.approx(1)
+    assert len(normals.shares) == 3
+    rng = np.random.default_rng(0)
+    uniform = rng.normal(size=(200_000, 3))
+    uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
+    radii = np.full(len(uniform), 4.0)
+    density = 4 * np.pi * normals.density(uniform, radii)
+    assert density.mean() == pytest.approx(1, rel=0.02)
+    drawn = normals.draw(radii, rng)
+    assert np.linalg.norm(drawn, axis=1) == pytest.approx(1)
+    for powers in ((2, 0, 0), (0, 0, 8), (0, 2, 2)):
+        moment = np.prod(drawn**powers, axis=1).mean()
+        assert moment == pytest.approx((np.prod(uniform**powers, axis=1) * density).mean(), rel=0.03)
+
+
+def test_curved_surfaces_have_no_normals_to_draw_around() -> None:
+    assert not FaceNormals.of([icosphere(4), Sphere()])
+    assert FaceNormals.of([icosphere(0)])
+
+
+def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
+    octave = Octave(40.0, 1)
+    deviations = []
+    for normals in (FaceNormals.of([BOX]), FaceNormals.of([Sphere()])):
+        drawn = DrawnFrequencies.random(octave, 2000, normals, 0.3, np.random.default_rng(0))
+        sampling = OctaveSampling(octave, (), drawn)
+        sums = octave_sums(sampling, octave_values(BOX, sampling, TARGET).values, ORDERS)
+        deviations.append(sums.energy_deviation / sums.energy)
+    assert deviations[0] < 0.1
+    assert deviations[1] > 3 * deviations[0]
+
+
+def test_known_values_are_not_computed_again() -> None:
+    sampling = sampling_of(BOX, 0)
+    known = octave_values(BOX, sampling, TARGET)
+    more = OctaveSampling(OCTAVE, (*sampling.lattices, *sampling_of(BOX, 1).lattices), sampling.drawn)
+    found = octave_values(BOX, more, TARGET, known=known)
+    assert found.values[0] is known.values[0]
+    assert found.values[-1] is known.values[-1]
+    assert len(found.values) == 3
+    assert len(found.check_radii) == 2 * len(known.check_radii)
+
+
+def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
+    few, many = (
+        octave_sums(sampling, octave_values(BOX, sampling, TARGET).values, ORDERS)
+        for sampling in (sampling_of(BOX, 0, 16, 0), sampling_of(BOX, 0, 0, 2000))
+    )
+    assert (statistical_errors([few]) / np.sqrt(few.variances) > 3.4).all()
+    assert (statistical_errors([many]) / np.sqrt(many.variances) < 2.7).all()
+
+
+# The limit of the energy.
+
+
+def test_the_energy_tends_to_twice_the_area() -> None:
+    other = BOX.vertices @ np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]) + 0.01
+    for surfaces, area in (([BOX], BOX.area), ([BOX, Mesh(other, BOX.triangles)], 2 * BOX.area)):
+        limit = EnergyLimit.of(surfaces, [1, -1][: len(surfaces)])
+        assert limit.value == pytest.approx(2 * area)
+        assert limit.deviation == 0
+
+
+def test_parts_that_coincide_cancel() -> None:
+    assert EnergyLimit.of([BOX, Mesh(BOX.vertices, BOX.triangles)], [1, -1]).value == 0
+    # Moved along x by a quarter of its length: three quarters of the four long faces coincide.
+    moved = Mesh(BOX.vertices + np.array([0.25, 0, 0]), BOX.triangles)
+    limit = EnergyLimit.of([BOX, moved], [1, -1])
+    long_faces = 2 * (1.0 * 0.6 + 1.0 * 0.4)
+    assert limit.value == pytest.approx(2 * (2 * BOX.area - 2 * 0.75 * long_faces), abs=4 * limit.deviation)
+    # Counted twice, an area weighs four times as much.
+    twice = Mesh(np.concatenate([BOX.vertices] * 2), np.concatenate([BOX.triangles, BOX.triangles + len(BOX.vertices)]))
+    assert EnergyLimit.of([twice], [1]).value == pytest.approx(8 * BOX.area)
