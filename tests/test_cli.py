@@ -121,6 +121,13 @@ def test_compare_to_an_accuracy(pair: Path) -> None:
     assert error <= 1e-3 * value
 
 
+@pytest.mark.parametrize(("option", "words"), [("--M", "M must be an even integer"), ("--xi-max", "xi_max must be")])
+def test_zero_is_no_lattice(pair: Path, option: str, words: str) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-4", option, "0", folder=pair)
+    assert done.returncode == 2
+    assert words in done.stderr
+
+
 def test_an_accuracy_out_of_reach_is_wrong_input(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-6", folder=pair)
     assert done.returncode == 2

@@ -46,7 +46,9 @@ def compare_command(
     if rtol is not None and (xi_max is not None or intervals is not None):
         raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
     memory = memory_of(memory, "--memory-gb", None if memory_gb is None else byte_count(1e9 * memory_gb))
-    lattice = None if rtol is not None else Lattice(xi_max or 5.0, intervals or 64)
+    lattice = (
+        None if rtol is not None else Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
+    )
     first, second = read_mesh(a), read_mesh(b)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)

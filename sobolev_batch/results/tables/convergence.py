@@ -115,12 +115,12 @@ def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
 
     Returns:
         Columns order, mesh, family, name, level, status, reason, triangles, edge_length (mean), distance (to the
-        reference), error and its parts truncation, aliasing, discretisation and statistical, relative and relative_error (over the
-        norm of the reference), area_part and shape_part (what a change of total area alone explains of the distance,
-        and the rest: their squares add up to its square), rate (observed order of convergence in the edge length) and
-        rate_error, resolved (the distance exceeds its error), within (the error is as small as the study asks
-        for); where the study asks for [proximity] also hausdorff, chamfer and chamfer_error. Lengths are in
-        the study's unit. Numbers of a mesh that failed are NaN; so are the parts in old stores that lack them. The
+        reference), error and its parts truncation, aliasing, discretisation and statistical, relative and
+        relative_error (over the norm of the reference), area_part and shape_part (what a change of total area alone
+        explains of the distance, and the rest: their squares add up to its square), rate (observed order of convergence
+        in the edge length) and rate_error, resolved (the distance exceeds its error), within (the error is as small as
+        the study asks for); where the study asks for [proximity] also hausdorff, chamfer and chamfer_error. Lengths are
+        in the study's unit. Numbers of a mesh that failed are NaN; so are the parts in old stores that lack them. The
         frame's ``attrs`` have the reference's label and the study's rtol, if it has one.
 
     Raises:

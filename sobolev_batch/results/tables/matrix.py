@@ -98,8 +98,8 @@ def matrix(
     """
     tree = as_tree(store)
     distances = finished_group(tree, "distances", load=False)
-    if values not in _COLUMNS:
-        raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
+    if values not in _columns_of(distances):
+        raise InputError(f"values must be one of {', '.join(_columns_of(distances))}, found {values!r}")
     (order,) = chosen_orders(distances, order)
     frame: pd.DataFrame = distances[values].sel(order=order).transpose("mesh", "other").to_pandas()
     frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
@@ -112,9 +112,15 @@ def matrix_frame(tree: xr.DataTree, order: float) -> pd.DataFrame:
     Columns order, mesh, other, distance, error, truncation, aliasing, discretisation, statistical.
     """
     distances = finished_group(tree, "distances", load=False)
-    chosen = distances[list(_COLUMNS)].sel(order=chosen_orders(distances, order)[0]).load()
+    columns = _columns_of(distances)
+    chosen = distances[columns].sel(order=chosen_orders(distances, order)[0]).load()
     frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
-    return frame[["order", "mesh", "other", *_COLUMNS]]
+    return frame[["order", "mesh", "other", *columns]]
+
+
+def _columns_of(distances: xr.Dataset) -> list[str]:
+    """Return the columns that a store has; those of earlier versions lack some."""
+    return [name for name in _COLUMNS if name in distances]
 
 
 def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:

@@ -41,6 +41,8 @@ _CLEARANCE = 1.001
 # An accuracy called reachable must hold when it is asked for, on a pilot that differs a little.
 _REACHABLE_MARGIN = 1.5
 _STEP = 1.04
+# At this distance the kernel exp(-2πr) is below the smallest double.
+_VANISHED = 120.0
 
 
 def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
@@ -174,8 +176,10 @@ def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
     """Return the period 1/h at which the kernel alone predicts images that are small enough."""
     allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
 
+    farthest = float(widths.max()) + _VANISHED
+
     def suffices(period: float) -> bool:
-        return all(image_weight(1 / period, order, widths) <= allowed for order in orders)
+        return period > farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
 
     return next(filter(suffices, accumulate(repeat(1.01), mul, initial=float(widths.max()))))
 

@@ -187,7 +187,7 @@ class _Search:
 
     def measure_outwards(self) -> None:
         """Add octaves until what lies beyond them is known well enough, or no more can be had."""
-        while len(self.octaves) < _MOST_OCTAVES and not self._knows_the_rest():
+        while len(self.octaves) < _MOST_OCTAVES and self.seconds < _MOST_SECONDS and not self._knows_the_rest():
             octave = Octave(self.cutoff, len(self.octaves) + 1)
             if octave.highest > self._resolvable_frequency():
                 break

@@ -233,7 +233,8 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
     # Above order -3/2 the kernel has no finite peak but the same decay: take the nearest order with one.
     nu = max(-order - 1.5, 0.25)
     # In logarithms, since powers of both signs overflow at low orders; K itself does so at small arguments.
-    arguments = np.maximum(2 * np.pi * distances, 1e-6)
+    # Beyond the upper bound K is zero, and its routine gives up.
+    arguments = np.clip(2 * np.pi * distances, 1e-6, 1e6)
     with np.errstate(over="ignore"):
         logs = nu * np.log(arguments) + np.log(kve(nu, arguments)) - arguments - gammaln(nu) - (nu - 1) * np.log(2)
     # Never exactly zero, so that ratios exist.

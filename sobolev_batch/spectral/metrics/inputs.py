@@ -27,9 +27,12 @@ def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr
 
     Raises:
         LatticeError: The field has other dimensions, or the surface does not fit into the lattice.
-        InputError: The argument is neither a field nor a surface, or a surface comes without a lattice.
+        InputError: The argument is neither a field nor a surface, a field is not complex, or a surface comes without a
+            lattice.
     """
     if isinstance(a, xr.DataArray):
+        if a.dtype.kind != "c":
+            raise InputError(f"a Fourier field has complex values, found {a.dtype}")
         if set(a.dims) != set(AXES):
             raise LatticeError(
                 f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"

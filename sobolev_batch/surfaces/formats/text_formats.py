@@ -34,7 +34,11 @@ def parse_obj(data: bytes) -> Raw:
     vertices: list[list[float]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    for line in decoded_text(data).replace("\\\n", " ").split("\n"):
+    lines = decoded_text(data).replace("\\\n", " ").split("\n")
+    # Without a line end, the last corner may have lost digits: then it seldom has as many slashes as the others.
+    if lines[-1].startswith("f ") and len({word.count("/") for word in lines[-1].split()[1:]}) > 1:
+        raise MeshError("the OBJ file breaks off in its last line")
+    for line in lines:
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -86,7 +90,7 @@ def parse_off(data: bytes) -> Raw:
 
 def decoded_text(data: bytes) -> str:
     """Return the text of a file with line feeds at the ends of its lines."""
-    return data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    return data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _is_count(word: str) -> bool:

@@ -120,6 +120,14 @@ def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
     assert cut.values[0, 2] == 1.0
 
 
+def test_stores_of_earlier_versions_lack_a_column() -> None:
+    frame = matrix_frame(made(3), -4.0)
+    assert "discretisation" in frame
+    assert "statistical" not in frame
+    with pytest.raises(InputError, match="values must be one of distance, error, truncation"):
+        matrix(made(3), -4.0, values="statistical")
+
+
 def test_unknown_orders_and_unfinished_stores() -> None:
     with pytest.raises(InputError, match="no order -3, only -4, -2"):
         matrix_frame(made(3), -3.0)

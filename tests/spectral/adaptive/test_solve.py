@@ -103,6 +103,15 @@ def test_refuses_what_has_no_meaning() -> None:
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
 
 
+@pytest.mark.parametrize("offset", [1e4, 1e8])
+def test_surfaces_far_apart_are_no_endless_search(offset: float) -> None:
+    far = Mesh(BOX.vertices + offset, BOX.triangles)
+    expected = np.sqrt(2) * norm(BOX, -4.0, rtol=1e-3)["norm"].item()
+    assert distance(BOX, far, -4.0, rtol=1e-2)["distance"].item() == pytest.approx(expected, rel=1e-2)
+    with pytest.raises(AccuracyError, match="below the rounding"):
+        distance(BOX, Sphere(), -4.0, rtol=1e-300)
+
+
 def test_memory_as_text() -> None:
     as_text, as_number = (distance(BOX, Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8))
     assert as_text.identical(as_number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import re
 from collections.abc import Callable
@@ -44,6 +45,14 @@ def test_every_format_gives_the_box(read: Read, name: str, zipped: bool) -> None
 def test_only_the_last_endings_of_a_name_matter(read: Read, ending: str) -> None:
     content = off(BOX_VERTICES, BOX_TRIANGLES)
     assert read(ending, gzip.compress(content) if ending.endswith("GZ") else content).area == BOX_AREA
+
+
+@pytest.mark.parametrize(
+    ("ending", "content"),
+    [(".obj", obj(BOX_VERTICES, BOX_TRIANGLES)), (".off", off(BOX_VERTICES, BOX_TRIANGLES))],
+)
+def test_a_byte_order_mark_is_no_part_of_the_text(read: Read, ending: str, content: bytes) -> None:
+    assert soup(read(ending, codecs.BOM_UTF8 + content)) == soup(box())
 
 
 def test_a_path_may_be_text(tmp_path: Path) -> None:

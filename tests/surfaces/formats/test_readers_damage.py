@@ -155,6 +155,7 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "obj, a coordinate in Python's spelling": (".obj", changed(OBJ_BOX, b"v 0.0 2.0 4.0\n", b"v 0.0 2_0 4.0\n"), ""),
     "obj, an index in Python's spelling": (".obj", OBJ_BOX + b"f 1 2 0_3\n", "index"),
     "obj, two coordinates": (".obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", ""),
+    "obj, cut in a corner": (".obj", OBJ_BOX + b"f 1//2 2//3 8", "breaks off in its last line"),
     "obj, no faces": (".obj", without_faces(OBJ_BOX), "no faces|no triangles"),
     "obj, no vertices": (".obj", b"f 1 2 3\n", ""),
     "obj, cut in a face": (".obj", OBJ_BOX[:-3], "face 12 has 2 vertices"),
