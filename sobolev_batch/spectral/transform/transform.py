@@ -78,6 +78,8 @@ def transform_block(
         InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
             the surface is of an unknown kind.
     """
+    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere):
+        require_inside(surface, lattice)
     return _transform(surface, _Target(lattice, block, settings, execution, plan))
 
 
@@ -129,8 +131,6 @@ def _(surface: Sphere, target: _Target) -> Transformed:
 @_transform.register(Smooth)
 def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
     lattice, execution = target.lattice, target.execution
-    if isinstance(lattice, Lattice):
-        require_inside(surface, lattice)
     plan = target.plan or target.settings.plan(surface, lattice)
     low, high = surface.bounds
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))

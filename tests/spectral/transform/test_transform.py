@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import InputError, Lattice, LatticeError, Mesh, fourier_transform, icosphere
+from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.exact.triangles import exact_transform
@@ -226,4 +226,6 @@ def test_refuses_meshes_that_would_fold() -> None:
     lattice = Lattice(5.0, 16)  # half period 0.8
     with pytest.raises(LatticeError, match=r"\|coordinate\| = 1, .* < 1/\(2h\) = 0.8; take M >= 22"):
         fourier_transform(icosphere(1), lattice)
+    with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 1, "):
+        fourier_transform(Sphere(), lattice)
     fourier_transform(icosphere(1), Lattice(5.0, 22))
