@@ -42,8 +42,8 @@ def test_understated_errors_are_called_uncovered(sample: Tally) -> None:
     assert not any(replace(verdict, reported=0.5 * verdict.true_error).covered for verdict in telling)
     assert not any(replace(verdict, reported=float("nan")).covered for verdict in sample.verdicts)
     # Nor would a tenth of the errors do for the sample as a whole.
-    tenth = Tally(tuple(replace(verdict, reported=verdict.reported / 10) for verdict in sample.verdicts))
-    assert tenth.covered < 0.5 * len(sample.verdicts)
+    tenth = Tally(tuple(replace(verdict, reported=verdict.reported / 10) for verdict in telling))
+    assert tenth.covered < 0.5 * len(telling)
     assert tenth.worst is not None
 
 
