@@ -14,7 +14,7 @@ STUDY = """
 name = "soak"
 [lattice]
 xi_max = 2.0
-M = 8
+M = 10
 [norm]
 orders = [-4.0, -2.0]
 pairs = "reference"
