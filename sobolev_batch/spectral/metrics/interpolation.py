@@ -165,7 +165,7 @@ def full_lattice(field: xr.DataArray) -> xr.DataArray:
         LatticeError: The argument is not the half of a lattice.
 
     >>> from sobolev_batch import Lattice, Sphere, fourier_transform
-    >>> full_lattice(fourier_transform(Sphere(), Lattice(3.0, 8))).shape
+    >>> full_lattice(fourier_transform(Sphere(), Lattice(1.0, 8))).shape
     (9, 9, 9)
     """
     Lattice.of(field)
