@@ -48,8 +48,8 @@ def test_spheres_against_their_closed_form(order: float) -> None:
 def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> None:
     pair = icosphere(1), icosphere(2)
     first, again, other = (distance(*pair, -1.0, rtol=0.05, seed=seed) for seed in (1, 1, 2))
-    # Sums of several threads round differently.
-    assert first["distance"].item() == pytest.approx(again["distance"].item(), rel=1e-10)
+    # Sums of several threads round differently, here in single precision.
+    assert first["distance"].item() == pytest.approx(again["distance"].item(), rel=1e-5)
     assert first["distance"].item() != other["distance"].item()
     assert abs(first["distance"] - other["distance"]) <= first["error"] + other["error"]
     assert first["statistical"].item() > 0
