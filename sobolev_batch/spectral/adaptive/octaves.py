@@ -222,9 +222,7 @@ class _Search:
             lattice = self.core.lattice
             larger = 2 * round(0.575 * lattice.M)
             if larger <= accuracy.largest_intervals:
-                self.core = Core.of(
-                    self.problem, Lattice(larger * lattice.spacing * lattice.M / larger / 2, larger), self.cutoff
-                )
+                self.core = Core.of(self.problem, Lattice(lattice.xi_max, larger), self.cutoff)
                 refined = True
         permitted = self.permitted_variances
         totals = np.sum([octave.sums.variances for octave in self.octaves], axis=0)

@@ -29,7 +29,8 @@ class OctaveSums:
         drawn_variances: Variance of their part from drawn frequencies (orders,).
         energy: Mean of ∫_{|ξ|=r} |field|² dS over the octave.
         energy_deviation: Standard error of the energy.
-        degrees_of_freedom: Degrees of freedom of the variances.
+        lattice_degrees: Degrees of freedom of the lattices' variances.
+        drawn_degrees: Degrees of freedom of the draws' variances.
     """
 
     squares: Reals
@@ -37,7 +38,8 @@ class OctaveSums:
     drawn_variances: Reals
     energy: float
     energy_deviation: float
-    degrees_of_freedom: float
+    lattice_degrees: int
+    drawn_degrees: int
 
     @property
     def variances(self) -> Reals:
@@ -52,7 +54,7 @@ def octave_sums(
     # The last row is the energy.
     exponents = [*orders, None]
     sums, variances = np.zeros(len(exponents)), np.zeros((2, len(exponents)))
-    degrees = 0.0
+    degrees = [0, 0]
     for number, (part, field) in enumerate(zip(sampling.parts(), values, strict=True)):
         if not len(field):
             continue
@@ -66,10 +68,10 @@ def octave_sums(
             sums[i] += by_group.sum()
             # A single sample may stand for others like it that were not met.
             variances[int(drawn), i] += groups * by_group.var(ddof=1) + terms.max() ** 2
-        degrees += groups - 1
+        degrees[int(drawn)] += groups - 1
     width = window_integral(sampling.octave, 0.0)
     deviation = float(np.sqrt(variances[:, -1].sum())) / width
-    return OctaveSums(sums[:-1], variances[0, :-1], variances[1, :-1], float(sums[-1]) / width, deviation, degrees)
+    return OctaveSums(sums[:-1], variances[0, :-1], variances[1, :-1], float(sums[-1]) / width, deviation, *degrees)
 
 
 def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
@@ -77,8 +79,16 @@ def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
 
     It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).
     """
-    variances = np.array([octave.variances for octave in octaves])
-    degrees = np.array([octave.degrees_of_freedom for octave in octaves])
+    parts = [
+        part
+        for octave in octaves
+        for part in (
+            (octave.lattice_variances, octave.lattice_degrees),
+            (octave.drawn_variances, octave.drawn_degrees),
+        )
+    ]
+    # Few sublattices stay few beside many draws.
+    variances, degrees = np.array([variance for variance, _ in parts]), np.array([count for _, count in parts])
     total = variances.sum(axis=0)
     tiny = np.finfo(np.float64).tiny
     effective = total**2 / np.maximum(np.sum(variances**2 / np.maximum(degrees, 1)[:, None], axis=0), tiny)
