@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from sobolev_batch.errors import OrderError
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -18,6 +19,10 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
 _LOWEST_ORDER = -100.0
+# The smooth step falls from one to zero between this fraction of the cutoff and the cutoff.
+STEP_START = 0.5
+# At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
+_STEEPNESS = 3.0
 
 
 @dataclass(frozen=True)
@@ -27,20 +32,34 @@ class SobolevWeights:
     Attributes:
         lattice: Lattice of ξ, in cycles per unit length.
         orders: Orders s.
+        cutoff: Radius |ξ| at which a `smooth_step` ends that the weights are multiplied by; None for none.
     """
 
     lattice: Lattice
     orders: tuple[float, ...]
+    cutoff: float | None = None
 
     @cached_property
     def per_shell(self) -> Reals:
         """Weight of each shell |k|² for each order, float64 (orders, lattice.shell_count)."""
-        squares = 1 + self.lattice.spacing**2 * np.arange(self.lattice.shell_count, dtype=np.float64)
-        return np.stack([squares**s for s in self.orders])
+        squares = self.lattice.spacing**2 * np.arange(self.lattice.shell_count, dtype=np.float64)
+        step = 1.0 if self.cutoff is None else smooth_step(np.sqrt(squares), self.cutoff)
+        return np.stack([(1 + squares) ** s * step for s in self.orders])
 
     def __getstate__(self) -> dict[str, Any]:
         # Tasks carry these weights: it is cheaper to compute them again than to send them.
-        return {"lattice": self.lattice, "orders": self.orders}
+        return {"lattice": self.lattice, "orders": self.orders, "cutoff": self.cutoff}
+
+
+def smooth_step(radii: Reals, cutoff: float) -> Reals:
+    """Return a smooth function of |ξ| that is 1 up to half the cutoff and 0 from the cutoff on.
+
+    Where a sharp cut would spoil it, the trapezoidal rule stays spectrally accurate.
+    """
+    middle, width = (1 + STEP_START) / 2, (1 - STEP_START) / 2
+    fractions = np.asarray(radii, dtype=np.float64) / cutoff
+    steps = 0.5 * erfc(_STEEPNESS * (fractions - middle) / width)
+    return np.where(fractions <= STEP_START, 1.0, np.where(fractions >= 1, 0.0, steps))
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:

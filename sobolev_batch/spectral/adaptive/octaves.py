@@ -16,12 +16,13 @@ from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_o
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond, tail_integral
+from sobolev_batch.spectral.octaves.limit import EnergyLimit, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
+from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, octave_sums, statistical_errors, window_integral
-from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, window_integral
+from sobolev_batch.spectral.octaves.tail import Tail
+from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -39,7 +40,7 @@ _USUAL_OCTAVES, _QUANTILE = 6, 2.9
 # Samples along an axis of the first lattice of an octave, and of the largest one.
 _FIRST_M, _LARGEST_M = 64, 192
 # Draws of an octave: the fewest, the most, and the time that draws may take beside a lattice, as a fraction of its.
-_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 64, 1_000_000, 0.5
+_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 256, 1_000_000, 0.5
 # The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
 _FEWEST_FLAT_DRAWS = 20_000
 # Uniform directions among the draws, beside a lattice and without one.
@@ -70,7 +71,7 @@ class Core:
         squares: Squared norm of their difference under the step for each order (orders,).
         images: Bound on the change of the squares by the lattice's spacing (orders,).
         errors: Norms of the fields' own errors (orders,).
-        energy: Energy ∫_{|ξ|=r} |field|² dS in the outer range of the lattice.
+        energies: Energy ∫_{|ξ|=r} |field|² dS in the last two octaves below ξ_max.
     """
 
     lattice: Lattice
@@ -78,7 +79,7 @@ class Core:
     squares: Reals
     images: Reals
     errors: Reals
-    energy: float
+    energies: tuple[float, ...]
 
     @classmethod
     def of(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
@@ -95,14 +96,13 @@ class Core:
             field_for(surface, lattice, target, settings, Execution(threads=problem.threads), sample=sample)
             for surface, sample in zip(problem.surfaces, samples, strict=True)
         )
-        weights = SobolevWeights(lattice, problem.orders)
-        sums = shell_sums(_difference([one.values for one in fields]), None, lattice, lattice.half)
-        step = smooth_step(lattice.spacing * np.sqrt(np.arange(lattice.shell_count)), cutoff)
-        stepped = sums_of_shells(step * sums, weights)
+        weights = SobolevWeights(lattice, problem.orders, cutoff)
+        sums = sums_of_shells(
+            shell_sums(_difference([one.values for one in fields]), None, lattice, lattice.half), weights
+        )
         errors = np.sum([one.quality.probe.norms(weights) for one in fields], axis=0)
-        images = aliased(stepped, weights, problem.support.widths)
-        energy = float(sums_of_shells(sums, weights).outer[1])
-        return cls(lattice, fields, np.maximum(stepped.totals, 0.0), images, errors, energy)
+        images = aliased(sums, weights, problem.support.widths)
+        return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, tuple(sums.outer.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class MeasuredOctave:
     @property
     def sampling(self) -> OctaveSampling:
         """Samples of the octave, common to all surfaces."""
-        return self.values[0].sampling
+        return self.values[0].octave.sampling
 
     def error_norms(self, orders: Sequence[float]) -> Reals:
         """Return the norms of the values' own errors (orders,), those of all surfaces added."""
@@ -171,8 +171,9 @@ class _Search:
 
     @property
     def squares(self) -> Reals:
-        """Squared norms of all that has been measured (orders,)."""
-        return np.asarray(self.core.squares + sum(octave.sums.squares for octave in self.octaves))
+        """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
+        tail = self._tail()
+        return np.asarray(self.core.squares + tail.octaves + np.maximum(tail.beyond - tail.uncertainty, 0.0))
 
     @property
     def tail_changes(self) -> Reals:
@@ -195,23 +196,11 @@ class _Search:
 
     def solution(self) -> Solution:
         """Return the numbers by what has been measured so far."""
-        orders = self.problem.orders
-        squares, changes = self.squares, np.zeros(len(orders))
-        if self.octaves:
-            rest, changes = self._beyond()
-            squares = squares + rest
-        errors = np.sqrt(
-            self.core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
-        )
-        found = NormEstimate(
-            np.sqrt(squares),
-            change_of_root(squares, changes),
-            change_of_root(squares, self.core.images),
-            errors,
-            change_of_root(squares, statistical_errors([octave.sums for octave in self.octaves])),
-        )
-        highest = max([self.cutoff, *(octave.sampling.octave.highest for octave in self.octaves)])
-        return Solution(found, self.core.lattice, self.core.fields, len(self.octaves), highest)
+        core, orders = self.core, self.problem.orders
+        squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
+        found = self._tail().estimate(core.squares, core.images, np.sqrt(squares))
+        samplings = tuple(octave.sampling for octave in self.octaves)
+        return Solution(found, core.lattice, core.fields, samplings)
 
     def refine(self) -> bool:
         """Take more samples where they are needed most; tell whether any could be taken."""
@@ -240,11 +229,12 @@ class _Search:
     def _knows_the_rest(self) -> bool:
         if not self.octaves:
             return False
-        return bool(np.all(self._beyond()[1] <= _LIMIT_FRACTION * self.tail_changes))
+        return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
 
-    def _beyond(self) -> tuple[Reals, Reals]:
-        octaves, sums = zip(*((octave.sampling.octave, octave.sums) for octave in self.octaves), strict=True)
-        return beyond(octaves, sums, self.limit, self.problem.orders)
+    def _tail(self) -> Tail:
+        octaves = [octave.sampling.octave for octave in self.octaves]
+        sums = [octave.sums for octave in self.octaves]
+        return Tail.of(octaves, sums, self.limit, self.problem.orders, self.core.energies)
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
@@ -252,17 +242,20 @@ class _Search:
         values = np.sqrt(self.squares)
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
-        execution = Execution(threads=problem.threads)
+        settings, execution = settings_for(target), Execution(threads=problem.threads)
+        octave = SampledOctave.of(sampling)
         found = tuple(
-            octave_values(surface, sampling, target, execution, known.values[number] if known else None)
+            octave_values(
+                surface, octave, problem.orders, settings, execution, known=known.values[number] if known else None
+            )
             for number, surface in enumerate(problem.surfaces)
         )
-        differences = [_difference(parts) for parts in zip(*(one.values for one in found), strict=True)]
-        return MeasuredOctave(found, octave_sums(sampling, differences, problem.orders))
+        squares = squared_moduli(_difference([one.values for one in found]))
+        return MeasuredOctave(found, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
 
     def _first_sampling(self, octave: Octave) -> OctaveSampling:
         """Return the sampling that is predicted to be the cheapest one."""
-        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energy
+        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
         energy = min(_GROWTH * energy, max(self.limit.value, energy))
         orders = self.problem.orders
         inside = np.array([window_integral(octave, order) for order in orders])
@@ -308,7 +301,8 @@ class _Search:
         return OctaveLattice.random(octave.lowest, octave.highest, intervals, self.rng)
 
     def _drawn(self, octave: Octave, count: int, uniform_fraction: float) -> DrawnFrequencies:
-        return DrawnFrequencies.random(octave, count, self.normals, uniform_fraction, self.rng)
+        seed = int(self.rng.integers(2**53))
+        return DrawnFrequencies(octave, count, seed, self.normals, uniform_fraction)
 
     @property
     def _draw_seconds(self) -> float:

@@ -17,6 +17,7 @@ from sobolev_batch.spectral.errors.budget import NormEstimate, Support
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -138,12 +139,15 @@ class Solution:
         estimate: Numbers with their errors, each (orders,).
         lattice: Lattice of the fields.
         fields: Fields of the surfaces.
-        octaves: Number of octaves that were measured beyond the lattice.
-        highest_frequency: Largest |ξ| that was sampled, in cycles per unit length.
+        octaves: Octaves that were measured beyond the lattice, as they were sampled.
     """
 
     estimate: NormEstimate
     lattice: Lattice
     fields: tuple[Field, ...]
-    octaves: int
-    highest_frequency: float
+    octaves: tuple[OctaveSampling, ...] = ()
+
+    @property
+    def highest_frequency(self) -> float:
+        """Largest |ξ| that was sampled, in cycles per unit length."""
+        return max([self.lattice.xi_max, *(sampling.octave.highest for sampling in self.octaves)])

@@ -183,7 +183,7 @@ def _compute(
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
     found = estimate_norms(sums, weights, problem.support, errors)
-    return Solution(found, lattice, fields, 0, lattice.xi_max), sums
+    return Solution(found, lattice, fields), sums
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:

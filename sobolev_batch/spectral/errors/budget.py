@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import exprel, gammaln, kve
 
-from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 
@@ -27,8 +26,9 @@ TRUNCATION_CAUTION = 2.5
 ALIASING_CAUTION = 5.0
 # With so many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
 _TROUGH_PERIODS = 3.0
-# Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them.
-_WINDOWS = ((0.5, 0.75), (0.75, 1.0))
+# Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them. Where it is
+# measured beyond xi_max, they are octaves as well.
+_WINDOWS, _OCTAVES = ((0.5, 0.75), (0.75, 1.0)), ((0.25, 0.5), (0.5, 1.0))
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -128,14 +128,15 @@ def sums_of_shells(shell_sums: Reals, weights: SobolevWeights) -> Sums:
     residues = np.arange(weights.lattice.shell_count) % 4
     by_residue = np.stack([weights.per_shell * (residues == residue) for residue in range(4)], axis=1)
     squares = np.tensordot(by_residue, shell_sums, axes=(2, -1))
-    return Sums(squares, np.tensordot(outer_windows(weights.lattice), shell_sums, axes=(1, -1)))
+    return Sums(squares, np.tensordot(outer_windows(weights), shell_sums, axes=(1, -1)))
 
 
-def outer_windows(lattice: Lattice) -> Reals:
+def outer_windows(weights: SobolevWeights) -> Reals:
     """Return the weights (2, shell_count) that turn shell sums into the mean energies of `Sums.outer`."""
+    lattice, ranges = weights.lattice, _WINDOWS if weights.cutoff is None else _OCTAVES
     radii = 2 / lattice.M * np.sqrt(np.arange(lattice.shell_count))
     return np.stack(
-        [((radii >= low) & (radii < high)) / ((high - low) * lattice.xi_max) for low, high in _WINDOWS]
+        [((radii >= low) & (radii < high)) / ((high - low) * lattice.xi_max) for low, high in ranges]
     ).astype(np.float64)
 
 

@@ -74,7 +74,7 @@ class Arrangement:
         """Return the arrangement of a block of the weights' lattice."""
         lattice = weights.lattice
         shells = lattice.shells(block).ravel()
-        windows = outer_windows(lattice)
+        windows = outer_windows(weights)
         kinds = (shells % 4 * 3).astype(np.uint8)
         for i, window in enumerate(windows):
             members = np.flatnonzero(window[shells])

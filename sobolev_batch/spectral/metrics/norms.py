@@ -201,7 +201,7 @@ def _to_accuracy(
         "rtol": accuracy.rtol,
         "xi_max": solution.lattice.xi_max,
         "M": solution.lattice.M,
-        "octaves": solution.octaves,
+        "octaves": len(solution.octaves),
         "highest_frequency": solution.highest_frequency,
         "seed": seed,
         "dtype": settings[0].dtype,

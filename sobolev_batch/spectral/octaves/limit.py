@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import beta, betainc
 
-from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
+from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import OctaveSums
+from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -23,9 +24,15 @@ _TRIANGLES = 2000
 # Surfaces coincide where they are closer than this fraction of their size, and a point is within a triangle if it is
 # outside by no more than this fraction of it.
 _CLOSENESS, _MARGIN = 1e-8, 1e-9
-# Least ratio of the energy's distances from its limit in neighbouring octaves, and the fraction of the next distance by
-# which the energy may exceed the limit.
-_FASTEST_FALL, _OVERSHOOT = 0.25, 0.3
+# A plane is one number, a combination of its normal and offset; those of surfaces that coincide differ by no more.
+_OF_NORMAL, _OF_OFFSET, _PLANE_CLOSENESS = np.array([0.7346, -0.5178, 0.9571]), 0.6294, 3e-8
+# Entries of normals along this direction decide which of two opposite ones is taken.
+_UPWARDS = np.array([0.3, 0.5, 0.81])
+# Octaves in which the energy's distances from its limit must fall regularly; the least ratio of two of them, and the
+# least ratio of two such ratios; the fraction of the next distance by which the energy may exceed the limit.
+_REGULAR, _FASTEST_FALL, _LEAST_STEADINESS, _OVERSHOOT = 3, 0.25, 0.6, 0.4
+# From octave to octave the bound on an irregular distance falls by no more than this.
+_SLOWEST_FALL = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,46 +45,93 @@ class EnergyLimit:
     Attributes:
         value: The limit.
         deviation: Standard error of the limit, from random points.
+        spread: How far the limit may be from the value beyond that; zero where the surfaces were compared.
     """
 
     value: float
-    deviation: float
+    deviation: float = 0.0
+    spread: float = 0.0
+
+    @classmethod
+    def between(cls, lowest: float, highest: float) -> EnergyLimit:
+        """Return a limit of which only bounds are known."""
+        lowest = min(lowest, highest)
+        return cls((lowest + highest) / 2, 0.0, (highest - lowest) / 2)
 
     @classmethod
     def of(cls, surfaces: Sequence[Surface], signs: Sequence[int], seed: int = 0) -> EnergyLimit:
         """Return the limit for the sum of some surfaces' measures, each with a sign."""
         rng = np.random.default_rng(seed)
         meshes = [(surface, sign) for surface, sign in zip(surfaces, signs, strict=True) if isinstance(surface, Mesh)]
-        value = 2 * sum(surface.area for surface in surfaces if not isinstance(surface, Mesh))
-        variance = 0.0
+        value, variance = 2 * sum(surface.area for surface in surfaces), 0.0
         size = max((float(np.ptp(mesh.vertices, axis=0).max()) for mesh, _ in meshes), default=0.0)
-        pairs = sum(len(mesh.triangles) for mesh, _ in meshes) * max(len(meshes), 1)
+        candidates = _in_common_planes([mesh for mesh, _ in meshes], size)
+        shared = [(mesh, sign) for mesh, (_, sign) in zip(candidates, meshes, strict=True) if mesh is not None]
+        pairs = sum(len(mesh.triangles) for mesh, _ in shared) * max(len(shared), 1)
         count = int(np.clip(_PAIRS // max(pairs, 1), _FEWEST_POINTS, _MOST_POINTS))
-        for mesh, sign in meshes:
+        for mesh, sign in shared:
             points = _random_points(mesh, count, rng)
-            multiplicities = sum(other * _covering(points, candidate, _CLOSENESS * size) for candidate, other in meshes)
+            multiplicities = sum(other * _covering(points, candidate, _CLOSENESS * size) for candidate, other in shared)
             terms = sign * np.asarray(multiplicities)
-            value += 2 * mesh.area * float(terms.mean())
+            value += 2 * mesh.area * (float(terms.mean()) - 1)
             variance += (2 * mesh.area) ** 2 * float(terms.var()) / count
         return cls(max(value, 0.0), variance**0.5)
 
 
 def beyond(
-    octaves: Sequence[Octave], sums: Sequence[OctaveSums], limit: EnergyLimit, orders: Sequence[float]
+    octaves: Sequence[Octave],
+    sums: Sequence[OctaveSums],
+    limit: EnergyLimit,
+    orders: Sequence[float],
+    inner: Sequence[float] = (),
 ) -> tuple[Reals, Reals]:
     """Return the integrals beyond the last octave (orders,), and how far off they may be.
 
-    The energy there lies between that of the last octave and its limit, which it may exceed a little. The nearer it has
-    come to the limit from one octave to the next, the nearer it comes beyond.
+    Args:
+        octaves: Octaves that were measured.
+        sums: Integrals over them.
+        limit: Limit of the energy.
+        orders: Orders s.
+        inner: Energies in the last octaves before the measured ones, from the inside out.
     """
-    limit_value, last = limit.value, sums[-1]
-    deficit, before = (limit_value - octave.energy for octave in (last, sums[-2] if len(sums) > 1 else last))
-    # Where the energy happens to cross its limit, it was farther away before.
-    gap = max(abs(deficit), _FASTEST_FALL * abs(before))
-    fall = float(np.clip(abs(deficit / before), _FASTEST_FALL, 1.0)) if before else 1.0
     tails = np.array([tail_integral(octaves[-1].highest, order) for order in orders])
-    noise = 3 * float(np.hypot(fall * last.energy_deviation, limit.deviation))
-    return (limit_value - fall * deficit / 2) * tails, ((0.5 + _OVERSHOOT) * fall * gap + noise) * tails
+    energies = np.array([*inner, *(one.energy for one in sums)])
+    deviations = np.array([*(0.0 for _ in inner), *(one.energy_deviation for one in sums)])
+    mean, uncertain = _approach(limit.value, energies, deviations)
+    return mean * tails, (uncertain + 3 * limit.deviation + limit.spread) * tails
+
+
+def _approach(limit: float, energies: Reals, deviations: Reals) -> tuple[float, float]:
+    """Return the mean energy beyond the last octave, and how far off it may be.
+
+    Where the energy approaches its limit in a regular way, it goes on to do so. Else it may oscillate: between parallel
+    surfaces it swings about the limit until |ξ| is several times the inverse of their distance. Then the larger of its
+    last two distances from the limit bounds the next ones. What was foreseen after an earlier octave holds on if the
+    later ones agree with it.
+    """
+    gaps = limit - energies
+    # Noise does not make a distance.
+    sizes = np.maximum(np.abs(gaps) - 2 * deviations, 0.0)
+    envelope, mean, uncertain = sizes[0], limit, np.inf
+    for last in range(len(gaps)):
+        before, envelope = envelope, max(_SLOWEST_FALL * envelope, sizes[last])
+        fall = _regular_fall(gaps[: last + 1])
+        expected = limit if fall is None else limit - fall * gaps[last] / 2
+        spread = (
+            max(before, envelope) if fall is None else (0.5 + _OVERSHOOT) * fall * gaps[last] + 3 * deviations[last]
+        )
+        if spread <= uncertain or abs(energies[last] - mean) > uncertain + 2 * deviations[last]:
+            mean, uncertain = expected, spread
+    return float(mean), float(uncertain)
+
+
+def _regular_fall(gaps: Reals) -> float | None:
+    """Return the ratio of the energy's last two distances from its limit, or None unless they fall regularly."""
+    if len(gaps) < _REGULAR or not np.all(gaps[-_REGULAR:] > 0):
+        return None
+    falls = gaps[1 - _REGULAR :] / gaps[-_REGULAR:-1]
+    is_regular = falls[-1] >= _FASTEST_FALL and falls[-1] >= _LEAST_STEADINESS * falls[-2]
+    return float(min(falls[-1], 1.0)) if is_regular else None
 
 
 def tail_integral(cutoff: float, order: float) -> float:
@@ -90,6 +144,32 @@ def tail_integral(cutoff: float, order: float) -> float:
     # With q = 1/(1+r²), ∫_R^∞ (1+r²)^s dr is half an incomplete beta integral.
     rest = 0.5 * beta(exponent, 0.5) * betainc(exponent, 0.5, 1 / (1 + cutoff**2))
     return float(rest + quad(integrand, cutoff / 2, cutoff)[0])
+
+
+def _in_common_planes(meshes: Sequence[Mesh], size: float) -> list[Mesh | None]:
+    """Return of each mesh the triangles whose plane is that of another triangle, of any mesh; None for none."""
+    planes = [_planes(mesh, size) for mesh in meshes]
+    together = np.sort(np.concatenate([np.zeros(0), *planes]))
+    chosen = []
+    for mesh, own in zip(meshes, planes, strict=True):
+        first = np.searchsorted(together, own - _PLANE_CLOSENESS, "left")
+        last = np.searchsorted(together, own + _PLANE_CLOSENESS, "right")
+        triangles = mesh.triangles[(last - first > 1) & np.isfinite(own)]
+        has_area = len(triangles) > 0 and Mesh.from_checked(mesh.vertices, triangles).area > 0
+        chosen.append(Mesh.from_checked(mesh.vertices, triangles) if has_area else None)
+    return chosen
+
+
+def _planes(mesh: Mesh, size: float) -> Reals:
+    """Return a number for the plane of each triangle, the same in coinciding planes; NaN without an area."""
+    a, b, c = mesh.corners()
+    normals = np.cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # Either side of a triangle may be its front.
+    normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
+    offsets = np.einsum("ij,ij->i", normals, a) / max(size, np.finfo(np.float64).tiny)
+    return np.asarray(normals @ _OF_NORMAL + _OF_OFFSET * offsets)
 
 
 def _random_points(mesh: Mesh, count: int, rng: np.random.Generator) -> Reals:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import t as students_t
 
 from sobolev_batch.spectral.octaves.partition import Octave
-from sobolev_batch.spectral.octaves.sampling import OctaveSampling
+from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 
 Reals = NDArray[np.float64]
 
@@ -47,31 +48,55 @@ class OctaveSums:
         return self.lattice_variances + self.drawn_variances
 
 
-def octave_sums(
-    sampling: OctaveSampling, values: Sequence[NDArray[np.complexfloating]], orders: Sequence[float]
-) -> OctaveSums:
-    """Integrate |field|² over an octave, from the values of a field at all samples."""
-    # The last row is the energy.
-    exponents = [*orders, None]
-    sums, variances = np.zeros(len(exponents)), np.zeros((2, len(exponents)))
-    degrees = [0, 0]
-    for number, (part, field) in enumerate(zip(sampling.parts(), values, strict=True)):
-        if not len(field):
-            continue
-        squares = part.weights * np.abs(field).astype(np.float64) ** 2
-        drawn = number == len(sampling.lattices)
-        groups = len(field) if drawn else 8
-        lengths = 1 + part.radii**2
-        for i, order in enumerate(exponents):
-            terms = squares if order is None else squares * lengths**order
-            by_group = np.bincount(part.groups, weights=terms, minlength=groups)
-            sums[i] += by_group.sum()
-            # A single sample may stand for others like it that were not met.
-            variances[int(drawn), i] += groups * by_group.var(ddof=1) + terms.max() ** 2
-        degrees[int(drawn)] += groups - 1
-    width = window_integral(sampling.octave, 0.0)
-    deviation = float(np.sqrt(variances[:, -1].sum())) / width
-    return OctaveSums(sums[:-1], variances[0, :-1], variances[1, :-1], float(sums[-1]) / width, deviation, *degrees)
+@dataclass(frozen=True, eq=False)
+class OctaveWeights:
+    """Weights of the samples of an octave for some orders.
+
+    Attributes:
+        quadrature: Samples of the octave.
+        orders: Orders s.
+    """
+
+    quadrature: OctaveQuadrature
+    orders: tuple[float, ...]
+
+    @cached_property
+    def by_order(self) -> Reals:
+        """Weight times (1+|ξ|²)^s for each order, and the weight alone, float64 (orders + 1, n)."""
+        lengths = 1 + self.quadrature.radii**2
+        return np.stack([*(self.quadrature.weights * lengths**order for order in self.orders), self.quadrature.weights])
+
+    @cached_property
+    def width(self) -> float:
+        """Integral of the octave's window over |ξ|."""
+        return window_integral(self.quadrature.octave, 0.0)
+
+    def integrals(self, products: Reals) -> Reals:
+        """Return ∫ window (1+|ξ|²)^s products for each order (orders,), from values at all samples (n,)."""
+        return np.asarray(self.by_order[:-1] @ products)
+
+    def sums(self, squares: Reals) -> OctaveSums:
+        """Return the integrals of |field|² with their variances, from its values at all samples (n,)."""
+        sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), [0, 0]
+        for part in self.quadrature.parts:
+            if part.samples.start == part.samples.stop:
+                continue
+            kind = int(part.is_drawn)
+            for i, weights in enumerate(self.by_order):
+                terms = weights[part.samples] * squares[part.samples]
+                groups = terms if part.starts is None else np.add.reduceat(terms, part.starts)
+                sums[i] += groups.sum()
+                # A single sample may stand for others like it that were not met.
+                variances[kind, i] += len(groups) * groups.var(ddof=1) + terms.max() ** 2
+            degrees[kind] += len(groups) - 1
+        deviation = float(np.sqrt(variances[:, -1].sum())) / self.width
+        energy = float(sums[-1]) / self.width
+        return OctaveSums(sums[:-1], variances[0, :-1], variances[1, :-1], energy, deviation, *degrees)
+
+
+def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
+    """Return |values|² in double precision."""
+    return np.asarray(values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2)
 
 
 def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,8 @@ from sobolev_batch.spectral.errors.probe import norms_of_draws
 from sobolev_batch.spectral.errors.samples import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.octaves.sampling import OctaveSampling, SamplePart
+from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -23,9 +24,46 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
+# Settings of the transform of a surface on a lattice.
+Settings = Callable[[Surface, OctaveLattice], TransformSettings]
+
 # Draws at which the values on a lattice are checked: of a small mesh, of a huge one, and pairs of a triangle and a
 # frequency in between.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
+
+
+@dataclass(frozen=True)
+class SampledOctave:
+    """An octave, how it is sampled, and the samples with their weights."""
+
+    sampling: OctaveSampling
+    quadrature: OctaveQuadrature
+
+    @classmethod
+    def of(cls, sampling: OctaveSampling) -> SampledOctave:
+        """Return an octave with the quadrature of its sampling."""
+        return cls(sampling, OctaveQuadrature.of(sampling))
+
+
+@dataclass(frozen=True, eq=False)
+class Checks:
+    """Comparisons of values on lattices with exact ones, at a few samples.
+
+    Attributes:
+        radii: |ξ| of each comparison, float64 (P,).
+        scales: Factor of its squared error in the squared norm of the error, without the weight of an order,
+            float64 (P,).
+        differences: Computed values less exact ones, complex128 (P,).
+    """
+
+    radii: Reals
+    scales: Reals
+    differences: Complexes
+
+    @property
+    def squares(self) -> Reals:
+        """Contribution of each comparison to the squared norm of the error, without the weight of an order."""
+        return np.asarray(self.scales * np.abs(self.differences) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,75 +71,96 @@ class OctaveValues:
     """The transform of a surface at the samples of an octave.
 
     Attributes:
-        sampling: The samples.
-        values: Values at each part of the sampling, complex (n,) each.
-        check_radii: |ξ| at which the values on lattices were compared with exact ones, float64 (P,).
-        check_squares: Contribution of each comparison to the squared norm of the error, without the weight of an
-            order, float64 (P,).
+        octave: The octave and its samples.
+        values: Values at all samples, complex (n,).
+        checks: Comparisons with exact values.
     """
 
-    sampling: OctaveSampling
-    values: tuple[NDArray[np.complexfloating], ...]
-    check_radii: Reals
-    check_squares: Reals
+    octave: SampledOctave
+    values: NDArray[np.complexfloating]
+    checks: Checks
+
+    def __add__(self, other: OctaveValues) -> OctaveValues:
+        """Return the values of two parts of one surface together."""
+        own = self.checks
+        checks = Checks(own.radii, own.scales, own.differences + other.checks.differences)
+        return OctaveValues(self.octave, self.values + other.values, checks)
 
     def error_norms(self, orders: Sequence[float]) -> Reals:
         """Return the norm of the values' own error for each order (orders,), raised for the small sample."""
-        weights = np.array([(1 + self.check_radii**2) ** order for order in orders])
-        return norms_of_draws(weights * self.check_squares)
+        return norms_of_checks(self.checks.radii, self.checks.squares, orders)
+
+
+def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
+    """Return the norm of an error for each order (orders,) from `Checks`, raised for the small sample."""
+    weights = np.array([(1 + radii**2) ** order for order in orders])
+    return norms_of_draws(weights * squares)
+
+
+def settings_for(target: ErrorTarget) -> Settings:
+    """Return a function that gives the cheapest settings for a target."""
+
+    def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
+        if isinstance(surface, Sphere):
+            return TransformSettings()
+        single = permits_single(surface, lattice, target)
+        chosen = TransformSettings(dtype="complex64" if single else "complex128")
+        return choose_settings(surface, lattice, target, chosen)
+
+    return settings
 
 
 def octave_values(
     surface: Surface,
-    sampling: OctaveSampling,
-    target: ErrorTarget,
+    octave: SampledOctave,
+    orders: Sequence[float],
+    settings: Settings,
     execution: Execution = ON_CPU,
+    *,
     known: OctaveValues | None = None,
+    checks: int | None = None,
 ) -> OctaveValues:
     """Return the transform of a surface at the samples of an octave.
 
     Args:
         surface: Surface in units of length.
-        sampling: Frequencies.
-        target: Largest error of the values on lattices, for the orders that they serve. Drawn values are exact.
+        octave: The octave and its samples.
+        orders: Orders that errors are measured for.
+        settings: Settings of the transforms on lattices. Values at drawn frequencies are exact.
         execution: Backend, threads and memory.
         known: Values at some of the samples: on the first lattices, and maybe at the same drawn frequencies. They are
             not computed again.
+        checks: Number of comparisons with exact values on each lattice; by default as many as the surface allows. Parts
+            of one surface need the same.
 
     Raises:
         InputError: The quadrature of a parametrised surface does not converge.
     """
+    sampling, quadrature = octave.sampling, octave.quadrature
     values: list[NDArray[np.complexfloating]] = []
-    radii: list[Reals] = []
-    squares: list[Reals] = []
-    finished = 0
-    if known is not None:
-        finished = len(known.sampling.lattices)
-        values, radii, squares = list(known.values[:finished]), [known.check_radii], [known.check_squares]
-    for number, part in enumerate(sampling.parts()):
-        if number < finished:
-            continue
-        if number == len(sampling.lattices):
-            same = known is not None and known.sampling.drawn is sampling.drawn
-            values.append(known.values[-1] if known and same else _at_frequencies(surface, part.frequencies))
-            continue
-        values.append(_on_lattice(surface, sampling.lattices[number], target, execution)[part.places])
-        if not isinstance(surface, Sphere):
-            at, contributions = _checks(surface, part, values[-1], target.orders, number)
-            radii.append(at)
-            squares.append(contributions)
-    return OctaveValues(sampling, tuple(values), np.concatenate([[], *radii]), np.concatenate([[], *squares]))
+    finished = 0 if known is None else len(known.octave.sampling.lattices)
+    for number, part in enumerate(quadrature.parts):
+        if known is not None and number < finished:
+            values.append(known.values[known.octave.quadrature.parts[number].samples])
+        elif not part.is_drawn:
+            lattice = sampling.lattices[number]
+            block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
+            values.append(block.ravel()[part.places])
+        elif known is not None and known.octave.sampling.drawn is sampling.drawn:
+            values.append(known.values[known.octave.quadrature.parts[-1].samples])
+        else:
+            values.append(_at_frequencies(surface, quadrature.frequencies[part.samples]))
+    joined = np.concatenate(values)
+    count = check_count(surface) if checks is None else checks
+    return OctaveValues(octave, joined, _compared(surface, quadrature, joined, orders, count))
 
 
-def _on_lattice(
-    surface: Surface, lattice: OctaveLattice, target: ErrorTarget, execution: Execution
-) -> NDArray[np.complexfloating]:
-    settings = TransformSettings()
-    if not isinstance(surface, Sphere):
-        single = permits_single(surface, lattice, target)
-        settings = TransformSettings(dtype="complex64" if single else "complex128")
-        settings = choose_settings(surface, lattice, target, settings)
-    return transform_block(surface, lattice, lattice.half, settings, execution).values
+def check_count(surface: Surface) -> int:
+    """Return the number of comparisons on each lattice: fewer where each costs more; none for closed forms."""
+    if isinstance(surface, Sphere):
+        return 0
+    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 1
+    return int(np.clip(_PAIRS // triangles, _FEWEST_CHECKS, _MOST_CHECKS))
 
 
 def _at_frequencies(surface: Surface, frequencies: Reals) -> Complexes:
@@ -112,14 +171,24 @@ def _at_frequencies(surface: Surface, frequencies: Reals) -> Complexes:
     )
 
 
-def _checks(
-    surface: Surface, part: SamplePart, values: NDArray[np.complexfloating], orders: Sequence[float], seed: int
-) -> tuple[Reals, Reals]:
-    """Compare values on a lattice with exact ones at a few samples, drawn by their weights for all orders."""
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 1
-    count = int(np.clip(_PAIRS // triangles, _FEWEST_CHECKS, _MOST_CHECKS))
-    by_order = part.weights * [(1 + part.radii**2) ** order for order in orders]
-    chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
-    chosen = np.random.default_rng(seed).choice(len(chances), count, p=chances)
-    differences = values[chosen] - _at_frequencies(surface, part.frequencies[chosen])
-    return part.radii[chosen], part.weights[chosen] * np.abs(differences) ** 2 / (count * chances[chosen])
+def _compared(
+    surface: Surface,
+    quadrature: OctaveQuadrature,
+    values: NDArray[np.complexfloating],
+    orders: Sequence[float],
+    count: int,
+) -> Checks:
+    """Compare values on lattices with exact ones at a few samples, drawn by their weights for all orders."""
+    chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for number, part in enumerate(quadrature.parts):
+        if part.is_drawn or not count:
+            continue
+        weights = quadrature.weights[part.samples]
+        by_order = weights * [(1 + quadrature.radii[part.samples] ** 2) ** order for order in orders]
+        chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
+        drawn = np.random.default_rng(number).choice(len(chances), count, p=chances)
+        chosen.append(part.samples.start + drawn)
+        scales.append(weights[drawn] / (count * chances[drawn]))
+    places = np.concatenate(chosen)
+    differences = values[places] - _at_frequencies(surface, quadrature.frequencies[places])
+    return Checks(quadrature.radii[places], np.concatenate(scales), np.asarray(differences, np.complex128))

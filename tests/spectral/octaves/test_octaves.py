@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +16,11 @@ from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.partition import Octave, smooth_step
+from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
-from sobolev_batch.spectral.octaves.sums import octave_sums, statistical_errors
-from sobolev_batch.spectral.octaves.values import octave_values
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
+from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.rectangles import Rectangles
 
@@ -33,8 +35,17 @@ TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
 def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
     rng = np.random.default_rng(seed)
     lattices = [OctaveLattice.random(OCTAVE.lowest, OCTAVE.highest, intervals, rng)] if intervals else []
-    drawn = DrawnFrequencies.random(OCTAVE, draws, FaceNormals.of([surface]), 0.3, rng)
+    drawn = DrawnFrequencies(OCTAVE, draws, seed, FaceNormals.of([surface]), 0.3)
     return OctaveSampling(OCTAVE, tuple(lattices), drawn)
+
+
+def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
+    return octave_values(surface, SampledOctave.of(sampling), ORDERS, settings_for(TARGET), known=known)
+
+
+def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
+    found = values_of(surface, sampling)
+    return OctaveWeights(found.octave.quadrature, ORDERS).sums(squared_moduli(found.values))
 
 
 def sphere_integral(order: float) -> float:
@@ -60,15 +71,16 @@ def test_the_ball_and_its_octaves_are_a_partition_of_one() -> None:
 @pytest.mark.parametrize("surface", [icosphere(2), Sphere(0.8, (0.1, 0.2, -0.4)), Torus(0.8, 0.3), BOX])
 def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surface) -> None:
     sampling = sampling_of(surface, 3)
-    values = octave_values(surface, sampling, TARGET)
-    part = next(sampling.parts())
-    chosen = np.random.default_rng(0).integers(len(part.radii), size=20)
+    values = values_of(surface, sampling)
+    quadrature = values.octave.quadrature
+    chosen = np.random.default_rng(0).integers(quadrature.parts[0].samples.stop, size=20)
+    frequencies = quadrature.frequencies[chosen]
     if isinstance(surface, Mesh):
-        expected = exact_transform(surface, part.frequencies[chosen])
+        expected = exact_transform(surface, frequencies)
     else:
         nodes, weights = surface_nodes(surface)
-        expected = np.asarray(np.exp(-2j * np.pi * part.frequencies[chosen] @ nodes) @ weights, np.complex128)
-    assert np.abs(values.values[0][chosen] - expected).max() < 1e-4 * surface.area
+        expected = np.asarray(np.exp(-2j * np.pi * frequencies @ nodes) @ weights, np.complex128)
+    assert np.abs(values.values[chosen] - expected).max() < 1e-4 * surface.area
     assert (values.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
 
 
@@ -94,8 +106,7 @@ def test_sums_over_an_octave_are_right_within_their_standard_errors(intervals: i
     scores = []
     for seed in range(60):
         sampling = sampling_of(Sphere(), seed, intervals, draws)
-        values = octave_values(Sphere(), sampling, TARGET)
-        sums = octave_sums(sampling, values.values, ORDERS)
+        sums = sums_of(Sphere(), sampling)
         scores.append((sums.squares - expected) / np.sqrt(sums.variances))
     # Without a random shift, or with wrong weights, the mean would be off by several standard errors of a mean.
     assert np.abs(np.mean(scores, axis=0)).max() < 4 / np.sqrt(60)
@@ -128,9 +139,7 @@ def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
     octave = Octave(40.0, 1)
     deviations = []
     for normals in (FaceNormals.of([BOX]), FaceNormals.of([Sphere()])):
-        drawn = DrawnFrequencies.random(octave, 2000, normals, 0.3, np.random.default_rng(0))
-        sampling = OctaveSampling(octave, (), drawn)
-        sums = octave_sums(sampling, octave_values(BOX, sampling, TARGET).values, ORDERS)
+        sums = sums_of(BOX, OctaveSampling(octave, (), DrawnFrequencies(octave, 2000, 0, normals, 0.3)))
         deviations.append(sums.energy_deviation / sums.energy)
     assert deviations[0] < 0.1
     assert deviations[1] > 3 * deviations[0]
@@ -138,20 +147,41 @@ def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
 
 def test_known_values_are_not_computed_again() -> None:
     sampling = sampling_of(BOX, 0)
-    known = octave_values(BOX, sampling, TARGET)
+    known = values_of(BOX, sampling)
+    lattice, drawn = known.octave.quadrature.parts
     more = OctaveSampling(OCTAVE, (*sampling.lattices, *sampling_of(BOX, 1).lattices), sampling.drawn)
-    found = octave_values(BOX, more, TARGET, known=known)
-    assert found.values[0] is known.values[0]
-    assert found.values[-1] is known.values[-1]
-    assert len(found.values) == 3
-    assert len(found.check_radii) == 2 * len(known.check_radii)
+    # What is known is taken as it is, wrong or right.
+    marked = replace(known, values=known.values + 1)
+    found, fresh = values_of(BOX, more, marked), values_of(BOX, more)
+    first, second, last = found.octave.quadrature.parts
+    assert (found.values[first.samples] == marked.values[lattice.samples]).all()
+    assert (found.values[last.samples] == marked.values[drawn.samples]).all()
+    assert found.values[second.samples] == pytest.approx(fresh.values[second.samples], abs=1e-12)
+    assert len(found.checks.radii) == 2 * len(known.checks.radii)
+
+
+def test_parts_of_a_surface_add_up_to_it() -> None:
+    sampling, cut = sampling_of(BOX, 0), len(BOX.triangles) // 2
+    halves = [Mesh(BOX.vertices, BOX.triangles[:cut]), Mesh(BOX.vertices, BOX.triangles[cut:])]
+    octave, settings = SampledOctave.of(sampling), settings_for(TARGET)
+    first, second = (octave_values(half, octave, ORDERS, settings, checks=8) for half in halves)
+    together, whole = first + second, values_of(BOX, sampling)
+    assert np.abs(together.values - whole.values).max() < 1e-4 * BOX.area
+    assert (together.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
+    assert (together.error_norms(ORDERS) > 0).all()
+
+
+def test_a_sampling_is_the_same_after_it_was_stored() -> None:
+    sampling = sampling_of(BOX, 5)
+    table = json.loads(json.dumps(sampling.to_table()))
+    again = SampledOctave.of(OctaveSampling.from_table(OCTAVE, FaceNormals.of([BOX]), table)).quadrature
+    first = SampledOctave.of(sampling).quadrature
+    assert (again.frequencies == first.frequencies).all()
+    assert (again.weights == first.weights).all()
 
 
 def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
-    few, many = (
-        octave_sums(sampling, octave_values(BOX, sampling, TARGET).values, ORDERS)
-        for sampling in (sampling_of(BOX, 0, 16, 0), sampling_of(BOX, 0, 0, 2000))
-    )
+    few, many = (sums_of(BOX, sampling) for sampling in (sampling_of(BOX, 0, 16, 0), sampling_of(BOX, 0, 0, 2000)))
     assert (statistical_errors([few]) / np.sqrt(few.variances) > 3.4).all()
     assert (statistical_errors([many]) / np.sqrt(many.variances) < 2.7).all()
     # Eight sublattices that carry the variance have no more degrees of freedom for many draws beside them.
