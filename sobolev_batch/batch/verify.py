@@ -171,12 +171,16 @@ def _damaged_witnesses(store: Store, complete: Mapping[int, Record]) -> dict[int
 
 def _damage_of(store: Store, row: int, record: Record) -> str:
     """Return the damage of the field of a row; empty where it is sound."""
-    places = store.block_slices()
-    if len(record.checksums) != len(places):
-        return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
-    for place, checksum in zip(places, record.checksums, strict=True):
-        try:
+    places, checksums = store.block_slices(), list(record.checksums)
+    count = len(places) + store.has_octaves
+    if len(checksums) != count:
+        return f"its record knows of {len(checksums)} blocks, and the store has {count}"
+    try:
+        if store.has_octaves:
+            # Behind those of the field.
+            store.read_octaves([row], [checksums.pop()])
+        for place, checksum in zip(places, checksums, strict=True):
             store.read_fields([row], place, [checksum])
-        except DamageError as error:
-            return error.what
+    except DamageError as error:
+        return error.what
     return ""

@@ -18,15 +18,15 @@ from sobolev_batch.batch.analysis.datasets import (
     meshes_dataset,
     norms_dataset,
 )
+from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.metrics.decomposition import Proportion
-from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
@@ -75,10 +75,10 @@ class _Results:
     """The results of a reduction, NaN where there are none.
 
     Attributes:
-        norms: (4, orders, rows), norms and their errors; see `NormEstimate`.
-        to_reference: (4, orders, rows), distances to the reference.
+        norms: (5, orders, rows), norms and their errors; see `NormEstimate`.
+        to_reference: (5, orders, rows), distances to the reference.
         proportions: (3, orders, rows), decomposition of these distances.
-        distances: (4, orders, rows, others), distances of all pairs, or to the reference alone.
+        distances: (5, orders, rows, others), distances of all pairs, or to the reference alone.
     """
 
     norms: Reals
@@ -91,7 +91,7 @@ class _Results:
         """Return the results before any task."""
         orders, rows = len(workspace.plan.study.orders), len(workspace.rows)
         others = rows if workspace.plan.study.pairs == "all" else 1
-        shapes = (4, orders, rows), (4, orders, rows), (3, orders, rows), (4, orders, rows, others)
+        shapes = (5, orders, rows), (5, orders, rows), (3, orders, rows), (5, orders, rows, others)
         return cls(*(np.full(shape, np.nan) for shape in shapes))
 
     def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
@@ -113,21 +113,30 @@ def make_reducer(workspace: Workspace) -> Reducer:
     plan, records, complete = workspace.plan, workspace.records, workspace.complete
     orders, reference = plan.study.orders, workspace.reference
     areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
-    weights, extents = SobolevWeights(plan.lattice, orders), []
+    weights, extents = plan.weights, []
+    tails: dict[int, TailQuality] = {}
     for i, record in complete.items():
         quality = Quality.from_json(record.quality)
-        areas[i], errors[:, i] = quality.area, quality.probe.norms(weights)
+        areas[i], errors[:, i] = quality.area, quality.error_norms(weights)
         extents.append(quality.extent)
+        if quality.tail is not None:
+            tails[i] = quality.tail
+    reference_in_store = reference if reference in complete else None
+    tail_reducer = None
+    if plan.tail is not None:
+        of_tails = {i: record.checksums[-1] for i, record in complete.items()}
+        tail_reducer = TailReducer(workspace.store, plan.tail, orders, reference_in_store, tails, of_tails)
     return Reducer(
         store=workspace.store,
         lattice=plan.lattice,
         blocks=plan.blocks,
         orders=orders,
-        reference=reference if reference in complete else None,
+        reference=reference_in_store,
         areas=areas,
         errors=errors,
         widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
         checksums={i: record.checksums for i, record in complete.items()},
+        tails=tail_reducer,
     )
 
 

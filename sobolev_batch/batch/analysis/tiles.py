@@ -8,11 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, add_sums, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.budget import (
+    NormEstimate,
+    Sums,
+    Support,
+    add_sums,
+    aliased,
+    estimate_norms,
+    sums_of_shells,
+)
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
+from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 
 Reals = NDArray[np.float64]
@@ -41,6 +51,7 @@ class Reducer:
         errors: Norms of the fields' own errors (orders, rows), likewise.
         widths: Widths of all surfaces together (13,), see `Extent`.
         checksums: Checksums of the blocks of each field, by its row.
+        tails: Tails from values in octaves; None where the fields are all there is.
         tile_bytes: Bytes of fields that a task holds at a time, in all: the rows of a tile, a group of the others,
             and fields as they are read.
     """
@@ -54,12 +65,13 @@ class Reducer:
     errors: Reals
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
+    tails: TailReducer | None = None
     tile_bytes: int = 384 << 20
 
     @property
     def weights(self) -> SobolevWeights:
-        """Weights of the orders on the lattice."""
-        return SobolevWeights(self.lattice, self.orders)
+        """Weights of the orders on the lattice, with a step where octaves follow."""
+        return SobolevWeights(self.lattice, self.orders, None if self.tails is None else self.tails.sampling.cutoff)
 
     def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
         """Yield rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
@@ -81,7 +93,8 @@ class Reducer:
     def task_bytes(self) -> float:
         """Memory that a task takes at most, as measured: the fields that it holds, and temporaries."""
         block_bytes = 16.0 * self.blocks[0].size
-        return max(5 * block_bytes, self.tile_bytes + 4 * block_bytes)
+        tail_bytes = 0.0 if self.tails is None else self.tails.task_bytes
+        return max(5 * block_bytes, self.tile_bytes + 4 * block_bytes) + tail_bytes
 
     @property
     def _capacity(self) -> int:
@@ -116,16 +129,55 @@ class Reducer:
                     references = np.broadcast_to(reference, values.shape)
                     products[batch] += shell_sums(values, references, self.lattice, block)
         of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
+        if self.tails is not None:
+            sums = [sums_of_shells(one, self.weights) for one in (own, to_reference, products, of_reference[None])]
+            return self._with_tails(self.tails, rows, sums)
         norms = self._estimate(sums_of_shells(own, self.weights), *of_rows)
         if self.reference is None:
-            unknown = np.full_like(norms.values, np.nan)
-            return norms, NormEstimate(*[unknown] * 4), Proportion(*[unknown] * 3)
+            return norms, *self._unknown(norms)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas = (of_rows[0] + self.areas[self.reference]) * apart
         errors = (of_rows[1] + self.errors[:, [self.reference]]) * apart
         distances = self._estimate(sums_of_shells(to_reference, self.weights), areas, errors)
         return norms, distances, Proportion.of_shells(to_reference, products, of_reference, self.weights)
+
+    def _with_tails(
+        self, tails: TailReducer, rows: Sequence[int], sums: Sequence[Sums]
+    ) -> tuple[NormEstimate, NormEstimate, Proportion]:
+        """Return what `norms` does, from sums of the rows, their differences, products with the reference, and it."""
+        own, to_reference, products, of_reference = sums
+        reference = None if self.reference is None else tails.read(self.reference)
+        of_norms, of_pairs, of_products = [], [], []
+        for i, row in enumerate(rows):
+            values = tails.read(row)
+            of_norms.append(tails.of_norm(row, values, own.outer[:, i]))
+            if reference is None or self.reference is None:
+                continue
+            difference = values - reference
+            of_pairs.append(tails.of_pair(row, self.reference, difference, to_reference.outer[:, i]))
+            of_products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
+        norm_tail = Tail.stacked(of_norms)
+        norms = norm_tail.estimate(own.totals, aliased(own, self.weights, self.widths), self.errors[:, list(rows)])
+        if reference is None or self.reference is None:
+            return norms, *self._unknown(norms)
+        # The reference's distance to itself is zero, and nothing is uncertain about that.
+        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
+        pair_tail = Tail.stacked(of_pairs).scaled(apart)
+        errors = (self.errors[:, list(rows)] + self.errors[:, [self.reference]]) * apart
+        images = aliased(to_reference, self.weights, self.widths) * apart
+        distances = pair_tail.estimate(to_reference.totals, images, errors)
+        own_tail = tails.of_norm(self.reference, reference, of_reference.outer[:, 0])
+        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+        rest = (norm_tail.beyond - own_tail.beyond[:, None] - pair_tail.beyond) / 2 * apart
+        product = products.totals + np.stack(of_products, axis=-1) + rest
+        reference_square = of_reference.totals[:, 0] + own_tail.squares
+        return norms, distances, Proportion.of_totals(distances.values**2, product, reference_square)
+
+    @staticmethod
+    def _unknown(norms: NormEstimate) -> tuple[NormEstimate, Proportion]:
+        unknown = np.full_like(norms.values, np.nan)
+        return NormEstimate(*[unknown] * 5), Proportion(*[unknown] * 3)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances of rows to other rows, over (orders, rows, others).
@@ -151,6 +203,10 @@ class Reducer:
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = (self.areas[list(rows)][:, None] + self.areas[list(others)]) * unequal
         errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal
+        if self.tails is not None:
+            tail = self.tails.of_pairs(rows, others, sums.outer, shared)
+            images = aliased(sums, self.weights, self.widths) * unequal
+            return tail.estimate(sums.totals, images, errors)
         return self._estimate(sums, areas, errors)
 
     def _estimate(self, sums: Sums, areas: Reals, errors: Reals) -> NormEstimate:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
 from sobolev_batch.batch.fields.graph import field_task
-from sobolev_batch.batch.fields.sizing import size_rows
+from sobolev_batch.batch.fields.sizing import reference_in_tasks, size_rows
 from sobolev_batch.batch.fields.tasks import FieldSettings, Job
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Record
@@ -42,12 +42,13 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
     for i in pending:
         if rows[i].label in refused:
             give_up(i, refused[rows[i].label])
-    settings = FieldSettings.of(plan)
+    settings, reference = FieldSettings.of(plan), reference_in_tasks(plan)
 
     def tasks() -> Iterator[Task]:
         for rank, i in enumerate(i for i in pending if rows[i].label in sizes):
             row = rows[i]
-            job = Job(store, i, row, settings, plan.distance_target(row), sizes[row.label].allowed_bytes)
+            allowed_bytes = sizes[row.label].allowed_bytes
+            job = Job(store, i, row, settings, plan.distance_target(row), allowed_bytes, reference)
             yield field_task(job, sizes[row.label], rank)
 
     # A mesh in batches occupies all workers by itself, and its batches the scratch space.

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sobolev_batch.batch.cluster.execution import Task
-from sobolev_batch.batch.fields.large_mesh import add_sums, split_mesh, store_block, transform_batch
+from sobolev_batch.batch.fields.large_mesh import add_sums, octaves_of_batches, split_mesh, store_block, transform_batch
 from sobolev_batch.batch.fields.sizing import TaskSizes
-from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, finish_mesh
+from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, compute_octaves, finish_mesh
 
 
 def field_task(job: Job, sizes: TaskSizes, rank: int = 0) -> Task:
@@ -28,6 +28,8 @@ def field_task(job: Job, sizes: TaskSizes, rank: int = 0) -> Task:
         (blocks,) = sizes.block_groups
         return Task(compute_mesh, (job, blocks), sizes.loading_bytes, needs_gpu, row=job.index)
     groups = [Task(compute_blocks, (job, blocks), sizes.loading_bytes, needs_gpu) for blocks in sizes.block_groups]
+    if job.settings.tail is not None:
+        groups.append(Task(compute_octaves, (job,), sizes.loading_bytes, needs_gpu))
     return Task(finish_mesh, (job, groups), row=job.index)
 
 
@@ -52,6 +54,10 @@ class _Batches:
             total = self._sum(sums, priority + 1)
             arguments = self.job, split, total, block
             stored.append(Task(store_block, arguments, self.sizes.batch_bytes, priority=priority + 1))
+        if self.job.settings.tail is not None:
+            needs_gpu = self.job.settings.backend == "gpu"
+            last = first - 2 * len(blocks) - 1
+            stored.append(Task(octaves_of_batches, (self.job, split), self.sizes.batch_bytes, needs_gpu, priority=last))
         return Task(finish_mesh, (self.job, stored), priority=first, row=self.job.index)
 
     def _transform(self, split: Task, batch: int, block: object, priority: int) -> Task:

@@ -16,17 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.cluster.worker_plugin import worker_backend
-from sobolev_batch.batch.fields.tasks import Job, StoredBlocks, facts_of
+from sobolev_batch.batch.fields.tasks import Job, StoredBlocks, facts_of, finish_octaves
 from sobolev_batch.batch.store.records import Facts
 from sobolev_batch.errors import MeshError, StoreError
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.errors.probe import Draws, Probe, measure
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import draws_for
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+
+# Comparisons of a batch with exact values on each lattice of an octave.
+_OCTAVE_CHECKS = 4
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 
@@ -44,6 +50,7 @@ class SplitMesh:
         quality: Quality of the whole mesh with an empty probe; None where the split failed.
         seconds: Time spent.
         error: Reason why it failed; empty otherwise.
+        octave_target: Largest error of the whole mesh's values in each octave, if an accuracy is asked for.
     """
 
     token: str = ""
@@ -54,6 +61,7 @@ class SplitMesh:
     quality: Quality | None = None
     seconds: float = 0.0
     error: str = ""
+    octave_target: ErrorTarget | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +101,7 @@ def split_mesh(job: Job, count: int) -> SplitMesh:
         transform = job.transform_settings(mesh)
         draws = draws_for([mesh], lattice, job.settings.orders, transform.lowest_degree(mesh, lattice))
         facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe())
+        octave_target = None if job.settings.tail is None else job.octave_target(mesh)
         token, batches = uuid4().hex, set()
         for number, batch in mesh.batches(math.ceil(len(mesh.triangles) / count)):
             job.store.scratch.write(job.index, token, number, batch)
@@ -101,7 +110,8 @@ def split_mesh(job: Job, count: int) -> SplitMesh:
         raise
     except Exception as error:
         return SplitMesh(seconds=time.perf_counter() - started, error=job.failure_reason(error))
-    return SplitMesh(token, frozenset(batches), transform, draws, facts, quality, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    return SplitMesh(token, frozenset(batches), transform, draws, facts, quality, seconds, "", octave_target)
 
 
 def transform_batch(job: Job, split: SplitMesh, number: int, block: Block) -> BlockSum:
@@ -120,6 +130,33 @@ def transform_batch(job: Job, split: SplitMesh, number: int, block: Block) -> Bl
     except Exception as error:
         return BlockSum(seconds=time.perf_counter() - started, error=job.failure_reason(error))
     return BlockSum(result.values, exact, result.points, (result.backend,), time.perf_counter() - started)
+
+
+def octaves_of_batches(job: Job, split: SplitMesh) -> StoredBlocks:
+    """Compute and store the values of a split mesh in octaves, batch after batch."""
+    tail = job.settings.tail
+    if split.error or split.quality is None or tail is None:
+        return StoredBlocks(Facts(), 0.0, split.error or "the study has no octaves")
+    started = time.perf_counter()
+    # The errors of the batches add up.
+    target = None if split.octave_target is None else split.octave_target.tightened(len(split.batches))
+    settings = job.octave_settings(target)
+    totals: list[OctaveValues] = []
+    try:
+        for number in sorted(split.batches):
+            batch = job.store.scratch.read(job.index, split.token, number)
+            values = [
+                octave_values(batch, octave, job.settings.orders, settings, job.execution, checks=_OCTAVE_CHECKS)
+                for octave in tail.sampled
+            ]
+            totals = [one + other for one, other in zip(totals, values, strict=True)] if totals else values
+    except StoreError:
+        raise
+    except Exception as error:
+        return StoredBlocks(Facts(), time.perf_counter() - started, job.failure_reason(error))
+    # Its triangles are taken to coincide with no others: to look that up would take the whole mesh.
+    stored = finish_octaves(job, split.quality, totals, EnergyLimit(2 * split.quality.area), None)
+    return replace(stored, seconds=time.perf_counter() - started)
 
 
 def add_sums(first: BlockSum, second: BlockSum) -> BlockSum:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 
@@ -28,6 +29,8 @@ MESH_BYTES = 100.0
 LEAST_TRANSFORM_BYTES = 256e6
 # For the choice of quadrature rules, for each triangle.
 _CHOICE_BYTES = 100.0
+# Of a sample of octaves: its frequency, weight, place and value, and what makes them.
+_SAMPLE_BYTES = 150.0
 
 
 @dataclass(frozen=True)
@@ -68,18 +71,56 @@ def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[s
     Raises:
         ClusterError: The lattice itself fits into no worker, whatever the mesh.
     """
-    size_tasks(plan.blocks, plan.transform, ExpectedSize(), workers, len(rows))
+    held = _OctaveBytes.of(plan)
+    size_tasks(plan.blocks, plan.transform, ExpectedSize(), workers, len(rows), held)
     sizes, refused = {}, {}
     for row in rows:
+        size = row.member.expected_size()
         try:
-            sizes[row.label] = size_tasks(plan.blocks, plan.transform, row.member.expected_size(), workers, len(rows))
+            sizes[row.label] = size_tasks(plan.blocks, plan.transform, size, workers, len(rows), held)
         except ClusterError as error:
             refused[row.label] = f"the mesh is too large: {error}"
     return sizes, refused
 
 
+def reference_in_tasks(plan: Plan) -> Row | None:
+    """Return the reference as tasks of octaves load it beside their mesh; None without octaves, or if it is huge."""
+    row = next(row for row in plan.rows if row.label == plan.reference)
+    is_small = row.member.expected_size().triangles <= 1.5 * _BATCH_TRIANGLES
+    return row if plan.tail is not None and is_small else None
+
+
+@dataclass(frozen=True)
+class _OctaveBytes:
+    """Memory that the octaves of a plan take in a task.
+
+    Attributes:
+        block: Samples of the largest lattice; None without one.
+        held: Bytes of all samples, their values, and the reference.
+    """
+
+    block: Block | None = None
+    held: float = 0.0
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Return the memory for a plan; none without octaves."""
+        if plan.tail is None:
+            return cls()
+        blocks = [lattice.half for sampling in plan.tail.octaves for lattice in sampling.lattices]
+        reference = reference_in_tasks(plan)
+        triangles = 0 if reference is None else reference.member.expected_size().triangles
+        largest = max(blocks, key=lambda block: block.size, default=None)
+        return cls(largest, _SAMPLE_BYTES * plan.tail.size + MESH_BYTES * triangles)
+
+
 def size_tasks(
-    blocks: Sequence[Block], transform: TransformSettings, size: ExpectedSize, workers: Workers, rows: int
+    blocks: Sequence[Block],
+    transform: TransformSettings,
+    size: ExpectedSize,
+    workers: Workers,
+    rows: int,
+    octaves: _OctaveBytes | None = None,
 ) -> TaskSizes:
     """Fit a row's tasks into the memory of workers.
 
@@ -92,11 +133,13 @@ def size_tasks(
         size: Size of the row's surface.
         workers: Workers of the cluster.
         rows: Number of rows that are to be computed.
+        octaves: Memory that octaves take.
 
     Raises:
         ClusterError: No worker has the memory.
     """
-    block = blocks[0]
+    octaves = octaves or _OctaveBytes()
+    block = max(blocks[0], octaves.block or blocks[0], key=lambda one: one.size)
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
 
     def transform_bytes(triangles: float) -> float:
@@ -104,7 +147,7 @@ def size_tasks(
 
     def held_bytes(triangles: float) -> float:
         # The mesh, the block, and a block that it is added to or compared with.
-        return MESH_BYTES * triangles + 2 * block_bytes
+        return MESH_BYTES * triangles + 2 * block_bytes + octaves.held
 
     def least_bytes(triangles: float) -> float:
         return held_bytes(triangles) + transform_bytes(triangles)

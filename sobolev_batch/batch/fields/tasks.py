@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
 from distributed import get_worker
 
 from sobolev_batch.batch.cluster.worker_plugin import worker_backend
@@ -22,12 +23,15 @@ from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
-from sobolev_batch.spectral.errors.a_priori import choose_settings
-from sobolev_batch.spectral.errors.probe import join
-from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
+from sobolev_batch.spectral.errors.probe import Probe, join
+from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.errors.samples import draws_for, probe_block
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.octaves.values import OctaveValues, Settings, octave_values, settings_for
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -36,6 +40,9 @@ from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 _log = logging.getLogger(__name__)
+
+# Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
+_OCTAVES_SHARE = 5.0
 
 
 @dataclass(frozen=True)
@@ -47,11 +54,12 @@ class FieldSettings:
     orders: tuple[float, ...]
     similarity: Similarity
     backend: Backends = "auto"
+    tail: TailSampling | None = None
 
     @classmethod
     def of(cls, plan: Plan) -> Self:
         """Return the settings of a plan."""
-        return cls(plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend)
+        return cls(plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail)
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,7 @@ class Job:
         settings: Settings of all fields.
         distance_target: Accuracy that the field is computed for, if the study asks for one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
+        reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
     """
 
     store: Store
@@ -73,6 +82,12 @@ class Job:
     settings: FieldSettings
     distance_target: DistanceTarget | None = None
     allowed_bytes: float | None = None
+    reference: Row | None = None
+
+    @property
+    def execution(self) -> Execution:
+        """Execution of the transforms on this worker."""
+        return Execution(worker_backend(self.settings.backend), allowed_bytes=self.allowed_bytes)
 
     def load(self) -> Surface:
         """Load the surface, in the study's unit.
@@ -81,8 +96,19 @@ class Job:
             MeshError: It cannot be loaded, or is not the one that the study was planned with: its field would be
                 recorded under the key of another.
         """
-        surface = self.settings.similarity.apply(self.row.member.load())
-        if self.row.fingerprint and self.row.member.fingerprint_digest() != self.row.fingerprint:
+        return self._loaded(self.row)
+
+    def load_reference(self) -> Surface | None:
+        """Load the reference, in the study's unit; None where it is too large.
+
+        Raises:
+            MeshError: See `load`.
+        """
+        return None if self.reference is None else self._loaded(self.reference)
+
+    def _loaded(self, row: Row) -> Surface:
+        surface = self.settings.similarity.apply(row.member.load())
+        if row.fingerprint and row.member.fingerprint_digest() != row.fingerprint:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
 
@@ -93,6 +119,16 @@ class Job:
         return choose_settings(
             surface, self.settings.lattice, self.distance_target.error_target(surface), self.settings.transform
         )
+
+    def octave_target(self, surface: Surface) -> ErrorTarget | None:
+        """Return the largest error of a surface's values in each octave, if an accuracy is asked for."""
+        target = self.distance_target
+        return None if target is None else target.error_target(surface).tightened(_OCTAVES_SHARE)
+
+    def octave_settings(self, target: ErrorTarget | None) -> Settings:
+        """Return a function that gives the settings of transforms in octaves, for an `octave_target`."""
+        transform = self.settings.transform
+        return settings_for(target, transform.dtype) if target is not None else lambda surface, lattice: transform
 
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
@@ -124,11 +160,22 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     record = job.store.read_record(job.index)
     if record is not None and record.completes(job.row.key):
         return record
-    return finish_mesh(job, [compute_blocks(job, blocks)])
+
+    def compute(surface: Surface) -> list[StoredBlocks]:
+        field = _store_some(job, surface, blocks)
+        return [field] if job.settings.tail is None else [field, store_octaves(job, surface)]
+
+    return finish_mesh(job, _of_loaded(job, compute))
 
 
 def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks:
-    """Compute and store some blocks of a mesh's field.
+    """Compute and store some blocks of a mesh's field; see `compute_octaves`."""
+    (stored,) = _of_loaded(job, lambda surface: [_store_some(job, surface, blocks)])
+    return stored
+
+
+def compute_octaves(job: Job) -> StoredBlocks:
+    """Compute and store a mesh's values in octaves.
 
     A mesh that cannot be loaded or transformed does not raise: the reason is part of the outcome, so
     that one bad mesh stops nothing else.
@@ -136,23 +183,65 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks:
     Raises:
         StoreError: The store cannot be written, which is not the mesh's fault.
     """
+    (stored,) = _of_loaded(job, lambda surface: [store_octaves(job, surface)])
+    return stored
+
+
+def _of_loaded(job: Job, compute: Callable[[Surface], list[StoredBlocks]]) -> list[StoredBlocks]:
+    """Load a mesh and compute something of it; the first outcome has the time, or the reason of a failure."""
     started = time.perf_counter()
     try:
-        surface = job.load()
-        is_whole = tuple(blocks) == (job.settings.lattice.half,)
-        stored = _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
-        facts = facts_of(surface, stored.facts.points)
-        return replace(stored, facts=facts, seconds=time.perf_counter() - started)
+        first, *others = compute(job.load())
     except StoreError:
         raise
     except Exception as error:
-        return StoredBlocks(Facts(), time.perf_counter() - started, job.failure_reason(error))
+        return [StoredBlocks(Facts(), time.perf_counter() - started, job.failure_reason(error))]
+    return [replace(first, seconds=time.perf_counter() - started), *others]
+
+
+def _store_some(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
+    is_whole = tuple(blocks) == (job.settings.lattice.half,)
+    stored = _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
+    return replace(stored, facts=facts_of(surface, stored.facts.points))
+
+
+def store_octaves(job: Job, surface: Surface) -> StoredBlocks:
+    """Compute and store a surface's values at all samples of octaves."""
+    tail = job.settings.tail
+    if tail is None:
+        raise ValueError("the study has no octaves")
+    settings = job.octave_settings(job.octave_target(surface))
+    values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
+    own, reference = EnergyLimit.of([surface], [1]), job.load_reference()
+    difference = None if reference is None else EnergyLimit.of([surface, reference], [1, -1])
+    return finish_octaves(job, Quality.of_surface(surface, Probe()), values, own, difference)
+
+
+def finish_octaves(
+    job: Job, quality: Quality, values: Sequence[OctaveValues], own: EnergyLimit, difference: EnergyLimit | None
+) -> StoredBlocks:
+    """Store values in octaves, and return what errors follow from.
+
+    Args:
+        job: The row.
+        quality: Quality of the surface with an empty probe.
+        values: Values in each octave.
+        own: Limit of the surface's energy.
+        difference: Limit of the energy of its difference from the reference, if known.
+    """
+    checksum = job.store.write_octaves(job.index, np.concatenate([one.values for one in values]))
+    tail = TailQuality(
+        tuple(float(radius) for one in values for radius in one.checks.radii),
+        tuple(float(square) for one in values for square in one.checks.squares),
+        (own.value, own.deviation),
+        None if difference is None else (difference.value, difference.deviation),
+    )
+    return StoredBlocks(Facts(), 0.0, "", replace(quality, tail=tail), (checksum,))
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
     """Compute and store a field of one block; its facts have the number of points alone."""
-    lattice, transform = job.settings.lattice, job.settings.transform
-    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
+    lattice, transform, execution = job.settings.lattice, job.settings.transform, job.execution
     if job.distance_target is not None and not isinstance(surface, Sphere):
         error_target = job.distance_target.error_target(surface)
         field = field_for(surface, lattice, error_target, transform, execution)
@@ -164,8 +253,7 @@ def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
 
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
     """Compute and store some of several blocks; the facts have the number of points alone."""
-    lattice, orders = job.settings.lattice, job.settings.orders
-    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
+    lattice, orders, execution = job.settings.lattice, job.settings.orders, job.execution
     transform = job.transform_settings(surface)
     plan = transform.plan(surface, lattice)
     draws = draws_for([surface], lattice, orders, plan.lowest_degree)
@@ -203,7 +291,8 @@ def finish_mesh(job: Job, stored: Sequence[StoredBlocks]) -> Record:
 
 def _joined_quality(stored: Sequence[StoredBlocks]) -> Quality:
     qualities = [blocks.quality for blocks in stored if blocks.quality is not None]
-    return replace(qualities[0], probe=join([quality.probe for quality in qualities]))
+    tail = next((quality.tail for quality in qualities if quality.tail is not None), None)
+    return replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
 
 
 def facts_of(surface: Surface, points: int) -> Facts:

@@ -10,11 +10,22 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import LOCK_KEYS
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords
-from sobolev_batch.batch.store.hierarchy import FIELD, LABELS, QUALITY, RECORD, RECORDS, ROOT
+from sobolev_batch.batch.store.hierarchy import (
+    FIELD,
+    LABELS,
+    OCTAVE_LABELS,
+    OCTAVES,
+    OCTAVES_GROUP,
+    QUALITY,
+    RECORD,
+    RECORDS,
+    ROOT,
+)
 from sobolev_batch.batch.store.layout import Layout
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.store.store import UNFINISHED, Store
@@ -22,6 +33,7 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import StoreError
 from sobolev_batch.spectral.lattice import AXES
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 _log = logging.getLogger(__name__)
@@ -61,7 +73,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     store.location.remove_partial_files()
     with store.location.access("written"):
         study = store.attributes()["study"]
-        if any(study[name] != value for name, value in _lattice_entry(plan).items()):
+        if any(study.get(name) != value for name, value in _lattice_entry(plan).items()):
             done = sum(record is not None for record in store.records())
             _log.warning(
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
@@ -113,10 +125,36 @@ def _create(store: Store, plan: Plan) -> None:
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
     layout.add_dataset("fourier", xr.Dataset(coords={**axes, "mesh": labels}))
     layout.add_array(RECORD, str, (rows,), (1,), ("mesh",))
+    if plan.tail is not None:
+        layout.add_array(
+            OCTAVES,
+            plan.choice.dtype,
+            (rows, plan.tail.size),
+            (1, plan.tail.size),
+            ("mesh", "sample"),
+            long_name="Fourier transform of the area measure, beyond the lattice",
+            description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
+        )
+        layout.add_dataset(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": labels}))
     _mark_unfinished(store, plan)
     store.documents = {"": _root(_attributes(plan))}
-    store.publish({**layout.keys("fourier"), **layout.keys(RECORDS)})
+    groups = ("fourier", RECORDS, *([OCTAVES_GROUP] if plan.tail is not None else []))
+    store.publish({key: content for group in groups for key, content in layout.keys(group).items()})
     store.consolidate()
+
+
+def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
+    """Return the coordinates of the samples of octaves."""
+    units = {"units": "cycles per unit length"}
+    columns = {name: ("sample", column, units) for name, column in zip(AXES, tail.frequencies.T, strict=True)}
+    columns["weight"] = ("sample", tail.weights, {"long_name": "weight in the integral over all frequencies"})
+    meanings = {
+        "octave": "number of the octave, from 1",
+        "lattice": "number of the random lattice in the octave; -1 for drawn samples",
+        "sublattice": "number of the sublattice in the lattice; -1 for drawn samples",
+    }
+    labels = tail.labels()
+    return columns | {name: ("sample", labels[name], {"long_name": meaning}) for name, meaning in meanings.items()}
 
 
 def _root(attributes: dict[str, Any]) -> dict[str, Any]:
@@ -124,15 +162,30 @@ def _root(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _repair_axes(store: Store, plan: Plan) -> None:
-    """Write damaged coordinates of the lattice again: nothing can be selected without them."""
-    for name, axis in zip(AXES, plan.lattice.axes, strict=True):
-        array = store.array(f"fourier/{name}")
+    """Write damaged coordinates of the lattice and of octaves again: nothing can be selected without them.
+
+    Raises:
+        StoreError: Octaves were sampled at other frequencies than this program would draw.
+    """
+    axes = {f"fourier/{name}": axis for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
+    columns = {} if plan.tail is None else _sample_columns(plan.tail)
+    axes |= {f"{OCTAVES_GROUP}/{name}": values for name, (_, values, _) in columns.items()}
+    for name, axis in axes.items():
+        array = store.array(name)
         try:
-            is_intact = np.array_equal(array[...], axis)
+            stored = np.asarray(array[...])
         except ValueError:
-            is_intact = False
-        if not is_intact:
+            stored = None
+        if stored is None or np.isnan(stored).any():
             array[...] = axis
+        elif not np.allclose(stored, axis, rtol=1e-9, atol=1e-12):
+            if name.startswith("fourier"):
+                array[...] = axis
+                continue
+            raise StoreError(
+                f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
+                "the versions that the attributes of the store name, or name another store"
+            )
 
 
 def _check_same_study(store: Store, plan: Plan) -> None:
@@ -146,6 +199,10 @@ def _check_same_study(store: Store, plan: Plan) -> None:
             ("a lattice of", _describe(study["lattice"]), _describe(planned)),
             ("dtype", repr(study["dtype"]), repr(plan.choice.dtype)),
         ]
+        old, new = study.get("octaves"), plan.choice.octaves
+        if old != new:
+            first, second = (str(len(table["octaves"])) if table else "none" for table in (old, new))
+            comparisons.append(("octaves:", first, second if first != second else f"{second} others"))
     differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
     removed = set(store.labels()) - {row.label for row in plan.rows}
     if removed:
@@ -165,10 +222,11 @@ def _extend(store: Store, plan: Plan) -> None:
     if not added:
         return
     rows = len(labels) + len(added)
-    for name in (RECORD, FIELD, QUALITY, LABELS):
+    of_octaves = (OCTAVES, OCTAVE_LABELS) if store.has_octaves else ()
+    for name in (RECORD, FIELD, QUALITY, LABELS, *of_octaves):
         store.resize(name, (rows, *store.array(name).shape[1:]))
     # Empty qualities are written too, since a missing chunk counts as lost.
-    for name, values in ((QUALITY, [""] * len(added)), (LABELS, added)):
+    for name, values in ((QUALITY, [""] * len(added)), *((name, added) for name in (LABELS, *of_octaves[1:]))):
         store.array(name)[len(labels) :] = np.array(values, dtype=object)
     for records in (ComparisonRecords(store, kind) for kind in KINDS):
         # xarray cannot read arrays of one group together that differ along `mesh`.
@@ -201,7 +259,8 @@ def _describe(lattice: dict[str, Any]) -> str:
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:
-    return {"lattice": {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}, "dtype": plan.choice.dtype}
+    lattice = {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}
+    return {"lattice": lattice, "dtype": plan.choice.dtype, "octaves": plan.choice.octaves}
 
 
 def _similarity_entry(similarity: Similarity) -> dict[str, Any]:

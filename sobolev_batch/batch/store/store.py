@@ -24,6 +24,7 @@ from sobolev_batch.batch.storage.scratch import Scratch
 from sobolev_batch.batch.store.hierarchy import (
     FIELD,
     LABELS,
+    OCTAVES,
     QUALITY,
     RECORD,
     RECORDS,
@@ -56,7 +57,7 @@ class Store(Hierarchy):
         carried = {
             name: document
             for name, document in self.documents.items()
-            if name in (FIELD, WITNESS) or name.startswith(f"{RECORDS}/")
+            if name in (FIELD, OCTAVES, WITNESS) or name.startswith(f"{RECORDS}/")
         }
         return {"location": self.location, "documents": carried}
 
@@ -157,13 +158,22 @@ class Store(Hierarchy):
         ]
         return tuple((x, y, z) for x, y, z in product(*axes))
 
+    @property
+    def has_octaves(self) -> bool:
+        """True if values in octaves lie beside the fields."""
+        return OCTAVES in self.documents
+
     def write_field(self, row: int, block: BlockSlices, values: NDArray[Any]) -> int:
         """Write one block of a row's field, made of whole chunks, and return its checksum for `read_fields`."""
-        array = self.array(FIELD)
-        values = np.ascontiguousarray(values, dtype=array.dtype)
-        with self.location.access("written"):
-            array[(row, *block)] = values
-        return checksum_of(values)
+        return self._write_chunks(FIELD, (row, *block), values)
+
+    def write_octaves(self, row: int, values: NDArray[Any]) -> int:
+        """Write a row's values at all samples of octaves, one chunk, and return their checksum for `read_octaves`."""
+        return self._write_chunks(OCTAVES, (row, slice(None)), values)
+
+    def read_octaves(self, rows: Sequence[int], checksums: Sequence[int] | None = None) -> NDArray[Any]:
+        """Return the values of several rows at all samples of octaves, complex (len(rows), n); see `read_fields`."""
+        return self._read_rows(OCTAVES, rows, (slice(0, self.array(OCTAVES).shape[1]),), checksums)
 
     def read_fields(
         self, rows: Sequence[int], block: BlockSlices, checksums: Sequence[int] | None = None
@@ -180,7 +190,19 @@ class Store(Hierarchy):
             DamageError: A block is damaged, lost, or another one; the error names its row.
             StoreError: The store cannot be read.
         """
-        array = self.array(FIELD)
+        return self._read_rows(FIELD, rows, block, checksums)
+
+    def _write_chunks(self, name: str, selection: tuple[int | slice, ...], values: NDArray[Any]) -> int:
+        array = self.array(name)
+        values = np.ascontiguousarray(values, dtype=array.dtype)
+        with self.location.access("written"):
+            array[selection] = values
+        return checksum_of(values)
+
+    def _read_rows(
+        self, name: str, rows: Sequence[int], block: tuple[slice, ...], checksums: Sequence[int] | None
+    ) -> NDArray[Any]:
+        array = self.array(name)
         values = np.empty((len(rows), *(axis.stop - axis.start for axis in block)), dtype=array.dtype)
         # On object storage, all but a wrong checksum is a failure of the access.
         damage = ValueError if self.location.scheme else (OSError, ValueError)
@@ -207,9 +229,11 @@ class Store(Hierarchy):
 
     def rows_with_complete_fields(self) -> set[int]:
         """Return the rows of which every block exists in its full length. No block is read."""
-        chunks = StoredChunks(self, FIELD)
-        blocks = list(np.ndindex(*chunks.counts[1:]))
-        return {row for row in range(chunks.counts[0]) if chunks.are_complete((row, *block) for block in blocks)}
+        rows = set(range(self.array(FIELD).shape[0]))
+        for chunks in (StoredChunks(self, name) for name in (FIELD, OCTAVES) if name in self.documents):
+            blocks = list(np.ndindex(*chunks.counts[1:]))
+            rows = {row for row in rows if chunks.are_complete((row, *block) for block in blocks)}
+        return rows
 
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one."""
@@ -250,8 +274,8 @@ def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
     existing = Store(store)
     if not existing.exists() or existing.is_unfinished:
         return None
-    table = existing.attributes()["study"].get("choice")
-    return LatticeChoice.from_table(table) if table else None
+    study = existing.attributes()["study"]
+    return LatticeChoice.from_table(study["choice"], study.get("octaves")) if study.get("choice") else None
 
 
 def checksum_of(values: NDArray[Any]) -> int:

@@ -11,6 +11,8 @@ import xarray as xr
 
 from sobolev_batch.batch.store.hierarchy import (
     LABELS,
+    OCTAVES,
+    OCTAVES_GROUP,
     QUALITY,
     RECORDS,
     ROOT,
@@ -23,7 +25,7 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.lattice import AXES
 
 # All other groups are tables.
-_GROUPS_OF_TASKS = ("fourier", RECORDS, WITNESS_GROUP)
+_GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS, WITNESS_GROUP)
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ class Tables:
 
     def damaged(self) -> dict[str, str]:
         """Return the damage of each small array, of tables and coordinates, that cannot be read."""
-        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *self._axes_of_witness()]
+        of_octaves = [name for name in self.store.documents if name.startswith(f"{OCTAVES_GROUP}/") and name != OCTAVES]
+        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *of_octaves, *self._axes_of_witness()]
         lost = {*self.lost(), *self._incomplete(coordinates, coordinates)}
         damage = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
         for name in [*coordinates, QUALITY, *self._names()]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -86,9 +89,19 @@ class Plan:
         return np.dtype(self.choice.dtype).itemsize
 
     @property
+    def tail(self) -> TailSampling | None:
+        """Sampling of the octaves beyond the lattice, if there are any."""
+        return self.choice.tail
+
+    @property
+    def weights(self) -> SobolevWeights:
+        """Weights of the study's orders on the lattice, with a step where octaves follow."""
+        return SobolevWeights(self.lattice, self.study.orders, None if self.tail is None else self.tail.cutoff)
+
+    @property
     def field_bytes(self) -> int:
-        """Bytes of one stored field."""
-        return self.lattice.half.size * self.item_bytes
+        """Bytes of one stored field, octaves included."""
+        return (self.lattice.half.size + (0 if self.tail is None else self.tail.size)) * self.item_bytes
 
     def distance_target(self, row: Row) -> DistanceTarget | None:
         """Return the accuracy that the field of a row is computed for, if an accuracy is asked for."""
@@ -151,7 +164,8 @@ def _lattice_choice(
     earlier: LatticeChoice | None,
 ) -> LatticeChoice:
     if study.lattice is not None:
-        return LatticeChoice(study.lattice, study.transform.dtype)
+        tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
+        return LatticeChoice(study.lattice, study.transform.dtype, tail=tail)
     basis = choice_basis(study, similarity, members[reference][1].fingerprint())
     if earlier is not None and earlier.basis == basis:
         return earlier
@@ -224,7 +238,7 @@ def _fingerprint(label: str, member: Member) -> str:
 def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprint: str) -> str:
     if not fingerprint:
         return ""
-    dependencies = {
+    dependencies: dict[str, Any] = {
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
@@ -233,4 +247,6 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
         # The target of a field follows from its distance to the reference.
         "accuracy": choice.basis,
     }
+    if choice.tail is not None:
+        dependencies["octaves"] = choice.tail.digest
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()

@@ -34,6 +34,7 @@ _DEEPEST = 20
 _MOST_VALUES = 1_000_000
 _LONGEST_TEXT = 10_000
 _MOST_ORDERS = 100
+MOST_OCTAVES = 24
 _MOST_OFFENDERS = 10
 _LONGEST_NAME, _LONGEST_TITLE = 100, 1000
 # The range of TOML's integers.
@@ -83,6 +84,7 @@ class _Header(_Section):
 class _LatticeSection(_Section):
     xi_max: Number
     M: int
+    octaves: Annotated[int, Field(ge=0, le=MOST_OCTAVES)] = 0
 
     def settings(self) -> Lattice:
         return Lattice(self.xi_max, self.M)

@@ -69,6 +69,7 @@ class Study:
         name: Word or line that identifies the study; a store remembers it.
         title: Free text.
         lattice: Lattice of all fields; None if an accuracy is asked for.
+        octaves: Number of octaves that are sampled beyond a given lattice.
         accuracy: Accuracy of the distances to the reference; None if the lattice is given.
         transform: Accuracy, dtype and quadrature of the transforms.
         dtype: Dtype that was asked for, if any.
@@ -115,6 +116,7 @@ class Study:
     folder: Path
     table: Mapping[str, Any]
     largest_chunk_bytes: int = 256 << 20
+    octaves: int = 0
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -218,6 +220,7 @@ class Study:
                 witness=() if document.witness is None else document.witness.settings(orders),
                 proximity=None if document.proximity is None else document.proximity.points,
                 folder=folder,
+                octaves=0 if document.lattice is None else document.lattice.octaves,
                 table=json.loads(json.dumps(table, default=str)),
             )
         except StudyError:

@@ -98,15 +98,24 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
         AccuracyError: The accuracy lies below the rounding of fields, or is out of reach.
     """
     step = _first_step(problem)
-    rtol = problem.accuracy.rtol
-    if step.is_pilot and rtol >= _OCTAVES_FIRST and not _near_duplicates(problem, step.lattice):
+    if prefers_octaves(problem) and not _near_duplicates(problem, step.lattice):
         return solve_in_octaves(problem, seed)
     try:
         return _solve_on_lattices(problem, step)
     except AccuracyError:
-        if rtol < _OCTAVES_AT_ALL:
+        if not permits_octaves(problem.accuracy):
             raise
     return solve_in_octaves(problem, seed)
+
+
+def prefers_octaves(problem: Problem) -> bool:
+    """Tell whether octaves are likely to be cheaper than one lattice that reaches far enough."""
+    return _first_step(problem).is_pilot and problem.accuracy.rtol >= _OCTAVES_FIRST
+
+
+def permits_octaves(accuracy: Accuracy) -> bool:
+    """Tell whether octaves can give an accuracy with a sensible number of samples."""
+    return accuracy.rtol >= _OCTAVES_AT_ALL
 
 
 def _near_duplicates(problem: Problem, lattice: Lattice) -> bool:

@@ -100,6 +100,7 @@ class NormEstimate:
 
     def __iter__(self) -> Iterator[Reals]:
         yield from (self.values, self.truncation, self.aliasing, self.discretisation)
+        yield np.broadcast_to(self.statistical, np.shape(self.values))
 
     @property
     def errors(self) -> Reals:
@@ -114,7 +115,7 @@ class NormEstimate:
             "truncation": self.truncation,
             "aliasing": self.aliasing,
             "discretisation": self.discretisation,
-            "statistical": np.broadcast_to(self.statistical, self.values.shape),
+            "statistical": np.broadcast_to(self.statistical, np.shape(self.values)),
         }
 
 

@@ -88,6 +88,18 @@ def norms_of_draws(parts: Reals) -> Reals:
     return np.asarray(np.sqrt(squares * (1 + _CAUTION * np.sqrt(np.sum(shares**2, axis=1)))))
 
 
+def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
+    """Return norms of an error (orders,) from checks at some |ξ| (P,), raised.
+
+    Args:
+        radii: |ξ| of each check.
+        squares: Contribution of each check to the squared norm, without the weight of an order.
+        orders: Orders s.
+    """
+    weights = np.array([(1 + radii**2) ** order for order in orders])
+    return norms_of_draws(weights * squares)
+
+
 def draw_count(triangles: int) -> int:
     """Return the number of frequencies to probe a mesh at: fewer where each costs more."""
     return int(np.clip(_PAIRS // triangles, _FEWEST_DRAWS, _MOST_DRAWS))

@@ -3,12 +3,33 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
-from sobolev_batch.spectral.errors.probe import Probe
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.spectral.errors.probe import Probe, norms_of_checks
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.surface import Surface
+
+
+@dataclass(frozen=True)
+class TailQuality:
+    """Properties of a surface's values in octaves that errors follow from.
+
+    Attributes:
+        radii: |ξ| at which values were compared with exact ones.
+        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order.
+        own_limit: Limit of the surface's own energy for large |ξ|, and its standard error.
+        difference_limit: Limit of the energy of its difference from the study's reference, likewise; None if unknown.
+    """
+
+    radii: tuple[float, ...]
+    squares: tuple[float, ...]
+    own_limit: tuple[float, float]
+    difference_limit: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -19,23 +40,40 @@ class Quality:
         area: Area of the surface, in squared units of length.
         extent: Extent of the surface.
         probe: Measured error of the field itself; empty for a closed form.
+        tail: Quality of the values in octaves; None without octaves.
     """
 
     area: float
     extent: Extent
     probe: Probe
+    tail: TailQuality | None = None
 
     @classmethod
     def of_surface(cls, surface: Surface, probe: Probe) -> Self:
         """Return the quality of the field of a surface."""
         return cls(surface.area, surface.extent, probe)
 
+    def error_norms(self, weights: SobolevWeights) -> NDArray[np.float64]:
+        """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
+        norms = self.probe.norms(weights)
+        if self.tail is None or not self.tail.radii:
+            return norms
+        tails = norms_of_checks(np.array(self.tail.radii), np.array(self.tail.squares), weights.orders)
+        return np.asarray(np.hypot(norms, tails))
+
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
-        return json.dumps([self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums])
+        parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
+        return json.dumps(parts if self.tail is None else [*parts, asdict(self.tail)])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read a quality from a line of `to_json`."""
-        area, lowest, highest, shells, sums = json.loads(text)
-        return cls(area, Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums)))
+        area, lowest, highest, shells, sums, *tail = json.loads(text)
+        probe = Probe(tuple(shells), tuple(sums))
+        tails = [TailQuality(**{name: _tuple(value) for name, value in one.items()}) for one in tail]
+        return cls(area, Extent(tuple(lowest), tuple(highest)), probe, tails[0] if tails else None)
+
+
+def _tuple(value: Any) -> Any:
+    return value if value is None else tuple(value)

@@ -46,7 +46,12 @@ class Proportion:
             weights: Weights of the shells.
         """
         square, product = (np.tensordot(weights.per_shell, sums, axes=(1, -1)) for sums in (squares, products))
-        norm = np.sqrt(weights.per_shell @ reference).reshape(-1, *[1] * (square.ndim - 1))
+        return cls.of_totals(square, product, weights.per_shell @ reference)
+
+    @classmethod
+    def of_totals(cls, square: Reals, product: Reals, reference: Reals) -> Proportion:
+        """Return the parts from ||e||² and <e, b>, each (orders, ...), and ||b||² (orders,); see `of_shells`."""
+        norm = np.sqrt(reference).reshape(-1, *[1] * (square.ndim - 1))
         with np.errstate(divide="ignore", invalid="ignore"):
             area = np.abs(product) / norm
             excess = product / norm**2

@@ -225,7 +225,7 @@ def _from_fields(
     errors = np.sum([quality.probe.norms(weights) for quality in qualities], axis=0)
     estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, widths), errors)
     if not complete:
-        estimate = NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 3)
+        estimate = NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)
     return _dataset(name, order, estimate, lattice_attributes(weights.lattice, *fields))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ Reals = NDArray[np.float64]
 # Points that are looked up among all triangles: at most so many of each mesh, and pairs of a point and a triangle.
 _MOST_POINTS, _FEWEST_POINTS, _PAIRS = 2000, 200, 50_000_000
 _TRIANGLES = 2000
+# Triangles whose planes are computed at a time.
+_BATCH = 1 << 17
 # Surfaces coincide where they are closer than this fraction of their size, and a point is within a triangle if it is
 # outside by no more than this fraction of it.
 _CLOSENESS, _MARGIN = 1e-8, 1e-9
@@ -134,6 +137,7 @@ def _regular_fall(gaps: Reals) -> float | None:
     return float(min(falls[-1], 1.0)) if is_regular else None
 
 
+@lru_cache(maxsize=1024)
 def tail_integral(cutoff: float, order: float) -> float:
     """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
 
@@ -162,14 +166,18 @@ def _in_common_planes(meshes: Sequence[Mesh], size: float) -> list[Mesh | None]:
 
 def _planes(mesh: Mesh, size: float) -> Reals:
     """Return a number for the plane of each triangle, the same in coinciding planes; NaN without an area."""
-    a, b, c = mesh.corners()
-    normals = np.cross(b - a, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Either side of a triangle may be its front.
-    normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
-    offsets = np.einsum("ij,ij->i", normals, a) / max(size, np.finfo(np.float64).tiny)
-    return np.asarray(normals @ _OF_NORMAL + _OF_OFFSET * offsets)
+    planes = np.empty(len(mesh.triangles))
+    for first in range(0, len(planes), _BATCH):
+        batch = slice(first, first + _BATCH)
+        a, b, c = mesh.corners(batch)
+        normals = np.cross(b - a, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        # Either side of a triangle may be its front.
+        normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
+        offsets = np.einsum("ij,ij->i", normals, a) / max(size, np.finfo(np.float64).tiny)
+        planes[batch] = normals @ _OF_NORMAL + _OF_OFFSET * offsets
+    return planes
 
 
 def _random_points(mesh: Mesh, count: int, rng: np.random.Generator) -> Reals:

@@ -37,22 +37,18 @@ class FaceNormals:
         directions: Unit normals, float64 (n, 3); the density is the same at opposite directions.
         shares: Area of the faces along each normal over that along all of them, float64 (n,).
         sizes: Typical width of these faces, float64 (n,), in units of length.
-        total_share: Area of these faces over the area of all surfaces.
     """
 
     directions: Reals
     shares: Reals
     sizes: Reals
-    total_share: float
 
     @classmethod
     def of(cls, surfaces: Sequence[Surface]) -> Self:
         """Return the normals of the flat faces of surfaces; none for curved ones."""
         found = [_main_normals(surface) for surface in surfaces if isinstance(surface, Mesh)]
         directions, areas, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))
-        total = float(areas.sum())
-        shares = areas / max(total, np.finfo(np.float64).tiny)
-        return cls(directions, shares, sizes, total / sum(surface.area for surface in surfaces))
+        return cls(directions, areas / max(float(areas.sum()), np.finfo(np.float64).tiny), sizes)
 
     def __bool__(self) -> bool:
         return len(self.shares) > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -88,10 +88,10 @@ class OctaveSampling:
 
     def to_table(self) -> dict[str, Any]:
         """Return the sampling as a table, without its octave and the normals."""
-        kept = ("M", "quaternion", "offset")
-        lattices = [asdict(lattice) for lattice in self.lattices]
         return {
-            "lattices": [{name: lattice[name] for name in kept} for lattice in lattices],
+            "lattices": [
+                {"M": one.M, "quaternion": list(one.quaternion), "offset": list(one.offset)} for one in self.lattices
+            ],
             "draws": self.drawn.count,
             "seed": self.drawn.seed,
             "uniform_fraction": self.drawn.uniform_fraction,

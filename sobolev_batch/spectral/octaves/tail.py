@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -19,7 +19,7 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """Squared norm of a field beyond the innermost frequencies, for each order (orders,).
+    """Squared norms of fields beyond the innermost frequencies, each (orders, ...).
 
     Attributes:
         octaves: Part of the octaves.
@@ -48,13 +48,29 @@ class Tail:
         measured = np.sum([one.squares for one in sums], axis=0)
         return cls(measured, statistical_errors(sums), *beyond(octaves, sums, limit, orders, inner))
 
+    @classmethod
+    def stacked(cls, tails: Sequence[Tail]) -> Self:
+        """Return the tails of several fields as one, (orders, fields)."""
+        parts = ([getattr(tail, field.name) for tail in tails] for field in fields(cls))
+        return cls(*(np.stack(arrays, axis=-1) for arrays in parts))
+
+    def scaled(self, factors: Reals) -> Tail:
+        """Return the tails of several fields, (orders, fields), each times a factor."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return Tail(*(part * factors for part in parts))
+
+    def reshaped(self, *shape: int) -> Tail:
+        """Return tails (orders, fields) as (orders, *shape)."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return Tail(*(part.reshape(len(part), *shape) for part in parts))
+
     @property
     def squares(self) -> Reals:
         """The whole tail."""
         return self.octaves + self.beyond
 
     def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
-        """Return norms with their errors, each (orders,).
+        """Return norms with their errors, each (orders, ...).
 
         Args:
             core: Squared norm of the innermost frequencies.

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
-from sobolev_batch.spectral.errors.probe import norms_of_draws
+from sobolev_batch.spectral.errors.probe import norms_of_checks
 from sobolev_batch.spectral.errors.samples import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
@@ -91,21 +92,14 @@ class OctaveValues:
         return norms_of_checks(self.checks.radii, self.checks.squares, orders)
 
 
-def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
-    """Return the norm of an error for each order (orders,) from `Checks`, raised for the small sample."""
-    weights = np.array([(1 + radii**2) ** order for order in orders])
-    return norms_of_draws(weights * squares)
-
-
-def settings_for(target: ErrorTarget) -> Settings:
-    """Return a function that gives the cheapest settings for a target."""
+def settings_for(target: ErrorTarget, dtype: ComplexDtype | None = None) -> Settings:
+    """Return a function that gives the cheapest settings for a target; the dtype may be given."""
 
     def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
         if isinstance(surface, Sphere):
-            return TransformSettings()
-        single = permits_single(surface, lattice, target)
-        chosen = TransformSettings(dtype="complex64" if single else "complex128")
-        return choose_settings(surface, lattice, target, chosen)
+            return TransformSettings(dtype=dtype or "complex128")
+        cheapest: ComplexDtype = "complex64" if permits_single(surface, lattice, target) else "complex128"
+        return choose_settings(surface, lattice, target, TransformSettings(dtype=dtype or cheapest))
 
     return settings
 
