@@ -16,6 +16,7 @@ from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_o
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
+from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, draw_seconds, lattice_seconds, sampling_seconds
 from sobolev_batch.spectral.octaves.limit import EnergyLimit, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
@@ -25,9 +26,7 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
-from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 
@@ -49,10 +48,6 @@ _UNIFORM_BESIDE_LATTICE, _UNIFORM_ALONE = 0.1, 0.5
 _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
 # Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength.
 _GROWTH = 4.0
-# Seconds for a quadrature point, a lattice of `_FIRST_M`, and a pair of a triangle and a frequency; measured, rough.
-_POINT_SECONDS, _LATTICE_SECONDS, _PAIR_SECONDS = 3.5e-7, 0.15, 2.5e-8
-# Quadrature points for each square of half a wavelength.
-_POINTS_PER_SQUARE = 4.0
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # An accuracy called reachable must hold when it is asked for.
@@ -265,16 +260,16 @@ class _Search:
         own = np.sqrt(self.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
         further = _LIMIT_FRACTION * self.tail_changes / (_QUANTILE * energy * outside)
         count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
-        lattice_seconds = self._lattice_seconds(octave, _FIRST_M)
+        lattice = self._lattice(octave, _FIRST_M)
+        seconds = self._lattice_seconds(lattice)
         alone = max(count, _FEWEST_FLAT_DRAWS) if self.normals else count
         alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / self._draw_seconds)))
-        if self._can_draw and alone * self._draw_seconds < lattice_seconds:
+        if self._can_draw and alone * self._draw_seconds < seconds:
             return OctaveSampling(octave, (), self._drawn(octave, alone, _UNIFORM_ALONE))
         beside = 0
         if self.normals and self._can_draw:
-            affordable = _DRAWS_FRACTION * lattice_seconds / self._draw_seconds
+            affordable = _DRAWS_FRACTION * seconds / self._draw_seconds
             beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
-        lattice = OctaveLattice.random(octave.lowest, octave.highest, _FIRST_M, self.rng)
         return OctaveSampling(octave, (lattice,), self._drawn(octave, beside, _UNIFORM_BESIDE_LATTICE))
 
     def _finer_sampling(self, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
@@ -286,9 +281,10 @@ class _Search:
         lattices, drawn = sampling.lattices, sampling.drawn
         count = int(min(len(drawn) * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
         from_draws = sums.drawn_variances[order] > sums.lattice_variances[order]
-        if not lattices and count * self._draw_seconds > self._lattice_seconds(sampling.octave, _FIRST_M):
+        first = self._lattice(sampling.octave, _FIRST_M)
+        if not lattices and count * self._draw_seconds > self._lattice_seconds(first):
             beside = len(drawn) if self.normals else 0
-            lattices, from_draws = (self._lattice(sampling.octave, _FIRST_M),), False
+            lattices = (first,)
             drawn = self._drawn(sampling.octave, beside, _UNIFORM_BESIDE_LATTICE)
         elif from_draws:
             drawn = self._drawn(sampling.octave, count, drawn.uniform_fraction)
@@ -306,17 +302,14 @@ class _Search:
 
     @property
     def _draw_seconds(self) -> float:
-        triangles = sum(len(surface.triangles) for surface in self.problem.surfaces if isinstance(surface, Mesh))
-        return _PAIR_SECONDS * (triangles + 100)
+        return sum(map(draw_seconds, self.problem.surfaces))
 
-    def _lattice_seconds(self, octave: Octave, intervals: int) -> float:
-        points = sum(_points(surface, octave.highest) for surface in self.problem.surfaces)
-        return points * _POINT_SECONDS + _LATTICE_SECONDS * (intervals / _FIRST_M) ** 3
+    def _lattice_seconds(self, lattice: OctaveLattice) -> float:
+        return sum(lattice_seconds(surface, lattice) for surface in self.problem.surfaces)
 
     def _seconds(self, sampling: OctaveSampling) -> float:
         """Predict the processor time of all samples of an octave."""
-        lattices = sum(self._lattice_seconds(sampling.octave, lattice.M) for lattice in sampling.lattices)
-        return lattices + len(sampling.drawn) * self._draw_seconds
+        return sum(sampling_seconds(surface, sampling) for surface in self.problem.surfaces)
 
     @property
     def _can_draw(self) -> bool:
@@ -326,7 +319,7 @@ class _Search:
     def _resolvable_frequency(self) -> float:
         """Return the frequency up to which all surfaces can be transformed."""
         smooth = [surface.area for surface in self.problem.surfaces if isinstance(surface, Smooth)]
-        return float((_MOST_SMOOTH_NODES / (4 * _POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
+        return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
 
 
 def _out_of_reach(problem: Problem, found: NormEstimate) -> AccuracyError:
@@ -344,14 +337,6 @@ def _out_of_reach(problem: Problem, found: NormEstimate) -> AccuracyError:
         rtol,
         reachable,
     )
-
-
-def _points(surface: Surface, frequency: float) -> float:
-    """Return about how many quadrature points a surface needs up to a frequency."""
-    if not isinstance(surface, Mesh | Smooth):
-        return 0.0
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
-    return max(1.5 * triangles, _POINTS_PER_SQUARE * surface.area * (2 * frequency) ** 2)
 
 
 def _difference(values: Sequence[NDArray[np.complexfloating]]) -> NDArray[np.complexfloating]:

@@ -14,6 +14,7 @@ from sobolev_batch.spectral.errors.probe import norms_of_checks
 from sobolev_batch.spectral.errors.samples import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
+from sobolev_batch.spectral.octaves.costs import exact_seconds, nufft_seconds
 from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
@@ -120,7 +121,8 @@ def octave_values(
         surface: Surface in units of length.
         octave: The octave and its samples.
         orders: Orders that errors are measured for.
-        settings: Settings of the transforms on lattices. Values at drawn frequencies are exact.
+        settings: Settings of nonuniform FFTs. Values at drawn frequencies, and on lattices where large triangles would
+            take many points, are exact.
         execution: Backend, threads and memory.
         known: Values at some of the samples: on the first lattices, and maybe at the same drawn frequencies. They are
             not computed again.
@@ -138,6 +140,9 @@ def octave_values(
             values.append(known.values[known.octave.quadrature.parts[number].samples])
         elif not part.is_drawn:
             lattice = sampling.lattices[number]
+            if exact_seconds(surface, lattice) < nufft_seconds(surface, lattice):
+                values.append(_at_frequencies(surface, quadrature.frequencies[part.samples]))
+                continue
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
             values.append(block.ravel()[part.places])
         elif known is not None and known.octave.sampling.drawn is sampling.drawn:
