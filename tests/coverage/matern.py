@@ -1,7 +1,8 @@
 """Sobolev norms in real space: a Matérn kernel, integrated over spheres and triangles.
 
-With a = -s a whole number of at least 2, ||m||_s² = ∬ K_a(|x-y|) dm dm, where the kernel
-K_a(r) = 2 π^a / Γ(a) · r^(a-3/2) · K_{a-3/2}(2πr) is exp(-2πr) times a polynomial (DLMF 10.49.12).
+With a = -s > 1/2, ||m||_s² = ∬ K_a(|x-y|) dm dm, where K_a(r) = 2 π^a / Γ(a) · r^(a-3/2) · K_{a-3/2}(2πr).
+If a is a whole number of at least 2, the kernel is exp(-2πr) times a polynomial (DLMF 10.49.12). For a <= 3/2 it
+is infinite at r = 0, but its integrals over surfaces are not.
 This module uses no frequencies, lattices or fields, and none of the package's rules.
 """
 
@@ -17,6 +18,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from scipy.special import gamma, k0, k1, kv
 
 from sobolev_batch import Mesh, Sphere
 
@@ -28,11 +30,18 @@ _TILE = 384
 _HELD = 1 << 17
 # Nodes on either side of a point's foot on an edge.
 _EDGE_NODES = 16
+# Powers up to which the kernel is infinite at zero.
+_SINGULAR = 1.5
+# Places that differ by no more than rounding.
+_SAME_PLACE = 1e-12
 
 
-def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
+def kernel(distances: Reals, power: float, decay: Reals | None = None) -> Reals:
     """Return K_a at some distances; `decay` is exp(-2πr) if that was computed before."""
     z = 2 * np.pi * distances
+    if power < 2 or power != round(power):
+        return _bessel_kernel(z, power)
+    power = round(power)
     decay = np.exp(-z) if decay is None else decay
     first, *rest = _coefficients(power)
     value = np.full_like(z, first)
@@ -43,12 +52,27 @@ def kernel(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
     return np.asarray(value)
 
 
-def radial_integral(distances: Reals, power: int, decay: Reals | None = None) -> Reals:
+def _bessel_kernel(z: Reals, power: float) -> Reals:
+    """Return K_a where it is no polynomial, z = 2πr; at zero its limit, which may be infinite."""
+    nu = power - 1.5
+    factor = 2 * np.pi**power / gamma(power) * (2 * np.pi) ** -nu
+    limit = factor * 2.0 ** (nu - 1) * gamma(nu) if nu > 0 else np.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if nu == -0.5:
+            value = factor * np.sqrt(np.pi / 2) * np.exp(-z) / z
+        elif nu in (0.0, 1.0):
+            value = factor * (k1(z) * z if nu else k0(z))
+        else:
+            value = factor * z**nu * kv(nu, z)
+    return np.where(z > 0, value, limit)
+
+
+def radial_integral(distances: Reals, power: float, decay: Reals | None = None) -> Reals:
     """Return ∫_r^∞ K_a(t) t dt = a K_{a+1}(r) / (2π²); `decay` as for `kernel`."""
     return power / (2 * np.pi**2) * kernel(distances, power + 1, decay)
 
 
-def sphere_potential(sphere: Sphere, points: Reals, power: int) -> Reals:
+def sphere_potential(sphere: Sphere, points: Reals, power: float) -> Reals:
     """Return ∫ K_a(|x-y|) dσ(y) over a sphere, at points (n, 3)."""
     apart = np.maximum(np.linalg.norm(points - np.asarray(sphere.center), axis=1), 1e-7)
     shorter, longer = np.abs(apart - sphere.radius), apart + sphere.radius
@@ -57,13 +81,21 @@ def sphere_potential(sphere: Sphere, points: Reals, power: int) -> Reals:
     )
 
 
-def double_sum(points: Reals, weights: Reals, powers: Sequence[int]) -> Reals:
-    """Return Σ w_i w_j K_a(|x_i - x_j|) for each a; points (n, 3), weights (n,)."""
+def double_sum(points: Reals, weights: Reals, powers: Sequence[float]) -> Reals:
+    """Return Σ w_i w_j K_a(|x_i - x_j|) for each a; points (n, 3), weights (n,).
+
+    Where a kernel is infinite, points of one place count as far apart as their cells are wide: the error then
+    falls by a power of the cells' width, as that of the other pairs does.
+    """
+    singular = min(powers) <= _SINGULAR
     starts = range(0, len(points), _TILE)
 
     def tile(pair: tuple[int, int]) -> Reals:
         rows, columns = (slice(start, start + _TILE) for start in pair)
         distances = cdist(points[rows], points[columns])
+        if singular:
+            i, j = np.nonzero(distances < _SAME_PLACE)
+            distances[i, j] = np.abs(weights[rows][i] * weights[columns][j]) ** 0.25
         decay = np.exp(-2 * np.pi * distances)
         count = 1 if rows == columns else 2
         return np.array([count * (weights[rows] @ kernel(distances, a, decay) @ weights[columns]) for a in powers])
@@ -108,7 +140,7 @@ class Sides:
         return cls(starts[kept], tangents[kept], lengths[kept], outwards[kept], across[kept])
 
 
-def mesh_potentials(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals:
+def mesh_potentials(sides: Sides, points: Reals, powers: Sequence[float]) -> Reals:
     """Return ∫ K_a(|x-y|) dy over the faces, at points (n, 3), for each a: (len(powers), n).
 
     In polar coordinates around the foot of x on a face's plane, at the height d over it, the radial
@@ -121,9 +153,11 @@ def mesh_potentials(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals
         return np.concatenate(list(pool.map(lambda part: _potentials_of_part(sides, part, powers), parts)), axis=1)
 
 
-def _potentials_of_part(sides: Sides, points: Reals, powers: Sequence[int]) -> Reals:
+def _potentials_of_part(sides: Sides, points: Reals, powers: Sequence[float]) -> Reals:
     relative = sides.starts - points[:, None]
     p, d, t = (np.einsum("xei,ei->xe", relative, along) for along in (sides.outwards, sides.normals, sides.tangents))
+    # At low orders a point must not seem to lie off its own face.
+    d = np.where(np.abs(d) < _SAME_PLACE, 0.0, d)
     closest = np.maximum(np.hypot(p, d), 1e-12)
     low, high = np.arcsinh(t / closest), np.arcsinh((t + sides.lengths) / closest)
     middle = np.where((low < 0) & (high > 0), 0.0, (low + high) / 2)

@@ -1,10 +1,11 @@
 """Independent values of distances, each with its own uncertainty.
 
-Two spheres have a closed form. Meshes of few triangles are integrated in real space, the inner
-integral in closed form up to the sides of the faces, the outer with two rules. Others are summed in
-real space on triangles that are cut finer and finer, as long as that does not take too many points.
-The rest, and what such sums find hard (surfaces nearer to each other than the points), is taken
-from a far finer lattice. Whatever is most certain counts.
+Two spheres have a radial integral, axis-parallel rectangles an exact heat trace, at every order. Meshes of few
+triangles are integrated in real space, the inner integral in closed form up to the sides of the faces, the outer with
+two rules. Others are summed in real space on triangles that are cut finer and finer, as long as that does not take too
+many points. At orders from -2 on, the rest, and what such sums find hard (surfaces nearer to each other than the
+points), is taken from a far finer lattice, and above -2 from an accuracy that few others ask for, with another seed.
+Triangles that both meshes have are left out. Whatever is most certain counts.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform
-from sobolev_batch.spectral.exact.spheres import sphere_inner_product
+from sobolev_batch import AccuracyError, Lattice, Mesh, Sphere, distance, fourier_transform
+from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.surface import Surface
+from tests.coverage import spheres
 from tests.coverage.matern import (
     Sides,
     divided_points,
@@ -27,22 +29,31 @@ from tests.coverage.matern import (
     mesh_potentials,
     sphere_potential,
 )
+from tests.support.rectangles import Rectangles
 
 Reals = NDArray[np.float64]
 
 # Kernels of orders above this have a strong kink at zero, those of others hardly any.
 _SMOOTH = -4.0
+# Kernels of orders above this are infinite at zero, or need Bessel functions. Sums of points reach this order.
+_SINGULAR, _SUMMED = -1.75, -1.0
 # Triangles of both meshes together for which the inner integral is done in closed form.
-_FEW = 90
+_FEW, _FEW_SINGULAR, _FEW_BESSEL = 90, 30, 8
 # Nodes per direction of the two outer rules.
 _OUTER = (8, 11)
 # Points of the double sum at most.
-_POINTS_ROUGH, _POINTS_SMOOTH = 40_000, 10_000
+_POINTS_ROUGH, _POINTS_SMOOTH = 15_000, 10_000
 # Lattices far finer than those under test. Surfaces within the unit ball: periods of 5 and 6 keep
 # their images away.
 _FINE_ROUGH, _FINE_SMOOTH = Lattice(16.0, 160), Lattice(10.0, 120)
-# The last change of an extrapolation was seen to be half of its error where levels are few.
-_EXTRAPOLATION_CAUTION = 3.0
+_WIDEST_ON_LATTICE = 2.2
+# The last change of an extrapolation was seen to be half of its error where levels are few; so was that of the rules.
+_EXTRAPOLATION_CAUTION, _RULE_CAUTION = 3.0, 2.0
+# Accuracy, seed and memory of a distance that others are compared with.
+_OWN_RTOL, _OWN_SEED, _OWN_MEMORY = {-1.0: 3e-2, -1.5: 1e-2}, 54321, 500_000_000
+# A common rotation moves coordinates by about so much, and faces of both surfaces that coincide off each other. At the
+# squared distance per area of faces at a gap g, which is at most some 20 (2πg)^(2a-1), this counts at order -0.6.
+_TURN_GAP, _TURN_FACTOR = 2e-16, 20.0
 # Rounding of sums of some thousand terms, relative to the squared norms.
 _ROUNDING = 1e-14
 
@@ -62,40 +73,81 @@ class Truth:
         return cls(float(value), float(max(high - value, value - low)))
 
 
-def truths(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
-    """Return the distance of two surfaces within about the unit ball for each of some whole orders."""
-    meshes = [surface for surface in (a, b) if isinstance(surface, Mesh)]
-    if not meshes:
-        closed = distance(a, b, orders)
-        pairs = zip(closed["distance"].values, closed["error"].values, strict=True)
-        return tuple(Truth(float(value), float(error)) for value, error in pairs)
-    rough, smooth = ([order for order in orders if (order > _SMOOTH) == side] for side in (True, False))
-    by_order: dict[float, Truth] = {}
-    for chosen, points in ((rough, _POINTS_ROUGH), (smooth, _POINTS_SMOOTH)):
+def truths_of_spheres(first: Sphere, second: Sphere, orders: Sequence[float]) -> list[Truth]:
+    """Return the distance of two spheres for each order."""
+    squares, slacks = spheres.squared_distances(first, second, orders)
+    return list(map(Truth.of_square, squares.tolist(), slacks.tolist()))
+
+
+def truths_of_rectangles(a: Rectangles, b: Rectangles, orders: Sequence[float], *, turned: bool) -> list[Truth]:
+    """Return the distance of two surfaces of rectangles for each order; `turned` if both were turned afterwards."""
+    squares, slacks = a.squared_distance(b, orders)
+    if turned:
+        area = float(a.mesh().area + b.mesh().area)
+        slacks = slacks + _TURN_FACTOR * area * (2 * np.pi * _TURN_GAP) ** (-2 * np.array(orders) - 1)
+    return list(map(Truth.of_square, squares.tolist(), slacks.tolist()))
+
+
+def truths_in_space(a: Surface, b: Surface, orders: Sequence[float]) -> list[Truth | None]:
+    """Return the distance of two surfaces, one of them a mesh, for each order; None where nothing is known of it."""
+    if isinstance(a, Mesh) and isinstance(b, Mesh):
+        a, b = without_common_triangles(a, b)
+    by_order: dict[float, Truth | None] = {}
+    for low, high, points in (
+        (-np.inf, _SMOOTH, _POINTS_SMOOTH),
+        (_SMOOTH, _SINGULAR, _POINTS_ROUGH),
+        (_SINGULAR, 0.0, _POINTS_ROUGH),
+    ):
+        chosen = [order for order in orders if low < order <= high]
         if chosen:
             by_order |= dict(zip(chosen, _most_certain(a, b, chosen, points), strict=True))
-    return tuple(by_order[order] for order in orders)
+    return [by_order[order] for order in orders]
 
 
-def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth]:
+def without_common_triangles(a: Mesh, b: Mesh) -> tuple[Mesh, Mesh]:
+    """Return two meshes without the triangles that both have, whose areas cancel; each keeps one at least."""
+    _, places = np.unique(np.concatenate([a.vertices, b.vertices]), axis=0, return_inverse=True)
+    numbers = np.split(places.ravel(), [len(a.vertices)])
+    corners = [np.sort(number[mesh.triangles], axis=1) for mesh, number in zip((a, b), numbers, strict=True)]
+    shared = {tuple(corner) for corner in corners[0].tolist()} & {tuple(corner) for corner in corners[1].tolist()}
+    distinct = all(len(np.unique(corner, axis=0)) == len(corner) for corner in corners)
+    if not shared or not distinct:
+        return a, b
+    kept = [np.array([tuple(corner) not in shared for corner in each.tolist()]) for each in corners]
+    if not all(keep.any() for keep in kept):
+        one = next(iter(shared))
+        kept = [keep | (each == one).all(axis=1) for keep, each in zip(kept, corners, strict=True)]
+    first, second = (Mesh(mesh.vertices, mesh.triangles[keep]) for mesh, keep in zip((a, b), kept, strict=True))
+    return first, second
+
+
+def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth | None]:
+    """Return the truths for some orders with kernels of one kind."""
     triangles = sum(len(surface.triangles) for surface in (a, b) if isinstance(surface, Mesh))
+    singular, rough = max(orders) > _SINGULAR, max(orders) > _SMOOTH
+    few = _FEW_BESSEL if max(orders) > _SUMMED else _FEW_SINGULAR if singular else _FEW
     # An extrapolation needs two levels at least.
-    summable = 24 * triangles <= points
-    candidates = []
-    if triangles <= _FEW and orders[0] > _SMOOTH:
+    summable = 24 * triangles <= points and max(orders) <= _SUMMED
+    narrow = bool(np.all(Extent.union([surface.extent for surface in (a, b)]).widths <= _WIDEST_ON_LATTICE))
+    candidates: list[Sequence[Truth | None]] = []
+    if rough and triangles <= few:
         candidates.append(closed_within(a, b, orders))
         # Still useful against spheres, whose potential has a kink where they cross a face.
         points = _POINTS_SMOOTH
-    elif not summable or orders[0] > _SMOOTH:
+    elif singular:
+        candidates.append([measured_with_another_seed(a, b, order) for order in orders])
+    elif narrow and (rough or not summable):
         candidates.append(on_fine_lattice(a, b, orders))
     if summable:
         candidates.append(summed_in_real_space(a, b, orders, points))
-    return [min(alternatives, key=lambda truth: truth.uncertainty) for alternatives in zip(*candidates, strict=True)]
+    known = [[truth for truth in alternatives if truth] for alternatives in zip(*candidates, strict=True)]
+    known = known or [[] for _ in orders]
+    return [min(alternatives, key=lambda truth: truth.uncertainty, default=None) for alternatives in known]
 
 
 def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Truth, ...]:
     """Integrate the potentials of the faces; the uncertainty is the change from one outer rule to a finer one."""
-    powers = [round(-order) for order in orders]
+    powers = [-order for order in orders]
     signed = ((a, 1.0), (b, -1.0))
     meshes = [(Sides.of(surface), sign) for surface, sign in signed if isinstance(surface, Mesh)]
     candidates = []
@@ -112,7 +164,7 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
             squares = squares + 2 * sign * (_of_spheres(signed, points, powers) @ weights)
         candidates.append(squares)
     coarse, fine = candidates
-    slack = np.abs(fine - coarse) + _ROUNDING * norms
+    slack = _RULE_CAUTION * np.abs(fine - coarse) + _ROUNDING * norms
     return tuple(map(Truth.of_square, fine.tolist(), slack.tolist()))
 
 
@@ -123,7 +175,7 @@ def summed_in_real_space(
 
     The kernel of a = -s has the term r^(2a-3), which leaves an error of h^(2a-1) beside the rule's h^6.
     """
-    powers = [round(-order) for order in orders]
+    powers = [-order for order in orders]
     signed = ((a, 1.0), (b, -1.0))
     triangles = sum(len(surface.triangles) for surface, _ in signed if isinstance(surface, Mesh))
     levels = [level for level in range(6) if 6 * triangles * 4**level <= most][-3:]
@@ -159,14 +211,31 @@ def on_fine_lattice(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Tr
     return tuple(Truth(float(value), float(error)) for value, error in pairs)
 
 
+def measured_with_another_seed(a: Surface, b: Surface, order: float) -> Truth | None:
+    """Ask for a high accuracy, with other random frequencies; the uncertainty is the error reported there.
+
+    This relies on the reported errors, and shows only where others are far too small.
+    """
+    if order not in _OWN_RTOL:
+        return None
+    try:
+        found = distance(a, b, order, rtol=_OWN_RTOL[order], memory=_OWN_MEMORY, seed=_OWN_SEED)
+    except AccuracyError:
+        return None
+    return Truth(found["distance"].item(), found["error"].item())
+
+
 def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Reals, Reals]:
     """Return the contribution of the spheres alone to the squared distance, and its size."""
-    spheres = [surface for surface in (a, b) if isinstance(surface, Sphere)]
-    alone = np.array([sum(sphere_inner_product(sphere, sphere, order) for sphere in spheres) for order in orders])
+    alone = np.zeros(len(orders))
+    for surface in (a, b):
+        if isinstance(surface, Sphere):
+            pole = np.add(surface.center, [[0.0, 0.0, surface.radius]])
+            alone += [surface.area * sphere_potential(surface, pole, -order).item() for order in orders]
     return alone, alone
 
 
-def _of_spheres(signed: Sequence[tuple[Surface, float]], points: Reals, powers: Sequence[int]) -> Reals:
+def _of_spheres(signed: Sequence[tuple[Surface, float]], points: Reals, powers: Sequence[float]) -> Reals:
     """Return the signed potential of the spheres among the surfaces, (len(powers), n)."""
     total = np.zeros((len(powers), len(points)))
     for surface, sign in signed:

@@ -1,0 +1,130 @@
+"""Random parts of axis-parallel rectangles, as of CAD programs, whose distances are exact at every order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch import Mesh
+from tests.coverage.draws import direction, rotation, small_amount
+from tests.coverage.pairs import Pair
+from tests.support.rectangles import Rectangles
+
+Reals = NDArray[np.float64]
+
+
+def pair_of(rng: np.random.Generator, a: Rectangles, b: Rectangles) -> Pair:
+    """Return two parts as they are, or turned and moved together, which changes no distance."""
+    turned = bool(rng.random() < 0.5)
+    if not turned:
+        return Pair(a.mesh(), b.mesh(), (a, b))
+    turn, shift = rotation(rng), rng.uniform(0, 0.3) * direction(rng)
+    first, second = (Mesh(mesh.vertices @ turn.T + shift, mesh.triangles) for mesh in (a.mesh(), b.mesh()))
+    return Pair(first, second, (a, b), turned=True)
+
+
+def moved_boxes(rng: np.random.Generator) -> Pair:
+    """Return a box and the same moved, slid along its faces, or with another height."""
+    sides, amount, choice = rng.uniform(0.2, 1.0, size=3), 3 * small_amount(rng), rng.random()
+    box = _box(sides)
+    if choice < 0.4:
+        return pair_of(rng, box, box.moved(*(amount * direction(rng))))
+    if choice < 0.7:
+        return pair_of(rng, box, box.moved(*(amount * np.eye(3)[rng.integers(3)])))
+    return pair_of(rng, box, _box(sides + amount * np.eye(3)[2]))
+
+
+def perforated_plates(rng: np.random.Generator) -> Pair:
+    """Return a plate with holes and the same moved by part of a pitch, with other holes, or without any."""
+    count, thickness, choice = int(rng.integers(4, 13)), float(rng.uniform(0.02, 0.1)), rng.random()
+    plate = Rectangles.perforated(count, thickness)
+    if choice < 0.5:
+        return pair_of(rng, plate, plate.moved(float(rng.uniform(0.05, 0.6)) / count))
+    if choice < 0.8:
+        return pair_of(rng, plate, Rectangles.perforated(int(rng.integers(4, 13)), thickness))
+    return pair_of(rng, plate, _box(np.array([1.0, 1.0, thickness])))
+
+
+def fins(rng: np.random.Generator) -> Pair:
+    """Return parallel fins and the same moved by part of their pitch, or another number of them."""
+    count, width = int(rng.integers(4, 31)), float(rng.uniform(0.3, 1.0))
+    stack = Rectangles.fins(count, width)
+    if rng.random() < 0.7:
+        return pair_of(rng, stack, stack.moved(0, 0, float(rng.uniform(0.05, 0.5)) / count))
+    return pair_of(rng, stack, Rectangles.fins(int(rng.integers(4, 31)), width))
+
+
+def crenellations(rng: np.random.Generator) -> Pair:
+    """Return a wall with battlements and the same moved along it, with others, or without any."""
+    count, choice = int(rng.integers(3, 16)), rng.random()
+    wall = _crenellated(count)
+    if choice < 0.5:
+        return pair_of(rng, wall, wall.moved(float(rng.uniform(0.05, 1.0)) / count))
+    if choice < 0.8:
+        return pair_of(rng, wall, _crenellated(int(rng.integers(3, 16))))
+    return pair_of(rng, wall, _box(np.array([1.0, 0.2, 0.5])))
+
+
+def voxel_balls(rng: np.random.Generator) -> Pair:
+    """Return a ball of cubes and the same moved, or one of larger or smaller cubes."""
+    count = int(rng.integers(4, 13))
+    ball = _voxel_ball(count)
+    if rng.random() < 0.5:
+        return pair_of(rng, ball, ball.moved(*(2 * small_amount(rng) * direction(rng))))
+    return pair_of(rng, ball, _voxel_ball(int(rng.integers(4, 13))))
+
+
+def thin_walls(rng: np.random.Generator) -> Pair:
+    """Return a hollow box against one of another thickness or a solid one, or parallel layers at two gaps."""
+    sides, walls, choice = rng.uniform(0.4, 1.0, size=3), 10.0 ** rng.uniform(-3, -1, size=2), rng.random()
+    if choice < 0.3:
+        layer = _box(np.array([sides[0], sides[1], 0.0]))
+        return pair_of(rng, *(layer.joined(layer.moved(0, 0, gap)) for gap in walls))
+    other = _hollow(sides, walls[1]) if choice < 0.7 else _box(sides)
+    return pair_of(rng, _hollow(sides, walls[0]), other)
+
+
+def distant_parts(rng: np.random.Generator) -> Pair:
+    """Return two small boxes some units apart, or the same two of which one differs."""
+    first, second = (_box(rng.uniform(0.02, 0.3, size=3)) for _ in range(2))
+    second = second.moved(*(rng.uniform(1, 6) * (np.eye(3)[0] if rng.random() < 0.5 else direction(rng))))
+    if rng.random() < 0.5:
+        return pair_of(rng, first, second)
+    return pair_of(rng, first.joined(second), first.joined(second.moved(*(small_amount(rng) * direction(rng)))))
+
+
+def _box(sides: Reals) -> Rectangles:
+    """Return a box around the origin, or a single rectangle if one of its sides is zero."""
+    box = Rectangles.box((-sides / 2).tolist(), (sides / 2).tolist())
+    flat = (box.high > box.low).sum(axis=1) == 2
+    kept = np.flatnonzero(flat)[: 1 if np.any(sides == 0) else 6]
+    return Rectangles(box.low[kept], box.high[kept])
+
+
+def _hollow(sides: Reals, wall: float) -> Rectangles:
+    return _box(sides).joined(_box(sides - 2 * wall))
+
+
+def _crenellated(count: int) -> Rectangles:
+    edges = [np.linspace(-0.5, 0.5, 2 * count + 1), np.array([-0.1, 0.1]), np.array([-0.25, 0.1, 0.25])]
+    filled = np.ones((2 * count, 1, 2), dtype=bool)
+    filled[1::2, :, 1] = False
+    return Rectangles.cells(edges, filled)
+
+
+def _voxel_ball(count: int) -> Rectangles:
+    middles = np.indices((count,) * 3) - (count - 1) / 2
+    return Rectangles.cells([np.linspace(-0.5, 0.5, count + 1)] * 3, (middles**2).sum(axis=0) <= (count / 2) ** 2)
+
+
+PARTS: dict[str, Callable[[np.random.Generator], Pair]] = {
+    "moved boxes": moved_boxes,
+    "perforated plates": perforated_plates,
+    "fins": fins,
+    "crenellations": crenellations,
+    "voxel balls": voxel_balls,
+    "thin walls": thin_walls,
+    "distant parts": distant_parts,
+}
