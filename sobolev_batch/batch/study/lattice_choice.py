@@ -242,7 +242,8 @@ def _choose_octaves(
         problem = problems[label]
         accuracy = replace(problem.accuracy, rtol=_PILOT_FRACTION * problem.accuracy.rtol)
         solutions[label] = solve_in_octaves(replace(problem, accuracy=accuracy), seed=0)
-    lattice = max((solution.lattice for solution in solutions.values()), key=lambda one: one.M)
+    lattices = (solution.lattice for solution in solutions.values() if solution.lattice is not None)
+    lattice = max(lattices, key=lambda one: one.M)
     surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in problems.values())]
     samplings = [solution.octaves for solution in solutions.values()]
     tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.of(surfaces))

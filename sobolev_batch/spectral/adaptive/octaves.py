@@ -31,7 +31,7 @@ from sobolev_batch.surfaces.shapes.smooth import Smooth
 Reals = NDArray[np.float64]
 
 _ROUNDS = 6
-_MOST_OCTAVES = 24
+_MOST_OCTAVES, _FEWEST_OCTAVES_OF_FACES = 24, 2
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
 _LIMIT_FRACTION = 0.4
 # Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
@@ -222,7 +222,8 @@ class _Search:
         return refined
 
     def _knows_the_rest(self) -> bool:
-        if not self.octaves:
+        # Where faces repeat, the energy may jump from one octave to the next.
+        if len(self.octaves) < (_FEWEST_OCTAVES_OF_FACES if self.normals else 1):
             return False
         return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
 

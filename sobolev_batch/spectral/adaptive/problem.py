@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,9 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -33,6 +35,7 @@ ESTIMATE_CAUTION = 0.7
 _ROUNDING = 1e-13
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 _OFF_CENTER = 1e-3
+_PAIR = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ class Problem:
     """A norm of a surface, or a distance of two, and the accuracy to compute it to.
 
     Attributes:
-        surfaces: One surface, or two.
+        surfaces: One surface, or two; none where two surfaces cancel.
         orders: Orders s.
         accuracy: Accuracy of the norm or distance.
         support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
@@ -59,8 +62,13 @@ class Problem:
     def of(
         cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
     ) -> Self:
-        """Return the problem for surfaces alone, moved together to the centre of the lattice's period."""
-        surfaces = _centered(surfaces)
+        """Return the problem for surfaces alone, moved together to the centre of the lattice's period.
+
+        Triangles that both surfaces have cancel, and are left out; none may remain.
+        """
+        surfaces = _centered(_without_shared_triangles(surfaces))
+        if not surfaces:
+            return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
         extent = Extent.union([surface.extent for surface in surfaces])
         area = np.array(sum(surface.area for surface in surfaces))
         return cls(surfaces, orders, accuracy, Support(area, extent.widths, extent.reach), label, threads)
@@ -121,6 +129,21 @@ def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
     return np.array([accuracy.discretisation_part(order) for order in orders])
 
 
+def _without_shared_triangles(surfaces: Sequence[Surface]) -> Sequence[Surface]:
+    """Return one surface, or what two do not have in common: both of them, one of them, or nothing."""
+    if len(surfaces) < _PAIR or not all(isinstance(surface, Mesh) for surface in surfaces):
+        return surfaces
+    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
+    if not shared[0].any():
+        return surfaces
+    rests = [
+        Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
+        for mesh, in_both in zip(meshes, shared, strict=True)
+    ]
+    return [mesh for mesh in rests if len(mesh.triangles) and mesh.area > 0]
+
+
 def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
     """Return the surfaces moved together to the centre of a lattice's period, which changes no distance."""
     lowest, highest = Extent.union([surface.extent for surface in surfaces]).box
@@ -137,17 +160,34 @@ class Solution:
 
     Attributes:
         estimate: Numbers with their errors, each (orders,).
-        lattice: Lattice of the fields.
+        lattice: Lattice of the fields; None where nothing had to be computed.
         fields: Fields of the surfaces.
         octaves: Octaves that were measured beyond the lattice, as they were sampled.
     """
 
     estimate: NormEstimate
-    lattice: Lattice
-    fields: tuple[Field, ...]
+    lattice: Lattice | None = None
+    fields: tuple[Field, ...] = ()
     octaves: tuple[OctaveSampling, ...] = ()
 
+    @classmethod
+    def zero(cls, orders: Sequence[float]) -> Self:
+        """Return the distance of equal surfaces, for which nothing is computed."""
+        return cls(NormEstimate(*np.zeros((5, len(orders)))))
+
     @property
-    def highest_frequency(self) -> float:
-        """Largest |ξ| that was sampled, in cycles per unit length."""
-        return max([self.lattice.xi_max, *(sampling.octave.highest for sampling in self.octaves)])
+    def settings(self) -> dict[str, Any]:
+        """How the numbers were computed, as attributes."""
+        if self.lattice is None:
+            return {}
+        settings = [field.settings for field in self.fields]
+        return {
+            "xi_max": self.lattice.xi_max,
+            "M": self.lattice.M,
+            "octaves": len(self.octaves),
+            "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
+            "dtype": settings[0].dtype,
+            "eps": [setting.eps for setting in settings],
+            "tolerance": [setting.tolerance for setting in settings],
+            "points": [field.points for field in self.fields],
+        }

@@ -18,6 +18,7 @@ from sobolev_batch.spectral.errors.budget import Sums, estimate_norms, sums_of_s
 from sobolev_batch.spectral.errors.samples import Sample, estimate
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -27,6 +28,8 @@ Reals = NDArray[np.float64]
 _ROUNDS = 4
 # From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.
 _OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
+# Below this order what lies beyond a lattice is next to nothing.
+_LOW_ORDER = -3.5
 # The error of a pair is divided evenly between its two fields.
 _PAIR = 2
 # A pilot has to tell how large distances are, not more.
@@ -97,6 +100,8 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     Raises:
         AccuracyError: The accuracy lies below the rounding of fields, or is out of reach.
     """
+    if not problem.surfaces:
+        return Solution.zero(problem.orders)
     step = _first_step(problem)
     if prefers_octaves(problem) and not _near_duplicates(problem, step.lattice):
         return solve_in_octaves(problem, seed)
@@ -109,8 +114,13 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
 
 
 def prefers_octaves(problem: Problem) -> bool:
-    """Tell whether octaves are likely to be cheaper than one lattice that reaches far enough."""
-    return _first_step(problem).is_pilot and problem.accuracy.rtol >= _OCTAVES_FIRST
+    """Tell whether octaves are likely to be cheaper than one lattice that reaches far enough, or are more reliable.
+
+    The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
+    """
+    is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.of(problem.surfaces)
+    least = _OCTAVES_FIRST if is_regular else _OCTAVES_AT_ALL
+    return problem.accuracy.rtol >= least and (not is_regular or _first_step(problem).is_pilot)
 
 
 def permits_octaves(accuracy: Accuracy) -> bool:

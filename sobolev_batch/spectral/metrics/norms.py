@@ -196,19 +196,7 @@ def _to_accuracy(
     for surface in surfaces:
         check_surface(surface)
     solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1), seed)
-    settings = [field.settings for field in solution.fields]
-    attributes = {
-        "rtol": accuracy.rtol,
-        "xi_max": solution.lattice.xi_max,
-        "M": solution.lattice.M,
-        "octaves": len(solution.octaves),
-        "highest_frequency": solution.highest_frequency,
-        "seed": seed,
-        "dtype": settings[0].dtype,
-        "eps": [setting.eps for setting in settings],
-        "tolerance": [setting.tolerance for setting in settings],
-        "points": [field.points for field in solution.fields],
-    }
+    attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     dataset = _dataset(name, order, solution.estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
     return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"]))

@@ -36,6 +36,8 @@ _UPWARDS = np.array([0.3, 0.5, 0.81])
 _REGULAR, _FASTEST_FALL, _LEAST_STEADINESS, _OVERSHOOT = 3, 0.25, 0.6, 0.4
 # From octave to octave the bound on an irregular distance falls by no more than this.
 _SLOWEST_FALL = 0.5
+# Later swings were measured to exceed the bound by a sixth.
+_CAUTION = 1.25
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,9 @@ def _approach(limit: float, energies: Reals, deviations: Reals) -> tuple[float, 
         fall = _regular_fall(gaps[: last + 1])
         expected = limit if fall is None else limit - fall * gaps[last] / 2
         spread = (
-            max(before, envelope) if fall is None else (0.5 + _OVERSHOOT) * fall * gaps[last] + 3 * deviations[last]
+            _CAUTION * max(before, envelope)
+            if fall is None
+            else (0.5 + _OVERSHOOT) * fall * gaps[last] + 3 * deviations[last]
         )
         if spread <= uncertain or abs(energies[last] - mean) > uncertain + 2 * deviations[last]:
             mean, uncertain = expected, spread

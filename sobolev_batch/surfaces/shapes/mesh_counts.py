@@ -1,4 +1,4 @@
-"""Counts of unusual triangles and edges of a mesh."""
+"""Counts of unusual triangles and edges of a mesh, and triangles that two meshes share."""
 
 from __future__ import annotations
 
@@ -63,3 +63,38 @@ def duplicate_triangles(triangles: NDArray[np.int64]) -> int:
     nearest = np.minimum(np.searchsorted(repeated, hashes), len(repeated) - 1)
     candidates = np.sort(triangles[repeated[nearest] == hashes], axis=1)
     return len(candidates) - len(np.unique(candidates, axis=0))
+
+
+def shared_triangles(
+    first: NDArray[np.float64], second: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which triangles of two meshes occur in both, in any orientation, each as often in one as in the other.
+
+    Args:
+        first: Corners of the triangles of one mesh, float64 (m, 3, 3).
+        second: Corners of the triangles of the other mesh, float64 (n, 3, 3).
+    """
+    (own, own_keys), (others, other_keys) = _ordered_corners(first), _ordered_corners(second)
+    order, other_order = np.argsort(own_keys, kind="stable"), np.argsort(other_keys, kind="stable")
+    sorted_keys, sorted_others = own_keys[order], other_keys[other_order]
+    # The k-th of equal triangles is matched with the k-th of the other mesh.
+    rank = np.arange(len(order)) - np.searchsorted(sorted_keys, sorted_keys, "left")
+    match = np.searchsorted(sorted_others, sorted_keys, "left") + rank
+    exists = match < np.searchsorted(sorted_others, sorted_keys, "right")
+    places, other_places = order[exists], other_order[match[exists]]
+    equal = np.all(own[places] == others[other_places], axis=(1, 2))
+    in_first, in_second = np.zeros(len(first), dtype=bool), np.zeros(len(second), dtype=bool)
+    in_first[places[equal]] = in_second[other_places[equal]] = True
+    return in_first, in_second
+
+
+def _ordered_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:
+    """Return corners in an order that does not depend on that of the mesh, and a hash of each triangle."""
+    # Zero has two signs.
+    bits = np.ascontiguousarray(corners + 0.0).view(np.uint64)
+    x, y, z = np.moveaxis(bits ^ (bits >> np.uint64(29)), -1, 0)
+    hashes = ((x * _MIXERS[0] + y) * _MIXERS[1] + z) * _MIXERS[0]
+    hashes ^= hashes >> np.uint64(32)
+    order = np.argsort(hashes, axis=1, kind="stable")
+    low, middle, high = np.take_along_axis(hashes, order, axis=1).T
+    return np.take_along_axis(corners, order[:, :, None], axis=1), (low * _MIXERS[0] + middle) * _MIXERS[1] + high
