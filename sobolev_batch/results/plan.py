@@ -84,6 +84,11 @@ class StudyPlan:
         return self._plan.lattice
 
     @property
+    def octaves(self) -> int:
+        """Number of octaves that are sampled beyond the lattice."""
+        return 0 if self._plan.tail is None else len(self._plan.tail.octaves)
+
+    @property
     def dtype(self) -> str:
         """Type of the fields, "complex128" or "complex64"."""
         return self._plan.choice.dtype
@@ -109,7 +114,7 @@ class StudyPlan:
         return self.field_bytes * len(self.labels)
 
     def __str__(self) -> str:
-        return "\n".join(f"{name + ':':<14} {text}" for name, text in self._lines())
+        return "\n".join(f"{name + ':' * bool(name):<14} {text}" for name, text in self._lines())
 
     def _lines(self) -> Iterator[tuple[str, str]]:
         study, lattice = self.study, self.lattice
@@ -124,6 +129,7 @@ class StudyPlan:
             f"half period {lattice.half_period:g}",
         )
         yield "orders", orders
+        yield from self._octave_lines()
         yield from self._transform_lines()
         yield "backend", study.backend
         if study.witness:
@@ -134,6 +140,20 @@ class StudyPlan:
         yield from self._task_lines()
         yield "storage", f"{format_bytes(self.field_bytes)} per surface, {format_bytes(self.total_bytes)} in all"
         yield "store", f"{self.store}, {len(self.stored)} of {len(self.labels)} already stored"
+
+    def _octave_lines(self) -> Iterator[tuple[str, str]]:
+        tail = self._plan.tail
+        if tail is None:
+            return
+        shortest = 1 / (tail.highest_frequency * self.similarity.scale)
+        yield (
+            "octaves",
+            f"{self.octaves} beyond the lattice, to |xi| {tail.highest_frequency:.4g}: wavelengths down to "
+            f"{shortest:.3g} of the files' unit; {tail.size:,} samples",
+        )
+        seconds = float(f"{self._plan.octave_seconds:.1g}")
+        octave_bytes = format_bytes(tail.size * self._plan.item_bytes)
+        yield "", f"{octave_bytes} per surface; about {seconds:g} s of processor time in all"
 
     def _transform_lines(self) -> Iterator[tuple[str, str]]:
         accuracy, transform = self.study.accuracy, self._plan.transform

@@ -17,6 +17,7 @@ from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
@@ -62,6 +63,7 @@ class Plan:
         blocks: Blocks of the lattice, one chunk of the store each.
         choice: Lattice and dtype of all fields.
         sample: Sample of the reference, if an accuracy is asked for.
+        reference_area: Area of the reference, in squared units of length.
     """
 
     study: Study
@@ -71,6 +73,7 @@ class Plan:
     blocks: tuple[Block, ...]
     choice: LatticeChoice
     sample: Sample | None = None
+    reference_area: float = 0.0
 
     @property
     def lattice(self) -> Lattice:
@@ -102,6 +105,13 @@ class Plan:
     def field_bytes(self) -> int:
         """Bytes of one stored field, octaves included."""
         return (self.lattice.half.size + (0 if self.tail is None else self.tail.size)) * self.item_bytes
+
+    @property
+    def octave_seconds(self) -> float:
+        """Predicted processor time of all transforms in octaves, on this machine or one like it."""
+        samplings = () if self.tail is None else self.tail.octaves
+        sizes = [SurfaceSize(row.member.expected_size().triangles, self.reference_area) for row in self.rows]
+        return sum(size.sampling_seconds(sampling) for size in sizes for sampling in samplings)
 
     def distance_target(self, row: Row) -> DistanceTarget | None:
         """Return the accuracy that the field of a row is computed for, if an accuracy is asked for."""
@@ -152,7 +162,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     sample = None
     if study.accuracy is not None:
         sample = Sample.of(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
-    return Plan(study, similarity, tuple(rows), reference, _blocks(study, choice), choice, sample)
+    return Plan(study, similarity, tuple(rows), reference, _blocks(study, choice), choice, sample, surface.area)
 
 
 def _lattice_choice(

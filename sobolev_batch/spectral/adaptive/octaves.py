@@ -16,7 +16,7 @@ from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_o
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
-from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, draw_seconds, lattice_seconds, sampling_seconds
+from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, SurfaceSize
 from sobolev_batch.spectral.octaves.limit import EnergyLimit, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
@@ -156,6 +156,7 @@ class _Search:
         self.rng = rng
         self.octaves: list[MeasuredOctave] = []
         self.seconds = 0.0
+        self.sizes = [SurfaceSize.of(surface) for surface in problem.surfaces]
         self.normals = FaceNormals.of(problem.surfaces)
         self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
 
@@ -303,14 +304,14 @@ class _Search:
 
     @property
     def _draw_seconds(self) -> float:
-        return sum(map(draw_seconds, self.problem.surfaces))
+        return sum(size.draw_seconds for size in self.sizes)
 
     def _lattice_seconds(self, lattice: OctaveLattice) -> float:
-        return sum(lattice_seconds(surface, lattice) for surface in self.problem.surfaces)
+        return sum(size.lattice_seconds(lattice) for size in self.sizes)
 
     def _seconds(self, sampling: OctaveSampling) -> float:
         """Predict the processor time of all samples of an octave."""
-        return sum(sampling_seconds(surface, sampling) for surface in self.problem.surfaces)
+        return sum(size.sampling_seconds(sampling) for size in self.sizes)
 
     @property
     def _can_draw(self) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Self
 
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
@@ -18,36 +20,49 @@ POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 _OVERHEAD_TRIANGLES = 50
 
 
-def draw_seconds(surface: Surface) -> float:
-    """Return the time of the exact transform at one frequency."""
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
-    return _PAIR_SECONDS * (triangles + _OVERHEAD_TRIANGLES)
+@dataclass(frozen=True)
+class SurfaceSize:
+    """What the time of a surface's transforms depends on.
 
+    Attributes:
+        triangles: Number of triangles; zero for a surface that is no mesh.
+        area: Area, in squared units of length.
+        is_closed_form: True for a surface whose transform is a formula.
+    """
 
-def lattice_seconds(surface: Surface, lattice: OctaveLattice) -> float:
-    """Return the time of a transform on a lattice, in the cheaper of both ways."""
-    return min(nufft_seconds(surface, lattice), exact_seconds(surface, lattice))
+    triangles: int
+    area: float
+    is_closed_form: bool = False
 
+    @classmethod
+    def of(cls, surface: Surface) -> Self:
+        """Return the size of a surface."""
+        triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
+        return cls(triangles, surface.area, not isinstance(surface, Mesh | Smooth))
 
-def nufft_seconds(surface: Surface, lattice: OctaveLattice) -> float:
-    """Return the time of a nonuniform FFT on a lattice."""
-    if not isinstance(surface, Mesh | Smooth):
-        return _SAMPLE_SECONDS * lattice.half.size
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
-    per_area = POINTS_PER_SQUARE * (2 * lattice.highest) ** 2
-    points = max(_POINTS_PER_TRIANGLE * triangles, per_area * surface.area)
-    return _POINT_SECONDS * points + _SAMPLE_SECONDS * lattice.half.size
+    @property
+    def draw_seconds(self) -> float:
+        """Time of the exact transform at one frequency."""
+        return _PAIR_SECONDS * (self.triangles + _OVERHEAD_TRIANGLES)
 
+    def lattice_seconds(self, lattice: OctaveLattice) -> float:
+        """Return the time of a transform on a lattice, in the cheaper of both ways."""
+        return min(self._nufft_seconds(lattice), self._exact_seconds(lattice))
 
-def exact_seconds(surface: Surface, lattice: OctaveLattice) -> float:
-    """Return the time of the exact transform at all samples of a lattice; endless where there is none."""
-    if not isinstance(surface, Mesh):
-        return math.inf
-    samples = math.pi / 12 * lattice.M**3
-    return samples * draw_seconds(surface)
+    def prefers_exact(self, lattice: OctaveLattice) -> bool:
+        """Tell whether the exact transform at all samples of a lattice is cheaper than a nonuniform FFT."""
+        return self._exact_seconds(lattice) < self._nufft_seconds(lattice)
 
+    def sampling_seconds(self, sampling: OctaveSampling) -> float:
+        """Return the time of the transforms at all samples of an octave."""
+        return sum(map(self.lattice_seconds, sampling.lattices)) + len(sampling.drawn) * self.draw_seconds
 
-def sampling_seconds(surface: Surface, sampling: OctaveSampling) -> float:
-    """Return the time of the transforms at all samples of an octave."""
-    lattices = sum(lattice_seconds(surface, lattice) for lattice in sampling.lattices)
-    return lattices + len(sampling.drawn) * draw_seconds(surface)
+    def _nufft_seconds(self, lattice: OctaveLattice) -> float:
+        seconds = _SAMPLE_SECONDS * lattice.half.size
+        if self.is_closed_form:
+            return seconds
+        of_area = POINTS_PER_SQUARE * self.area * (2 * lattice.highest) ** 2
+        return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
+
+    def _exact_seconds(self, lattice: OctaveLattice) -> float:
+        return math.pi / 12 * lattice.M**3 * self.draw_seconds if self.triangles else math.inf

@@ -14,7 +14,7 @@ from sobolev_batch.spectral.errors.probe import norms_of_checks
 from sobolev_batch.spectral.errors.samples import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.octaves.costs import exact_seconds, nufft_seconds
+from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
@@ -140,7 +140,7 @@ def octave_values(
             values.append(known.values[known.octave.quadrature.parts[number].samples])
         elif not part.is_drawn:
             lattice = sampling.lattices[number]
-            if exact_seconds(surface, lattice) < nufft_seconds(surface, lattice):
+            if SurfaceSize.of(surface).prefers_exact(lattice):
                 values.append(_at_frequencies(surface, quadrature.frequencies[part.samples]))
                 continue
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values

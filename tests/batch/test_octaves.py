@@ -1,0 +1,231 @@
+"""Studies whose fields have octaves beside them: right numbers, stored, resumed, verified, in parts."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from distributed import Client
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from sobolev_batch import (
+    Sphere,
+    StoreError,
+    Study,
+    distance,
+    icosphere,
+    inner_product,
+    norm,
+    open_store,
+    plan,
+    run,
+    verify,
+)
+from sobolev_batch.batch.store.store import Store
+from tests.faults.test_damage import delete, flip, swap_octaves, truncate
+from tests.support.studies import small_table, variable
+
+Reals = NDArray[np.float64]
+
+ORDERS = (-0.8, -1.5, -2.0)
+BALL = Sphere(0.9)
+LEVELS = [1, 2]
+
+
+def asking(rtol: float = 5e-2, **changes: Any) -> dict[str, Any]:
+    """A study of two icospheres and a ball, which has a closed form."""
+    families = [
+        {"name": "ico", "source": "icosphere", "levels": LEVELS},
+        {"name": "ball", "source": "sphere", "radius": BALL.radius},
+    ]
+    table = small_table(accuracy={"rtol": rtol}, norm={"orders": list(ORDERS)}, family=families, **changes)
+    del table["lattice"]
+    return table
+
+
+@pytest.fixture(scope="module")
+def octave_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("octaves") / "store.zarr"
+    run(Study.from_table(asking()), path, client)
+    return path
+
+
+@pytest.fixture
+def store(octave_store: Path, store_path: Path) -> Path:
+    shutil.copytree(octave_store, store_path)
+    return store_path
+
+
+def test_distances_are_as_accurate_as_asked_and_their_errors_hold(octave_store: Path) -> None:
+    convergence = open_store(octave_store)["convergence"].to_dataset().drop_sel(mesh="reference")
+    assert convergence["within"].all()
+    ball = convergence.sel(mesh="ball/sphere")
+    exact = distance(Sphere(), BALL, ORDERS)["distance"].values
+    assert (np.abs(ball["distance"].values - exact) <= ball["error"].values).all()
+    for level in LEVELS:
+        other = distance(icosphere(level), Sphere(), ORDERS, rtol=2e-2, seed=7)
+        here = convergence.sel(mesh=f"ico/{level}")
+        gap = np.abs(here["distance"].values - other["distance"].values)
+        assert (gap <= here["error"].values + other["error"].values).all()
+        assert (here["statistical"] > 0).all()
+    parts = sum(convergence[name] for name in ("truncation", "aliasing", "discretisation", "statistical"))
+    assert np.array_equal(parts, convergence["error"])
+
+
+def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> None:
+    tree = open_store(octave_store)
+    for label, sphere in (("reference", Sphere()), ("ball/sphere", BALL)):
+        found = tree["norms"].to_dataset().sel(mesh=label)
+        exact = norm(sphere, ORDERS)["norm"].values
+        assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
+        assert (found["error"].values < 0.05 * exact).all()
+    pair = tree["distances"].to_dataset().sel(mesh="ball/sphere", other="ico/2")
+    swapped = tree["distances"].to_dataset().sel(mesh="ico/2", other="ball/sphere")
+    alone = distance(icosphere(2), BALL, ORDERS, rtol=2e-2, seed=3)
+    assert (np.abs(pair["distance"] - alone["distance"].values) <= pair["error"] + alone["error"].values).all()
+    for name in ("distance", "error", "statistical"):
+        assert np.array_equal(pair[name], swapped[name])
+    # The ball is shrunk: <a - b, b> / ||b|| by the closed forms of spheres.
+    exact_norm = norm(Sphere(), ORDERS)["norm"].values
+    area = np.abs(inner_product(BALL, Sphere(), ORDERS)["inner_product"].values - exact_norm**2) / exact_norm
+    found = tree["convergence"].to_dataset().sel(mesh="ball/sphere")
+    assert found["area_part"].values == pytest.approx(area, rel=0.05)
+    assert (found["area_part"] ** 2 + found["shape_part"] ** 2).values == pytest.approx(found["distance"].values ** 2)
+
+
+def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> None:
+    tree = xr.open_datatree(octave_store, engine="zarr")
+    octaves = tree["octaves"].to_dataset()
+    axes = [octaves[name].values for name in ("xi_x", "xi_y", "xi_z")]
+    lengths = 1 + sum(axis**2 for axis in axes)
+    of_reference = np.abs(octaves["octaves"].sel(mesh="reference").values) ** 2
+    field = variable(tree, "fourier", "fourier").sel(mesh="reference")
+    x, y, z = (field[name].values for name in ("xi_x", "xi_y", "xi_z"))
+    square = (x**2)[:, None, None] + (y**2)[:, None] + z**2
+    # The step, written down once more.
+    cutoff = tree.attrs["study"]["octaves"]["cutoff"]
+    step = 0.5 * erfc(3 * (np.sqrt(square) / cutoff - 0.75) / 0.25)
+    inner = (x[1] - x[0]) ** 3 * np.where(z > 0, 2.0, 1.0) * step * np.abs(field.values) ** 2
+    for order in (-0.8, -1.0, -2.0):
+        tail = (octaves["weight"].values * lengths**order * of_reference).sum()
+        inside = (inner * (1 + square) ** order).sum()
+        exact = norm(Sphere(), order)["norm"].item() ** 2
+        # At -0.8 some hundredths lie beyond the last octave.
+        assert inside + tail == pytest.approx(exact, rel={-0.8: 5e-2, -1.0: 5e-3, -2.0: 1e-5}[order])
+        assert tail > (0.1 * exact if order >= -1 else 0)
+    assert octaves.sizes["mesh"] == 4
+    assert set(np.unique(octaves["octave"])) == set(range(1, len(tree.attrs["study"]["octaves"]["octaves"]) + 1))
+    assert octaves["xi_x"].attrs["units"] == "cycles per unit length"
+
+
+def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Path, client: Client) -> None:
+    before = open_store(store)["octaves"].to_dataset().load()
+    summary = run(Study.from_table(asking()), store, client)
+    assert summary.computed == ()
+    more = asking()
+    more["family"][0]["levels"] = [0, *LEVELS]
+    summary = run(Study.from_table(more), store, client)
+    assert summary.computed == ("ico/0",)
+    after = open_store(store)["octaves"].to_dataset().load()
+    assert np.array_equal(after.xi_x, before.xi_x)
+    assert np.array_equal(after.octaves.sel(mesh=before.mesh), before.octaves)
+    found = variable(open_store(store), "convergence", "distance").sel(mesh="ico/0").values
+    other = distance(icosphere(0), Sphere(), ORDERS, rtol=2e-2)
+    assert found == pytest.approx(other["distance"].values, rel=0.05)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip, delete, swap_octaves])
+def test_damaged_octaves_are_named_and_computed_again(
+    damage: Callable[[Path], None], store: Path, octave_store: Path, client: Client
+) -> None:
+    row = Store.open(store).labels().index("ico/2")
+    damage(store / f"octaves/octaves/c/{row}/0")
+    found = verify(store)
+    assert set(found.fields) == {"ico/2"}
+    summary = run(Study.from_table(asking()), store, client)
+    assert summary.computed == ("ico/2",)
+    assert verify(store).is_sound
+    fresh, whole = (open_store(path)["convergence"]["distance"].values for path in (store, octave_store))
+    assert fresh == pytest.approx(whole, rel=1e-9, nan_ok=True)
+
+
+def test_damaged_octaves_are_found_by_the_reduction_too(store: Path, client: Client) -> None:
+    row = Store.open(store).labels().index("ico/2")
+    flip(store / f"octaves/octaves/c/{row}/0")
+    # Another order asks for new tables.
+    table = asking()
+    table["norm"]["orders"] = [*ORDERS, -2.5]
+    assert "ico/2" in run(Study.from_table(table), store, client).computed
+    assert verify(store).is_sound
+
+
+def test_damaged_frequencies_are_named_and_written_again(store: Path, client: Client) -> None:
+    flip(store / "octaves/weight/c/0")
+    assert set(verify(store).tables) == {"octaves/weight"}
+    before = variable(open_store(store), "fourier", "xi_x").values
+    run(Study.from_table(asking()), store, client)
+    assert verify(store).is_sound
+    assert np.array_equal(variable(open_store(store), "fourier", "xi_x").values, before)
+
+
+def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client) -> None:
+    stored = Store.open(store)
+    stored.write("octaves/xi_x", ..., np.asarray(stored.read("octaves/xi_x", ...)) + 1.0)
+    with pytest.raises(StoreError, match="sampled at other frequencies"):
+        run(Study.from_table(asking()), store, client)
+
+
+def with_lattice(octaves: int) -> dict[str, Any]:
+    lattice = {"xi_max": 4.0, "M": 32, "octaves": octaves}
+    return small_table(lattice=lattice, norm={"orders": [-1.5, -2.0]})
+
+
+def test_octaves_beyond_a_given_lattice_lower_its_errors(client: Client, tmp_path: Path) -> None:
+    datasets = {}
+    for octaves in (0, 4):
+        run(Study.from_table(with_lattice(octaves)), tmp_path / f"{octaves}.zarr", client)
+        datasets[octaves] = open_store(tmp_path / f"{octaves}.zarr")["convergence"].to_dataset()
+    assert "octaves" not in open_store(tmp_path / "0.zarr")
+    for level in (1, 2, 3):
+        exact = distance(icosphere(level), Sphere(), [-1.5, -2.0], rtol=5e-3)
+        errors = []
+        for dataset in datasets.values():
+            here = dataset.sel(mesh=f"ico/{level}")
+            gap = np.abs(here["distance"].values - exact["distance"].values)
+            assert (gap <= here["error"].values + exact["error"].values).all()
+            errors.append(here["error"].values / here["distance"].values)
+        assert (errors[1] < errors[0] / 5).all()
+    with pytest.raises(StoreError, match=r"octaves: 4, not none"):
+        run(Study.from_table(with_lattice(0)), tmp_path / "4.zarr", client)
+
+
+def test_octaves_are_the_same_in_a_task_of_their_own(client: Client, tmp_path: Path) -> None:
+    # Small chunks: several blocks, and a task for the octaves of each mesh.
+    table = {**with_lattice(2), "family": [{"name": "ico", "source": "icosphere", "levels": [2]}]}
+    study = Study.from_table(table)
+    run(study, tmp_path / "whole.zarr", client)
+    run(replace(study, largest_chunk_bytes=1 << 17), tmp_path / "blocks.zarr", client)
+    whole, blocks = (open_store(tmp_path / name) for name in ("whole.zarr", "blocks.zarr"))
+    assert np.array_equal(variable(whole, "octaves", "octaves"), variable(blocks, "octaves", "octaves"))
+    found, expected = (variable(tree, "convergence", "distance").values for tree in (blocks, whole))
+    assert found == pytest.approx(expected, rel=1e-8, nan_ok=True)
+    assert verify(tmp_path / "blocks.zarr").is_sound
+
+
+def test_a_plan_shows_octaves_their_bytes_and_time(octave_store: Path) -> None:
+    found = plan(Study.from_table(asking()), octave_store)
+    text = str(found)
+    samples = open_store(octave_store)["octaves"].sizes["sample"]
+    assert found.octaves == len(open_store(octave_store).attrs["study"]["octaves"]["octaves"])
+    assert f"octaves:       {found.octaves} beyond the lattice" in text
+    assert f"{samples:,} samples" in text
+    assert "s of processor time in all" in text
+    assert found.field_bytes == found.lattice.half.size * 8 + samples * 8 or found.dtype == "complex128"
+    assert len(found.stored) == 4
