@@ -35,7 +35,7 @@ import lazy_loader
 # All modules together take seconds to import, in which the command line could not answer.
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# xarray learns of the accessor `field.sobolev` with the first function that returns fields.
+# xarray learns of the accessors `field.sobolev` and `tree.sobolev` with the first function that returns fields.
 _RETURN_FIELDS = ("fourier_transform", "open_store")
 # New names by the old ones, which go on working for one release.
 _RENAMED = {"ClaimError": "LockError"}
@@ -49,4 +49,6 @@ def __getattr__(name: str) -> Any:
         name = new
     if name in _RETURN_FIELDS:
         import_module(f"{__name__}.results.accessor")
+    if name == "open_store":
+        import_module(f"{__name__}.results.store_accessor")
     return _load(name)

@@ -34,6 +34,7 @@ from .results.plan import plan as plan
 from .results.report.build import report as report
 from .results.status import Status as Status
 from .results.status import status as status
+from .results.store_accessor import StoreAccessor as StoreAccessor
 from .results.tables.convergence import table as table
 from .results.tables.matrix import matrix as matrix
 from .spectral.fields import fourier_transform as fourier_transform

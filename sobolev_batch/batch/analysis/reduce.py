@@ -22,11 +22,16 @@ from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.quality import Quality, TailQuality
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
@@ -108,36 +113,65 @@ class _Results:
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
 
+@dataclass(frozen=True, eq=False)
+class StoredFields:
+    """Fields in a store, and what their norms follow from.
+
+    Attributes:
+        store: Store of the fields.
+        records: Record of each row; None without one.
+        lattice: Lattice of the fields.
+        tail: Sampling of the octaves beside them, if there are any.
+        reference: Row of the study's reference.
+    """
+
+    store: Store
+    records: Sequence[Record | None]
+    lattice: Lattice
+    tail: TailSampling | None
+    reference: int
+
+    def reducer(self, orders: tuple[float, ...], compared_with: int | None = None) -> Reducer:
+        """Return the reducer for some orders.
+
+        Args:
+            orders: Sobolev orders s.
+            compared_with: Row to which distances are measured; by default the reference.
+        """
+        complete = complete_records(self.records)
+        areas, errors = np.full(len(self.records), np.nan), np.full((len(orders), len(self.records)), np.nan)
+        weights = SobolevWeights(self.lattice, orders, None if self.tail is None else self.tail.cutoff)
+        extents, qualities = [], {}
+        for i, record in complete.items():
+            quality = Quality.from_json(record.quality)
+            areas[i], errors[:, i] = quality.area, quality.error_norms(weights)
+            extents.append(quality.extent)
+            if quality.tail is not None:
+                qualities[i] = quality.tail
+        reference = self.reference if self.reference in complete else None
+        tails = None
+        if self.tail is not None:
+            checksums = {i: record.checksums[-1] for i, record in complete.items()}
+            tails = TailReducer(self.store, self.tail, orders, reference, qualities, checksums)
+        return Reducer(
+            store=self.store,
+            lattice=self.lattice,
+            blocks=self.store.blocks_of(self.lattice),
+            orders=orders,
+            reference=reference if compared_with is None else compared_with,
+            areas=areas,
+            errors=errors,
+            widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
+            checksums={i: record.checksums for i, record in complete.items()},
+            tails=tails,
+        )
+
+
 def make_reducer(workspace: Workspace) -> Reducer:
-    """Return the reducer of a workspace, with the qualities in its records."""
-    plan, records, complete = workspace.plan, workspace.records, workspace.complete
-    orders, reference = plan.study.orders, workspace.reference
-    areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
-    weights, extents = plan.weights, []
-    tails: dict[int, TailQuality] = {}
-    for i, record in complete.items():
-        quality = Quality.from_json(record.quality)
-        areas[i], errors[:, i] = quality.area, quality.error_norms(weights)
-        extents.append(quality.extent)
-        if quality.tail is not None:
-            tails[i] = quality.tail
-    reference_in_store = reference if reference in complete else None
-    tail_reducer = None
-    if plan.tail is not None:
-        of_tails = {i: record.checksums[-1] for i, record in complete.items()}
-        tail_reducer = TailReducer(workspace.store, plan.tail, orders, reference_in_store, tails, of_tails)
-    return Reducer(
-        store=workspace.store,
-        lattice=plan.lattice,
-        blocks=plan.blocks,
-        orders=orders,
-        reference=reference_in_store,
-        areas=areas,
-        errors=errors,
-        widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
-        checksums={i: record.checksums for i, record in complete.items()},
-        tails=tail_reducer,
-    )
+    """Return the reducer of a workspace."""
+    plan = workspace.plan
+    fields = StoredFields(workspace.store, workspace.records, plan.lattice, plan.tail, workspace.reference)
+    return fields.reducer(plan.study.orders)
 
 
 def _write_tables(workspace: Workspace, results: _Results) -> None:

@@ -117,11 +117,11 @@ class Reducer:
         to_reference, products = np.zeros_like(own), np.zeros_like(own)
         of_reference = np.zeros(self.lattice.shell_count)
         for number, block in enumerate(self.blocks):
-            reference = None if self.reference is None else self._read([self.reference], number)[0]
+            reference = None if self.reference is None else self.read([self.reference], number)[0]
             if reference is not None:
                 of_reference += shell_sums(reference, None, self.lattice, block)
             for batch in _slices(len(rows), self._read_at_once):
-                values = self._read(rows[batch], number)
+                values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
                 if reference is not None:
                     values -= reference
@@ -221,11 +221,11 @@ class Reducer:
         """
         block = self.blocks[number]
         arrangement = Arrangement.of(self.weights, block)
-        reference = None if self.reference is None else self._read([self.reference], number)
+        reference = None if self.reference is None else self.read([self.reference], number)
 
         def read(fields: Sequence[int], buffer: Complexes) -> Complexes:
             for batch in _slices(len(fields), self._read_at_once):
-                values = self._read(fields[batch], number).astype(np.complex128, copy=False)
+                values = self.read(fields[batch], number).astype(np.complex128, copy=False)
                 if reference is not None:
                     values -= reference
                 np.take(values.reshape(len(values), -1), arrangement.order, axis=1, out=buffer[batch], mode="clip")
@@ -247,7 +247,7 @@ class Reducer:
             multiply(group, read(others[group], buffer), len(rows))
         return products, left, right
 
-    def _read(self, rows: Sequence[int], number: int) -> Complexes:
+    def read(self, rows: Sequence[int], number: int) -> Complexes:
         """Read one block of fields, and check it against their records."""
         expected = [self.checksums[row][number] for row in rows]
         return self.store.read_fields(rows, self.lattice.place(self.blocks[number]), expected)
@@ -257,7 +257,7 @@ class Reducer:
         sums = np.zeros(self.lattice.shell_count)
         if row != other:
             for number, block in enumerate(self.blocks):
-                a, b = self._read([row, other], number)
+                a, b = self.read([row, other], number)
                 sums += shell_sums(a - b, None, self.lattice, block)
         return sums_of_shells(sums, self.weights)
 

@@ -38,6 +38,7 @@ from sobolev_batch.batch.store.record_table import RecordTable
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.spectral.lattice import Block, Lattice
 
 _log = logging.getLogger(__name__)
 
@@ -157,6 +158,14 @@ class Store(Hierarchy):
             for total, step in zip(array.shape[1:], array.chunks[1:], strict=True)
         ]
         return tuple((x, y, z) for x, y, z in product(*axes))
+
+    def blocks_of(self, lattice: Lattice) -> tuple[Block, ...]:
+        """Return the blocks of a field on its lattice, in the order of `block_slices`."""
+        x, y, z = lattice.half.start
+        return tuple(
+            Block((x + i.start, y + j.start, z + k.start), (i.stop - i.start, j.stop - j.start, k.stop - k.start))
+            for i, j, k in self.block_slices()
+        )
 
     @property
     def has_octaves(self) -> bool:

@@ -19,7 +19,6 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -95,11 +94,6 @@ class Plan:
     def tail(self) -> TailSampling | None:
         """Sampling of the octaves beyond the lattice, if there are any."""
         return self.choice.tail
-
-    @property
-    def weights(self) -> SobolevWeights:
-        """Weights of the study's orders on the lattice, with a step where octaves follow."""
-        return SobolevWeights(self.lattice, self.study.orders, None if self.tail is None else self.tail.cutoff)
 
     @property
     def field_bytes(self) -> int:

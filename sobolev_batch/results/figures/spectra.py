@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.shells import Orders
-from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 Reals = NDArray[np.float64]
 
@@ -62,10 +62,12 @@ class Spectra:
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
         labels = spread(others, max(1, min(most, affordable)))
         scale = tree.attrs["similarity"]["scale"]
-        of_reference = fields.sel(mesh=reference).load()
-        spectra = [
-            spectrum(fields.sel(mesh=label), of_reference, orders, similarity=Similarity(scale)) for label in labels
-        ]
+        if "octaves" in tree:
+            accessor = StoreAccessor(tree)
+            spectra = [accessor.spectrum(label, reference, orders) for label in labels]
+        else:
+            of_reference = fields.sel(mesh=reference).load()
+            spectra = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
         shares = np.stack([np.asarray(one["share"].transpose("order", "band")) for one in spectra])
         longest, shortest = (spectra[0][name].to_numpy() for name in ("longest_wavelength", "shortest_wavelength"))
         return cls(tuple(labels), len(others), orders, shares, longest, shortest, 1 / scale)

@@ -260,6 +260,14 @@ def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tup
         f"frequencies up to {lattice.xi_max:.6g} cycles per unit length on each axis, {lattice.M} intervals "
         f"(spacing {lattice.spacing:.4g}): wavelengths down to {1 / lattice.xi_max:.4g} units",
     )
+    octaves = study.get("octaves")
+    if octaves is not None:
+        highest = octaves["cutoff"] * 2 ** len(octaves["octaves"])
+        yield (
+            "octaves",
+            f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
+            f"length: wavelengths down to {1 / highest:.4g} units",
+        )
     if table.get("witness") is not None:
         chosen = table["witness"].get("orders") or study["orders"]
         yield "witness", f"at the vertices of every mesh, order {minus(', '.join(f'{order:g}' for order in chosen))}"

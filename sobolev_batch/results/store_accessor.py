@@ -1,0 +1,199 @@
+"""`tree.sobolev`: norms, distances and spectra of any order from everything that a store holds, octaves included."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.batch.analysis.reduce import StoredFields
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import InputError
+from sobolev_batch.results.open import location_of
+from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.datasets import (
+    AREA,
+    FREQUENCY,
+    KERNEL,
+    LENGTH,
+    NUMBER,
+    described,
+    labelled,
+    order_axis,
+)
+from sobolev_batch.spectral.octaves.partition import Octave
+from sobolev_batch.spectral.octaves.sums import squared_moduli
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
+from sobolev_batch.surfaces.sources.names import quoted
+
+# The innermost octave has this many spacings of the lattice within it.
+_FEWEST_SPACINGS = 4
+# A band's window is one half at this fraction of its cutoff.
+_HALF_WEIGHT = 0.75
+
+
+@xr.register_datatree_accessor("sobolev")  # type: ignore[no-untyped-call]
+class StoreAccessor:
+    """Norms, distances and spectra of any order as methods of an open store: ``tree.sobolev.norm("a/1", -2)``.
+
+    They use the octaves beside the fields, if the study has some. `field.sobolev` and the functions that take single
+    fields know the lattice alone.
+
+    Raises:
+        InputError: In all methods: the tree does not say where it was opened, or no mesh with a field has that label.
+        OrderError: In all methods: an order is not below -1/2.
+        DamageError: In all methods: stored values are not what was written.
+
+    >>> import sobolev_batch as sb
+    >>> tree = sb.open_store("storage/icosphere.zarr")
+    >>> found = tree.sobolev.distance("icosphere/1", "reference", [-4, -3.5])
+    >>> found["distance"].dims, bool((found["error"] < found["distance"]).all())
+    (('order',), True)
+    """
+
+    def __init__(self, tree: xr.DataTree) -> None:
+        self._tree = tree
+
+    def norm(self, mesh: str, order: Orders) -> xr.Dataset:
+        """Return the norm of a mesh with its error; see `sobolev_batch.norm`.
+
+        Args:
+            mesh: Label of the mesh.
+            order: One order s < -1/2, or several.
+
+        >>> import sobolev_batch as sb
+        >>> tree = sb.open_store("storage/icosphere.zarr")
+        >>> f"{tree.sobolev.norm('reference', -4)['norm'].item():.3f}"
+        '3.511'
+        """
+        fields, row = self._fields(mesh)
+        norms, _, _ = fields.reducer(check_orders(order), row).norms([row])
+        return _labelled(order, "norm", norms, {})
+
+    def distance(self, mesh: str, other: str, order: Orders) -> xr.Dataset:
+        """Return the distance of two meshes with its error, and its parts that are area and shape.
+
+        See `sobolev_batch.distance` and `sobolev_batch.proportion`.
+
+        Args:
+            mesh: Label of one mesh.
+            other: Label of the other mesh, which the area part is a multiple of.
+            order: One order s < -1/2, or several.
+        """
+        fields, row, against = self._fields(mesh, other)
+        _, distances, parts = fields.reducer(check_orders(order), against).norms([row])
+        return _labelled(order, "distance", distances, {"area_part": parts.area, "shape_part": parts.shape})
+
+    def spectrum(self, mesh: str, other: str | None, order: Orders) -> xr.Dataset:
+        """Return the squared distance of two meshes, or the squared norm of one, by octaves of the frequency |ξ|.
+
+        Neighbouring bands overlap smoothly; at its two ends a band has half of its weight.
+
+        Args:
+            mesh: Label of one mesh.
+            other: Label of the other mesh; None for the norm.
+            order: One order s < -1/2, or several.
+
+        Returns:
+            Dataset over `band` with the coordinates `lower` and `upper` in cycles per unit length, and
+            `longest_wavelength` and `shortest_wavelength` in units of length; `squared` (order, band), in units of
+            length, and its `share` of what has been measured; `energy` (band), the mean of ∫_{|ξ|=r} |a^ - b^|² dS, and
+            its standard error `energy_error`, in squared units of length. The attribute `energy_limit` is twice the
+            area of all surfaces, which the energy tends to if no parts of them coincide.
+        """
+        rows = self._fields(mesh) if other is None else self._fields(mesh, other)
+        fields, indices, orders = rows[0], [int(row) for row in rows[1:]], check_orders(order)
+        bands = [*_inner_bands(fields, indices, orders), *_octaves(fields, indices, orders)]
+        upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
+        upper *= _HALF_WEIGHT
+        lower = np.array([0.0, *upper[:-1]])
+        dims, values, _ = axis = order_axis(order)
+        squared = squares.T.reshape(*values.shape, -1)
+        areas = fields.reducer(orders).areas[indices].sum()
+        with np.errstate(divide="ignore"):
+            longest = 1 / lower
+        return xr.Dataset(
+            {
+                "squared": ((*dims, "band"), squared, described("squared value", LENGTH)),
+                "share": ((*dims, "band"), squared / squared.sum(axis=-1)[..., None], described("share", NUMBER)),
+                "energy": ("band", energies, described("energy on a sphere of frequencies", AREA)),
+                "energy_error": ("band", deviations, described("standard error of the energy", AREA)),
+            },
+            coords={
+                "order": axis,
+                "lower": ("band", lower, described("lower end", FREQUENCY)),
+                "upper": ("band", upper, described("upper end", FREQUENCY)),
+                "longest_wavelength": ("band", longest, described("longest wavelength", LENGTH)),
+                "shortest_wavelength": ("band", 1 / upper, described("shortest wavelength", LENGTH)),
+            },
+            attrs={"kernel": KERNEL, "energy_limit": 2 * float(areas)},
+        )
+
+    def _fields(self, *labels: str) -> tuple[Any, ...]:
+        """Return the stored fields, and the row of each label."""
+        fields, known, rows = self._stored, self._stored.store.labels(), []
+        for label in labels:
+            record = fields.records[known.index(label)] if label in known else None
+            if record is None or record.status != "complete":
+                raise InputError(
+                    f"{fields.store.path}: no mesh {quoted(label)} with a field; its labels begin {known[:3]}"
+                )
+            rows.append(known.index(label))
+        return fields, *rows
+
+    @cached_property
+    def _stored(self) -> StoredFields:
+        store = Store.open(location_of(self._tree))
+        study = store.attributes()["study"]
+        lattice, octaves = Lattice(**study["lattice"]), study.get("octaves")
+        tail = None if octaves is None else TailSampling.from_table(octaves)
+        return StoredFields(store, store.records(), lattice, tail, store.labels().index(study["reference"]))
+
+
+def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[str, Reals]) -> xr.Dataset:
+    columns = {**estimate.named(name), **others}
+    return labelled(order, {label: values[:, 0] for label, values in columns.items()}, {})
+
+
+Band = tuple[float, Reals, float, float]
+
+
+def _inner_bands(fields: StoredFields, rows: list[int], orders: tuple[float, ...]) -> list[Band]:
+    """Return the upper end, squares (orders,), energy and its error of each octave within the lattice."""
+    lattice = fields.lattice
+    reducer = fields.reducer(orders)
+    sums = np.zeros(lattice.shell_count)
+    for number, block in enumerate(reducer.blocks):
+        values = reducer.read(rows, number)
+        sums += shell_sums(values[0] - values[1] if len(rows) > 1 else values[0], None, lattice, block)
+    radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
+    bands: list[Band] = []
+    upper = lattice.xi_max
+    while True:
+        is_last = upper / 2 < _FEWEST_SPACINGS * lattice.spacing
+        window = smooth_step(radii, upper) - (0.0 if is_last else smooth_step(radii, upper / 2))
+        squares = np.array([np.sum(window * sums * (1 + radii**2) ** order) for order in orders])
+        width = upper * (0.75 if is_last else 0.375)
+        bands.insert(0, (upper, squares, float(np.sum(window * sums)) / width, 0.0))
+        if is_last:
+            return bands
+        upper /= 2
+
+
+def _octaves(fields: StoredFields, rows: list[int], orders: tuple[float, ...]) -> list[Band]:
+    """Return the same of each octave beyond the lattice."""
+    tails = fields.reducer(orders).tails
+    if tails is None:
+        return []
+    values = [tails.read(row) for row in rows]
+    sums = tails.weights.sums(squared_moduli(values[0] - values[1] if len(rows) > 1 else values[0]))
+    partition: list[Octave] = tails.weights.partition
+    return [
+        (octave.highest, one.squares, one.energy, one.energy_deviation)
+        for octave, one in zip(partition, sums, strict=True)
+    ]
