@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -206,6 +207,7 @@ def choose_lattice(
             accuracy,
             Support(np.array(surface.area + reference.area), widths, reach),
             label,
+            os.cpu_count() or 1,
         )
         for label, surface in surfaces.items()
     }

@@ -141,14 +141,14 @@ def octave_values(
         elif not part.is_drawn:
             lattice = sampling.lattices[number]
             if SurfaceSize.of(surface).prefers_exact(lattice):
-                values.append(_at_frequencies(surface, quadrature.frequencies[part.samples]))
+                values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
                 continue
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
             values.append(block.ravel()[part.places])
         elif known is not None and known.octave.sampling.drawn is sampling.drawn:
             values.append(known.values[known.octave.quadrature.parts[-1].samples])
         else:
-            values.append(_at_frequencies(surface, quadrature.frequencies[part.samples]))
+            values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
     joined = np.concatenate(values)
     count = check_count(surface) if checks is None else checks
     return OctaveValues(octave, joined, _compared(surface, quadrature, joined, orders, count))
@@ -162,9 +162,9 @@ def check_count(surface: Surface) -> int:
     return int(np.clip(_PAIRS // triangles, _FEWEST_CHECKS, _MOST_CHECKS))
 
 
-def _at_frequencies(surface: Surface, frequencies: Reals) -> Complexes:
+def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:
     return (
-        sampled_transform(surface, frequencies)
+        sampled_transform(surface, frequencies, execution.threads)
         if isinstance(surface, Mesh)
         else exact_transform_of(surface, frequencies)
     )

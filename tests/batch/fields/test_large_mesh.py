@@ -20,7 +20,9 @@ from sobolev_batch.batch.fields.tasks import FieldSettings, Job
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
+from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.sources.registry import Fingerprint, Member
 from tests.support.studies import small_table
 
@@ -64,6 +66,23 @@ def computed(client: Client, job: Job, batches: int, blocks: tuple[Block, ...]) 
     ((_, record),) = Cluster(client, workers).run([field_task(job, sizes)])
     assert isinstance(record, Record)
     return record
+
+
+@pytest.mark.parametrize("batches", [2, 3, 7])
+def test_octaves_of_batches_add_up_to_those_of_the_whole(client: Client, store_path: Path, batches: int) -> None:
+    lattice = {"xi_max": 3.0, "M": 16, "octaves": 2}
+    plan = make_plan(Study.from_table(small_table(lattice=lattice, norm={"orders": [-1.5, -2.0]})))
+    whole = computed(client, job_of(plan, store_path, Ball("ball", 0)), 1, plan.blocks)
+    job = job_of(plan, store_path, Ball("ball", 0), row=1)
+    record = computed(client, job, batches, plan.blocks)
+    assert record.status == "complete", record.reason
+    expected, found = job.store.read_octaves([0, 1], [one.checksums[-1] for one in (whole, record)])
+    assert np.abs(found - expected).max() < 2e-8 * whole.facts.area
+    qualities = [Quality.from_json(one.quality) for one in (whole, record)]
+    for quality in qualities:
+        assert quality.tail is not None
+        assert quality.tail.own_limit[0] == pytest.approx(2 * whole.facts.area)
+    assert (qualities[1].error_norms(SobolevWeights(plan.lattice, (-1.5,), 3.0)) < 1e-6 * whole.facts.area).all()
 
 
 @pytest.mark.parametrize("batches", [2, 3, 7])

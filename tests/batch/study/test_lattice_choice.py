@@ -23,7 +23,8 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from tests.support.studies import small_table, variable
 
-RTOL = 1e-3
+# So high that one lattice is chosen, and no octaves.
+RTOL = 5e-4
 original = run_pilot
 
 
