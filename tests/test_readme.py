@@ -14,7 +14,7 @@ from tests.support.repository import ROOT, blocks
 def test_the_study_file_is_valid(tmp_path: Path) -> None:
     study, lattice = blocks("README.md", "toml")
     (tmp_path / "study.toml").write_text(study)
-    assert sb.Study.from_toml(tmp_path / "study.toml").orders == (-3.0, -6.0)
+    assert sb.Study.from_toml(tmp_path / "study.toml").orders == (-1.5, -2.0, -4.0)
     on_lattice = re.sub(r"^\[accuracy\].*?\n\n", lattice + "\n", study, flags=re.M | re.S)
     (tmp_path / "study.toml").write_text(on_lattice)
     assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(5.0, 64)

@@ -243,7 +243,7 @@ def _choose_octaves(
     for label in demanding:
         problem = problems[label]
         accuracy = replace(problem.accuracy, rtol=_PILOT_FRACTION * problem.accuracy.rtol)
-        solutions[label] = solve_in_octaves(replace(problem, accuracy=accuracy), seed=0)
+        solutions[label] = solve_in_octaves(replace(problem, accuracy=accuracy), 0, problem.accuracy)
     lattices = (solution.lattice for solution in solutions.values() if solution.lattice is not None)
     lattice = max(lattices, key=lambda one: one.M)
     surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in problems.values())]

@@ -38,10 +38,11 @@ _NUMBERS = (
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 _NOTE = """\
 The true distance lies within its error, the sum of truncation (frequencies beyond
-xi_max; they can only add to the distance), aliasing (spacing of the lattice) and
-discretisation (quadrature and NUFFT). Lengths are in the study's unit. A distance
-marked * is not larger than its error, and gives no rate. The column "area" is the
-fraction of the squared distance that a change of total area alone explains."""
+the highest one), aliasing (spacing of the lattice), discretisation (quadrature and
+NUFFT) and chance (random frequencies, if the study samples octaves). Lengths are in
+the study's unit. A distance marked * is not larger than its error, and gives no rate.
+The column "area" is the fraction of the squared distance that a change of total area
+alone explains."""
 _PROXIMITY_NOTE = """\
 Hausdorff and Chamfer distances are for orientation, and the same at all orders.
 Hausdorff is a lower bound: the largest distance from any vertex or sampled point to

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, rounded_up
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
@@ -122,15 +123,16 @@ class MeasuredOctave:
         return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
 
 
-def solve_in_octaves(problem: Problem, seed: int) -> Solution:
+def solve_in_octaves(problem: Problem, seed: int, acceptable: Accuracy | None = None) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     Args:
         problem: Surfaces, orders and accuracy.
         seed: Seed of the random frequencies. The same seed gives the same result.
+        acceptable: Accuracy that will do where that of the problem is out of reach.
 
     Returns:
-        The solution of the first of a few rounds that meets the accuracy.
+        The solution of the first of a few rounds that meets the accuracy, or of the last.
 
     Raises:
         AccuracyError: The accuracy lies below the rounding of fields, or would take too many samples.
@@ -143,6 +145,8 @@ def solve_in_octaves(problem: Problem, seed: int) -> Solution:
             return solution
         if not search.refine():
             break
+    if acceptable is not None and np.all(acceptable.met(solution.estimate)):
+        return solution
     raise _out_of_reach(problem, solution.estimate)
 
 

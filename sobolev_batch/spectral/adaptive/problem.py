@@ -66,9 +66,10 @@ class Problem:
 
         Triangles that both surfaces have cancel, and are left out; none may remain.
         """
-        surfaces = _centered(_without_shared_triangles(surfaces))
+        surfaces = _without_shared_triangles(surfaces)
         if not surfaces:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
+        surfaces = _centered(surfaces)
         extent = Extent.union([surface.extent for surface in surfaces])
         area = np.array(sum(surface.area for surface in surfaces))
         return cls(surfaces, orders, accuracy, Support(area, extent.widths, extent.reach), label, threads)

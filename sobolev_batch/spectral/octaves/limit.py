@@ -38,6 +38,8 @@ _REGULAR, _FASTEST_FALL, _LEAST_STEADINESS, _OVERSHOOT = 3, 0.25, 0.6, 0.4
 _SLOWEST_FALL = 0.5
 # Later swings were measured to exceed the bound by a sixth.
 _CAUTION = 1.25
+# If the energy grows by more than this from octave to octave, it may swing by this fraction of the limit.
+_STEEPEST_GROWTH, _SWING = 2.5, 0.9
 
 
 @dataclass(frozen=True)
@@ -110,24 +112,24 @@ def _approach(limit: float, energies: Reals, deviations: Reals) -> tuple[float, 
     """Return the mean energy beyond the last octave, and how far off it may be.
 
     Where the energy approaches its limit in a regular way, it goes on to do so. Else it may oscillate: between parallel
-    surfaces it swings about the limit until |ξ| is several times the inverse of their distance. Then the larger of its
-    last two distances from the limit bounds the next ones. What was foreseen after an earlier octave holds on if the
-    later ones agree with it.
+    surfaces it grows like |ξ|², rises through the limit to twice it, and swings about it until |ξ| is several times the
+    inverse of their distance. Then the larger of its last two distances from the limit bounds the next ones. What was
+    foreseen after an earlier octave holds on if the later ones agree with it.
     """
     gaps = limit - energies
     # Noise does not make a distance.
     sizes = np.maximum(np.abs(gaps) - 2 * deviations, 0.0)
     envelope, mean, uncertain = sizes[0], limit, np.inf
-    for last in range(len(gaps)):
+    for last, energy in enumerate(energies):
         before, envelope = envelope, max(_SLOWEST_FALL * envelope, sizes[last])
+        expected, spread = limit, _CAUTION * max(before, envelope)
         fall = _regular_fall(gaps[: last + 1])
-        expected = limit if fall is None else limit - fall * gaps[last] / 2
-        spread = (
-            _CAUTION * max(before, envelope)
-            if fall is None
-            else (0.5 + _OVERSHOOT) * fall * gaps[last] + 3 * deviations[last]
-        )
-        if spread <= uncertain or abs(energies[last] - mean) > uncertain + 2 * deviations[last]:
+        if last and _STEEPEST_GROWTH * energies[last - 1] < energy < limit:
+            spread = max(spread, _SWING * limit)
+        elif fall is not None:
+            expected = limit - fall * gaps[last] / 2
+            spread = (0.5 + _OVERSHOOT) * fall * gaps[last] + 3 * deviations[last]
+        if spread <= uncertain or abs(energy - mean) > uncertain + 2 * deviations[last]:
             mean, uncertain = expected, spread
     return float(mean), float(uncertain)
 

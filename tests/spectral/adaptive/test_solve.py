@@ -77,9 +77,30 @@ def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
     assert distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
 
 
-def test_equal_surfaces_have_a_distance_below_rounding() -> None:
-    dataset = distance(BOX, Mesh(BOX.vertices, BOX.triangles), -3.0, rtol=1e-3)
-    assert dataset["distance"].item() <= dataset["error"].item()
+def test_equal_surfaces_have_the_distance_zero() -> None:
+    # Whatever the order of vertices and triangles, and their orientation.
+    order = np.random.default_rng(0).permutation(len(BOX.vertices))
+    places = np.argsort(order)
+    shuffled = Mesh(BOX.vertices[order], places[BOX.triangles[::-1, [2, 0, 1]]])
+    for other in (Mesh(BOX.vertices, BOX.triangles), shuffled):
+        dataset = distance(BOX, other, [-0.6, -3.0], rtol=1e-3)
+        assert (dataset["distance"] == 0).all()
+        assert (dataset["error"] == 0).all()
+        assert dataset["within"].all()
+
+
+def test_what_surfaces_share_cancels() -> None:
+    ball = icosphere(2)
+    less = Mesh(ball.vertices, ball.triangles[5:])
+    patch = Mesh(ball.vertices, ball.triangles[:5])
+    found, expected = distance(ball, less, -1.5, rtol=2e-2), norm(patch, -1.5, rtol=2e-2)
+    assert found["distance"].item() == pytest.approx(expected["norm"].item(), rel=1e-6)
+    # One vertex moved by little: six thin triangles, of which lattices see next to nothing.
+    vertices = ball.vertices.copy()
+    vertices[7] *= 1 + 1e-6
+    near = distance(ball, Mesh(vertices, ball.triangles), -2.0, rtol=5e-2)
+    assert near["within"].item()
+    assert 0 < near["distance"].item() < 1e-5
 
 
 def test_refuses_what_has_no_meaning() -> None:

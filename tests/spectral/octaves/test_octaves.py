@@ -14,7 +14,7 @@ from sobolev_batch import Mesh, Sphere, Torus, icosphere
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
@@ -161,12 +161,13 @@ def test_known_values_are_not_computed_again() -> None:
 
 
 def test_parts_of_a_surface_add_up_to_it() -> None:
-    sampling, cut = sampling_of(BOX, 0), len(BOX.triangles) // 2
-    halves = [Mesh(BOX.vertices, BOX.triangles[:cut]), Mesh(BOX.vertices, BOX.triangles[cut:])]
+    ball = icosphere(3)
+    sampling, cut = sampling_of(ball, 0), len(ball.triangles) // 2
+    halves = [Mesh(ball.vertices, ball.triangles[:cut]), Mesh(ball.vertices, ball.triangles[cut:])]
     octave, settings = SampledOctave.of(sampling), settings_for(TARGET)
     first, second = (octave_values(half, octave, ORDERS, settings, checks=8) for half in halves)
-    together, whole = first + second, values_of(BOX, sampling)
-    assert np.abs(together.values - whole.values).max() < 1e-4 * BOX.area
+    together, whole = first + second, values_of(ball, sampling)
+    assert np.abs(together.values - whole.values).max() < 1e-4 * ball.area
     assert (together.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
     assert (together.error_norms(ORDERS) > 0).all()
 
@@ -210,3 +211,35 @@ def test_parts_that_coincide_cancel() -> None:
     # Counted twice, an area weighs four times as much.
     twice = Mesh(np.concatenate([BOX.vertices] * 2), np.concatenate([BOX.triangles, BOX.triangles + len(BOX.vertices)]))
     assert EnergyLimit.of([twice], [1]).value == pytest.approx(8 * BOX.area)
+
+
+def beyond_energies(energies: Reals, limit: float) -> tuple[float, float]:
+    """Mean energy beyond octaves of known energies, and how far off it may be."""
+    octaves = [Octave(1.0, index) for index in range(1, len(energies) + 1)]
+    zero = np.zeros(1)
+    sums = [OctaveSums(zero, zero, zero, float(energy), 0.0, 7, 0) for energy in energies]
+    mean, uncertain = beyond(octaves, sums, EnergyLimit(limit), (-1.0,))
+    tail = tail_integral(octaves[-1].highest, -1.0)
+    return mean.item() / tail, uncertain.item() / tail
+
+
+@pytest.mark.parametrize("gap", np.geomspace(0.01, 0.3, 25))
+def test_swings_about_the_limit_are_allowed_for(gap: float) -> None:
+    # Parallel surfaces: the energy swings about its limit, and is averaged over octaves.
+    def energy(cutoff: float) -> float:
+        radii = np.linspace(cutoff / 4, cutoff, 4001)
+        window = smooth_step(radii, cutoff) - smooth_step(radii, cutoff / 2)
+        return float(np.sum(window * (1 - np.cos(2 * np.pi * radii * gap))) / np.sum(window))
+
+    radii = np.linspace(1, 4096, 400_001)
+    for count in range(3, 8):
+        found, uncertain = beyond_energies(np.array([energy(2.0**k) for k in range(1, count + 1)]), 1.0)
+        weights = (1 - smooth_step(radii, 2.0**count)) / (1 + radii**2)
+        true = float(np.sum(weights * (1 - np.cos(2 * np.pi * radii * gap))) / np.sum(weights))
+        assert abs(true - found) <= uncertain + 1e-3, count
+
+
+def test_a_regular_approach_to_the_limit_goes_on() -> None:
+    found, uncertain = beyond_energies(np.array([1 - 0.5**k for k in range(1, 6)]), 1.0)
+    assert pytest.approx(found, abs=0.02) == 1 - 0.5**6
+    assert uncertain < 0.02
