@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -21,7 +22,7 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, lattice_attributes
+from sobolev_batch.spectral.metrics.datasets import LENGTH, VARIABLES, labelled, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
     Operand,
     check_surface,
@@ -35,6 +36,9 @@ from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_o
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
+# Fraction of an inner product's accuracy for each of the three numbers that it follows from, and the ratio of two norms
+# below which the larger one is computed again.
+_PART_OF_PRODUCT, _UNEQUAL = 0.125, 0.5
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
 
@@ -89,7 +93,16 @@ def norm(
     return _from_fields("norm", order, weights, shells_of(field, None, weights.lattice), [field])
 
 
-def inner_product(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
+def inner_product(
+    a: Operand,
+    b: Operand,
+    order: Orders,
+    *,
+    lattice: Lattice | None = None,
+    rtol: float | None = None,
+    memory: float | str | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
     """Return the Sobolev inner product <a, b>_s of two surfaces' area measures, which is real.
 
     Args:
@@ -97,21 +110,28 @@ def inner_product(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | N
         b: Field on the same lattice, or a surface.
         order: One order s < -1/2, or several.
         lattice: Lattice to transform surfaces on. A field brings its own.
+        rtol: Largest error relative to ||a||_s ||b||_s, in place of a lattice; the inner product itself may be zero.
+        memory: Memory that a transform may take with rtol; see `distance`.
+        seed: Seed of the random frequencies with rtol; see `distance`.
 
     Returns:
         Dataset over `order` with `inner_product`, float64, in units of length. A single order has no
-        dimension. Attributes hold the lattice and the kernel.
+        dimension. Attributes hold the lattice and the kernel. With rtol there is also the `error`, in units of length.
 
     Raises:
         OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
-        InputError: A surface comes without a lattice.
+        InputError: A surface comes without a lattice or an rtol, or with both.
+        AccuracyError: The rtol is out of reach.
 
     >>> from sobolev_batch import Sphere, inner_product
     >>> f"{inner_product(Sphere(), Sphere(0.5), -2.0)['inner_product'].item():.6f}"
     '1.758104'
     """
     orders = check_orders(order)
+    if rtol is not None:
+        return _inner_product_to_accuracy((a, b), order, lattice, _accuracy(rtol, memory), seed)
+    _refuse_memory(memory)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         products = np.array([sphere_inner_product(a, b, s) for s in orders])
         return labelled(order, {"inner_product": products}, {})
@@ -200,6 +220,32 @@ def _to_accuracy(
     dataset = _dataset(name, order, solution.estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
     return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"]))
+
+
+def _inner_product_to_accuracy(
+    operands: tuple[Operand, Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
+) -> xr.Dataset:
+    """Compute an inner product from both norms and the distance: 2 <a, b> = ||a||² + ||b||² - ||a - b||²."""
+
+    def measured(name: str, some: Sequence[Operand], fraction: float) -> tuple[Reals, Reals]:
+        part = replace(accuracy, rtol=fraction * accuracy.rtol)
+        dataset = _to_accuracy(name, some, np.atleast_1d(order).tolist(), lattice, part, seed)
+        return dataset[name].to_numpy(), dataset["error"].to_numpy()
+
+    norms = [measured("norm", (operand,), _PART_OF_PRODUCT) for operand in operands]
+    # The larger norm must not drown the product.
+    ratio = float(np.min(norms[0][0] / norms[1][0])), float(np.min(norms[1][0] / norms[0][0]))
+    norms = [
+        measured("norm", (operand,), _PART_OF_PRODUCT * share) if share < _UNEQUAL else found
+        for operand, found, share in zip(operands, norms, reversed(ratio), strict=True)
+    ]
+    distances = measured("distance", operands, _PART_OF_PRODUCT * min(ratio))
+    squares = [(value**2, 2 * value * error + error**2) for value, error in (*norms, distances)]
+    product = (squares[0][0] + squares[1][0] - squares[2][0]) / 2
+    errors = sum(error for _, error in squares) / 2
+    dataset = labelled(order, {"inner_product": product, "error": errors}, {"rtol": accuracy.rtol, "seed": seed})
+    dataset["error"].attrs["units"] = LENGTH
+    return dataset
 
 
 def _from_fields(
