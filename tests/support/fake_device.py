@@ -35,7 +35,7 @@ FUNCTIONS = {
 # nor is any reduceat, since CuPy's loses digits.
 UFUNCS = {
     "absolute", "add", "bitwise_and", "bitwise_or", "cos", "divide", "exp", "left_shift", "maximum", "minimum",
-    "multiply", "negative", "not_equal", "right_shift", "subtract", "tan",
+    "multiply", "negative", "not_equal", "right_shift", "rint", "subtract", "tan",
 }  # fmt: skip
 
 # The fields of the options structure of cuFINUFFT 2.5.1.

@@ -21,7 +21,7 @@ from sobolev_batch.spectral.backends.costs import GPU_COSTS
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.fields import compute_field, field_for
-from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.lattice import Block, OctaveLattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
@@ -98,6 +98,17 @@ def test_batches_and_blocks_agree(block: Block) -> None:
     mesh = icosphere(3)
     found, expected = (
         transform_block(mesh, LATTICE, block, DOUBLE, Execution(backend, batch=20_000))
+        for backend in (Device().backend(), CPU)
+    )
+    assert found.backend == "cufinufft"
+    assert_agree(found, expected, mesh)
+
+
+def test_lattices_of_octaves_agree() -> None:
+    # Turned and shifted, with a period far below the size of the mesh.
+    mesh, lattice = icosphere(4), OctaveLattice.random(8.0, 32.0, 32, np.random.default_rng(0))
+    found, expected = (
+        transform_block(mesh, lattice, lattice.half, DOUBLE, Execution(backend, batch=20_000))
         for backend in (Device().backend(), CPU)
     )
     assert found.backend == "cufinufft"
