@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.accuracy import left_to_us, stored_bytes
 from benchmarks.devices import on_a_gpu
+from benchmarks.low_orders import low_orders
 from benchmarks.memory import peaks
 from benchmarks.scale import tiny_meshes
 from benchmarks.studies import all_pairs, study_overhead
@@ -26,6 +27,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "7": stored_bytes,
     "8": peaks,
     "9": on_a_gpu,
+    "10": low_orders,
     "growth": growth,
     "scale": tiny_meshes,
 }
@@ -43,7 +45,8 @@ def main() -> None:
     facts = [
         *machine_facts(),
         f"times are medians of {effort.repeats} turns each, taken alternately",
-        "items 1 to 4: ratios of times are other / ours; items 5 to 7 and 9: ours / other; "
+        "items 1 to 4: ratios of times are other / ours; items 5 to 7 and 9: ours / other; item 10: processor seconds, "
+        "and other / ours against sums; "
         "distances: relative difference",
     ]
     print("\n".join(["", format_table(rows), "", *facts]))

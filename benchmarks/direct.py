@@ -34,6 +34,19 @@ def frequencies_of(lattice: Lattice, block: Block) -> Reals:
 
 
 @numba.njit(parallel=True, fastmath=True)
+def exponential_sum(points: Reals, weights: Reals) -> float:
+    """The double sum of w_i w_j exp(-2π |x_i - x_j|) over points (n, 3) with weights (n,), on all cores."""
+    total = 0.0
+    for i in numba.prange(len(points)):
+        row = 0.0
+        for j in range(len(points)):
+            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+            row += weights[j] * np.exp(-2 * np.pi * np.sqrt(x * x + y * y + z * z))
+        total += weights[i] * row
+    return total
+
+
+@numba.njit(parallel=True, fastmath=True)
 def _sums(vertices: Reals, triangles: NDArray[np.int64], doubled_areas: Reals, wavevectors: Reals) -> Complexes:
     values = np.zeros(len(wavevectors), dtype=np.complex128)
     for j in numba.prange(len(wavevectors)):

@@ -1,0 +1,94 @@
+"""Orders near -1/2: what a distance costs whose tail is measured, and what a sum over points costs instead."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sobolev_batch as sb
+from benchmarks.table import Row, as_seconds, at_most
+from benchmarks.timing import Effort
+from sobolev_batch.surfaces.sources.decimation import DecimatedMember
+from sobolev_batch.surfaces.sources.files import FileSource
+
+Found = TypeVar("Found")
+
+# Order, rtol, and most processor seconds, for a coarse organic mesh against a fine one.
+_REQUESTS = ((-2.0, 1e-2, 3.0), (-2.0, 1e-3, 10.0), (-1.0, 1e-2, 20.0), (-0.6, 1e-1, 20.0))
+_OF_SPHERE = (-2.0, 1e-3, 10.0)
+_CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
+
+
+def low_orders(effort: Effort) -> Iterator[Row]:
+    """Item 10: distances of meshes at low orders, and the sum over points that a user would write instead."""
+    coarse, fine = _pair(effort)
+    what = f"{len(coarse.triangles):,} against {len(fine.triangles):,} triangles"
+    for order, rtol, most in _REQUESTS:
+        yield _row(what, coarse, fine, order, rtol, most)
+    order, rtol, most = _OF_SPHERE
+    level = 3 if effort.quick else 5
+    yield _row(f"T_{level} against the sphere", sb.icosphere(level), sb.Sphere(), order, rtol, most)
+    yield from _against_points(what, coarse, fine, effort)
+
+
+def _row(what: str, a: sb.Mesh, b: sb.Mesh | sb.Sphere, order: float, rtol: float, most: float) -> Row:
+    seconds, found = _processor_seconds(lambda: sb.distance(a, b, order, rtol=rtol))
+    reported = found["error"].item() / found["distance"].item()
+    text = f"{what}, order {order:g}, rtol {rtol:g}: processor seconds, relative error {reported:.1g}"
+    return Row("10", text, as_seconds(seconds), "", seconds, at_most(most))
+
+
+def _against_points(what: str, coarse: sb.Mesh, fine: sb.Mesh, effort: Effort) -> Iterator[Row]:
+    """Compare with double sums of the kernel of order -2, exp(-2πr), over centroids of triangles cut once and not."""
+    from benchmarks.direct import exponential_sum
+
+    seconds, found = _processor_seconds(lambda: sb.distance(coarse, fine, -2.0, rtol=1e-2))
+    exponential_sum(*_points(sb.icosphere(0), sb.icosphere(0), 0))  # compiled by now
+    sums = []
+    for cuts in range(1 if effort.quick else 2):
+        taken, square = _processor_seconds(partial(exponential_sum, *_points(coarse, fine, cuts)))
+        sums.append((taken, float(np.sqrt(np.pi**2 * square))))
+    for cuts, (taken, distance) in enumerate(sums):
+        digits = abs(distance - found["distance"].item()) / found["distance"].item()
+        text = f"{what}, order -2: sum over centroids, cut {cuts} times, off by {digits:.1g}"
+        yield Row("10", text, as_seconds(seconds), as_seconds(taken), taken / seconds)
+
+
+def _points(a: sb.Mesh, b: sb.Mesh, cuts: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroids (n, 3) of the triangles of both meshes, each cut in four so often, and their signed areas."""
+    points, weights = [], []
+    for mesh, sign in ((a, 1.0), (b, -1.0)):
+        corners = mesh.vertices[mesh.triangles]
+        for _ in range(cuts):
+            middles = (corners + np.roll(corners, -1, axis=1)) / 2
+            first = [np.stack([corners[:, i], middles[:, i], middles[:, i - 1]], axis=1) for i in range(3)]
+            corners = np.concatenate([*first, middles])
+        points.append(corners.mean(axis=1))
+        weights.append(sign * np.tile(mesh.areas / 4**cuts, 4**cuts))
+    return np.concatenate(points), np.concatenate(weights)
+
+
+def _processor_seconds(work: Callable[[], Found]) -> tuple[float, Found]:
+    started = time.process_time()
+    result = work()
+    return time.process_time() - started, result
+
+
+def _pair(effort: Effort) -> tuple[sb.Mesh, sb.Mesh]:
+    """A cortical surface and its decimation, or two icospheres where it is not installed."""
+    if effort.quick or find_spec("nilearn") is None:
+        return sb.icosphere(1), sb.icosphere(3)
+    (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
+    fine = original.load()
+    coarse = DecimatedMember("cortex", 0, original, 1280).load()
+    assert isinstance(fine, sb.Mesh)
+    assert isinstance(coarse, sb.Mesh)
+    unit = sb.Similarity.to_unit_ball(fine)
+    return coarse.moved(unit.scale, unit.origin), fine.moved(unit.scale, unit.origin)
