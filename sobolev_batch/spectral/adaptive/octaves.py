@@ -243,7 +243,8 @@ class _Search:
         values = np.sqrt(self.squares)
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
-        settings, execution = settings_for(target), Execution(threads=problem.threads)
+        settings = settings_for(target)
+        execution = Execution(threads=problem.threads, allowed_bytes=problem.accuracy.allowed_bytes)
         octave = SampledOctave.of(sampling)
         found = tuple(
             octave_values(
@@ -296,11 +297,12 @@ class _Search:
             drawn = self._drawn(sampling.octave, count, drawn.uniform_fraction)
         else:
             intervals = 2 * round(lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
-            lattices = (*lattices, self._lattice(sampling.octave, min(intervals, _LARGEST_M)))
+            lattices = (*lattices, self._lattice(sampling.octave, intervals))
         return replace(sampling, lattices=lattices, drawn=drawn)
 
     def _lattice(self, octave: Octave, intervals: int) -> OctaveLattice:
-        return OctaveLattice.random(octave.lowest, octave.highest, intervals, self.rng)
+        largest = min(_LARGEST_M, self.problem.accuracy.largest_intervals)
+        return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), self.rng)
 
     def _drawn(self, octave: Octave, count: int, uniform_fraction: float) -> DrawnFrequencies:
         seed = int(self.rng.integers(2**53))
