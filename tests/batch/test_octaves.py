@@ -208,6 +208,14 @@ def test_octaves_beyond_a_given_lattice_lower_its_errors(client: Client, tmp_pat
         run(Study.from_table(with_lattice(0)), tmp_path / "4.zarr", client)
 
 
+def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -> None:
+    families = [{"name": name, "source": "icosphere", "levels": [1]} for name in ("ico", "copy")]
+    run(Study.from_table({**with_lattice(2), "family": families}), store_path, client)
+    pair = open_store(store_path)["distances"].to_dataset().sel(mesh="ico/1", other="copy/1")
+    assert (pair["distance"] == 0).all()
+    assert (pair["error"] < 1e-6).all()
+
+
 def test_octaves_are_the_same_in_a_task_of_their_own(client: Client, tmp_path: Path) -> None:
     # Small chunks: several blocks, and a task for the octaves of each mesh.
     table = {**with_lattice(2), "family": [{"name": "ico", "source": "icosphere", "levels": [2]}]}

@@ -112,5 +112,8 @@ class TailReducer:
             known = self.qualities[one].difference_limit
             if against == self.reference and known is not None:
                 return EnergyLimit(*known)
+        if not last_energy:
+            # Equal meshes have equal values.
+            return EnergyLimit(0.0)
         highest = self.qualities[row].own_limit[0] + self.qualities[other].own_limit[0]
         return EnergyLimit.between(_LEAST_LIMIT * last_energy, highest)
