@@ -147,7 +147,14 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
         if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
             break
         step = _next_step(problem, step, sums)
-    return solution
+    return _not_below_rounding(problem, solution)
+
+
+def _not_below_rounding(problem: Problem, solution: Solution) -> Solution:
+    """Return a solution whose errors are no smaller than rounding where its numbers are."""
+    found = solution.estimate
+    rounding = np.where(found.values <= problem.rounding, problem.rounding, 0.0)
+    return replace(solution, estimate=replace(found, discretisation=np.maximum(found.discretisation, rounding)))
 
 
 def run_pilot(problem: Problem) -> Pilot:
