@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.analysis.reduce import StoredFields
+from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import location_of
@@ -108,13 +109,14 @@ class StoreAccessor:
         """
         rows = self._fields(mesh) if other is None else self._fields(mesh, other)
         fields, indices, orders = rows[0], [int(row) for row in rows[1:]], check_orders(order)
-        bands = [*_inner_bands(fields, indices, orders), *_octaves(fields, indices, orders)]
+        reducer = fields.reducer(orders)
+        bands = [*_inner_bands(reducer, indices), *_octaves(reducer, indices)]
         upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
         upper *= _HALF_WEIGHT
         lower = np.array([0.0, *upper[:-1]])
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
-        areas = fields.reducer(orders).areas[indices].sum()
+        areas = reducer.areas[indices].sum()
         with np.errstate(divide="ignore"):
             longest = 1 / lower
         return xr.Dataset(
@@ -163,10 +165,9 @@ def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[
 Band = tuple[float, Reals, float, float]
 
 
-def _inner_bands(fields: StoredFields, rows: list[int], orders: tuple[float, ...]) -> list[Band]:
+def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
     """Return the upper end, squares (orders,), energy and its error of each octave within the lattice."""
-    lattice = fields.lattice
-    reducer = fields.reducer(orders)
+    lattice, orders = reducer.lattice, reducer.orders
     sums = np.zeros(lattice.shell_count)
     for number, block in enumerate(reducer.blocks):
         values = reducer.read(rows, number)
@@ -185,9 +186,9 @@ def _inner_bands(fields: StoredFields, rows: list[int], orders: tuple[float, ...
         upper /= 2
 
 
-def _octaves(fields: StoredFields, rows: list[int], orders: tuple[float, ...]) -> list[Band]:
+def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
     """Return the same of each octave beyond the lattice."""
-    tails = fields.reducer(orders).tails
+    tails = reducer.tails
     if tails is None:
         return []
     values = [tails.read(row) for row in rows]

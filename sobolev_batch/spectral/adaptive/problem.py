@@ -178,7 +178,7 @@ class Solution:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """How the numbers were computed, as attributes."""
+        """Settings that the numbers were computed with, as attributes."""
         if self.lattice is None:
             return {}
         settings = [field.settings for field in self.fields]

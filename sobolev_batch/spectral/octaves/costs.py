@@ -22,7 +22,7 @@ _OVERHEAD_TRIANGLES = 50
 
 @dataclass(frozen=True)
 class SurfaceSize:
-    """What the time of a surface's transforms depends on.
+    """Size of a surface, on which the time of its transforms depends.
 
     Attributes:
         triangles: Number of triangles; zero for a surface that is no mesh.
