@@ -22,7 +22,7 @@ The public names by subject:
 - Studies: `Study`, `plan` and its `StudyPlan`, `run` and its `Summary`, `submit` and its `Submission`.
 - Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.
 - Results of a store: `table`, `matrix`, `report`, `write_witness`; plots on Matplotlib axes: `plot_convergence`,
-  `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_transform`, `plot_witness`.
+  `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_energy`, `plot_transform`, `plot_witness`.
 - Errors: all derive from `SobolevBatchError`.
 """
 

@@ -24,8 +24,9 @@ from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.plots import plot_convergence as plot_convergence
 from .results.figures.plots import plot_map as plot_map
 from .results.figures.plots import plot_matrix as plot_matrix
-from .results.figures.plots import plot_spectrum as plot_spectrum
 from .results.figures.plots import plot_transform as plot_transform
+from .results.figures.spectrum_plots import plot_energy as plot_energy
+from .results.figures.spectrum_plots import plot_spectrum as plot_spectrum
 from .results.figures.witness_plots import plot_witness as plot_witness
 from .results.meshes.export import write_witness as write_witness
 from .results.open import open_store as open_store

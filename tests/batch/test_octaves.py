@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from distributed import Client
+from matplotlib.container import ErrorbarContainer
 from numpy.typing import NDArray
 from scipy.special import erfc
 
@@ -26,6 +27,7 @@ from sobolev_batch import (
     norm,
     open_store,
     plan,
+    plot_energy,
     report,
     run,
     verify,
@@ -102,6 +104,33 @@ def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> No
     assert (found["area_part"] ** 2 + found["shape_part"] ** 2).values == pytest.approx(found["distance"].values ** 2)
 
 
+def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave_store: Path) -> None:
+    axes = plot_energy(octave_store)
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["limit", "ico", "ball"]
+    drawn = axes.containers[-1]
+    assert isinstance(drawn, ErrorbarContainer)
+    energies = np.asarray(drawn.lines[0].get_xydata())[:, 1]
+    radii = np.linspace(0, 200, 200_001)[1:]
+    difference = 2 / radii * (np.sin(2 * np.pi * radii) - BALL.radius * np.sin(2 * np.pi * BALL.radius * radii))
+    exact = 4 * np.pi * radii**2 * difference**2 / (8 * np.pi * (1 + BALL.radius**2))
+    tree = open_store(octave_store)
+    highest = tree.attrs["study"]["octaves"]["cutoff"] * 2.0 ** np.arange(
+        -1, len(tree.attrs["study"]["octaves"]["octaves"]) + 1
+    )
+    for number in range(1, len(highest)):
+        window = step_down(radii / highest[number]) - step_down(radii / highest[number - 1])
+        mean = np.average(exact, weights=window)
+        assert energies[number - len(highest)] == pytest.approx(mean, rel=0.15)
+    assert energies[-1] == pytest.approx(1, abs=0.3)
+
+
+def step_down(fractions: Reals) -> Reals:
+    """The step between octaves by |ξ| over its end, written down once more."""
+    return np.asarray(0.5 * erfc(3 * (fractions - 0.75) / 0.25))
+
+
 def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> None:
     tree = xr.open_datatree(octave_store, engine="zarr")
     octaves = tree["octaves"].to_dataset()
@@ -111,9 +140,7 @@ def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> Non
     field = variable(tree, "fourier", "fourier").sel(mesh="reference")
     x, y, z = (field[name].values for name in ("xi_x", "xi_y", "xi_z"))
     square = (x**2)[:, None, None] + (y**2)[:, None] + z**2
-    # The step, written down once more.
-    cutoff = tree.attrs["study"]["octaves"]["cutoff"]
-    step = 0.5 * erfc(3 * (np.sqrt(square) / cutoff - 0.75) / 0.25)
+    step = step_down(np.sqrt(square) / tree.attrs["study"]["octaves"]["cutoff"])
     inner = (x[1] - x[0]) ** 3 * np.where(z > 0, 2.0, 1.0) * step * np.abs(field.values) ** 2
     for order in (-0.8, -1.0, -2.0):
         tail = (octaves["weight"].values * lengths**order * of_reference).sum()

@@ -1,4 +1,4 @@
-"""Plots of a store: convergence, transforms along one frequency axis, distance matrices, maps, spectra."""
+"""Plots of a store: convergence, transforms along one frequency axis, distance matrices, maps."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.embedding import Embedding, clustered_order
 from sobolev_batch.results.figures.spectra import Spectra, spread
+from sobolev_batch.results.figures.spectrum_plots import energy_figure, spectrum_figure
 from sobolev_batch.results.figures.style import (
     add_legend,
+    error_bars,
     escaped,
     family_styles,
     hide_frame,
@@ -43,9 +44,6 @@ _MOST_CURVES = 5
 _MOST_TICKS = 40
 # Distance between names on a map, as a fraction of its width.
 _NAMES_APART = 0.08
-# Smaller fractions are not written into their cells.
-_SMALLEST_SHARE = 0.005
-_MOST_HORIZONTAL_BANDS = 6
 _CONVERGENCE_INCHES, _TRANSFORM_INCHES, _MATRIX_INCHES, _MAP_INCHES = 3.6, 3.4, 5.6, 4.4
 
 
@@ -83,7 +81,7 @@ def plot_convergence(store: AnyStore, order: float | None = None, ax: Axes | Non
         sizes, values, errors = (ordered[name].to_numpy() for name in ("edge_length", "relative", "relative_error"))
         style = f"{marker}-" if (ordered["level"] >= 0).all() else marker
         axes.loglog(sizes, values, style, color=color, label=escaped(str(family)), markersize=4, linewidth=1.2)
-        axes.errorbar(sizes, values, yerr=_error_bars(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
+        axes.errorbar(sizes, values, yerr=error_bars(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
     if len(frame):
         _draw_slope(axes, frame["edge_length"].to_numpy(), frame["relative"].to_numpy())
         add_legend(axes)
@@ -235,68 +233,11 @@ def plot_map(store: AnyStore, order: float | None = None, ax: Axes | None = None
     return axes
 
 
-def plot_spectrum(store: AnyStore, order: float | None = None, ax: Axes | None = None) -> Axes:
-    """Plot the fractions of each mesh's squared distance to the reference by wavelength, as a heat map.
-
-    The field of each mesh is read; up to 24 meshes are drawn, evenly through the study.
-
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders; default its first.
-        ax: Axes to draw on; its figure gets a colour bar too.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: The store has no tables yet, lacks the order, or has no mesh to compare.
-        DamageError: A field is damaged.
-
-    >>> import sobolev_batch as sb
-    >>> ax = sb.plot_spectrum("storage/icosphere.zarr", order=-10)
-    >>> [text.get_text() for text in ax.get_yticklabels()]
-    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3']
-    """
-    tree = as_tree(store)
-    order = _order_of(tree, order)
-    with fields_read(store):
-        spectra = Spectra.of(tree, order)
-    if spectra is None:
-        raise InputError("the store has no mesh to compare: the reference or all others are not computed")
-    return draw_spectrum(spectra, order, ax)
-
-
-def draw_spectrum(spectra: Spectra, order: float, ax: Axes | None = None) -> Axes:
-    """Plot spectra of one order; see `plot_spectrum`."""
-    axes = ax or new_axes(spectrum_inches(spectra))
-    shares = spectra.shares[:, spectra.orders.index(order)]
-    image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
-    axes.figure.colorbar(image, ax=axes, label="fraction of the squared distance", format=PercentFormatter(1.0, 0))
-    for (i, j), share in np.ndenumerate(shares):
-        if share >= _SMALLEST_SHARE:
-            color = "white" if share > 0.6 * np.nanmax(shares) else "black"
-            axes.text(j, i, f"{share:.0%}", ha="center", va="center", fontsize=7, color=color)
-    # Long labels would run into each other.
-    is_turned = len(spectra.bands) > _MOST_HORIZONTAL_BANDS
-    rotation, alignment = (20, "right") if is_turned else (0, "center")
-    axes.set_xticks(range(len(spectra.bands)), spectra.bands, fontsize=7.5, rotation=rotation, ha=alignment)
-    axes.set_yticks(range(len(spectra.labels)), [shortened(label) for label in spectra.labels], fontsize=7.5)
-    axes.set_xlabel("wavelength in the study's unit")
-    axes.set_title(f"differences by wavelength, order {order:g}")
-    hide_frame(axes)
-    return axes
-
-
-def spectrum_inches(spectra: Spectra) -> float:
-    """Return the height of a plot of spectra."""
-    return 1.6 + 0.24 * len(spectra.labels)
-
-
 def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """Write the plots of an open store into a folder, with a panel for each order or family.
 
-    The files are convergence.png, transform.png and spectrum.png; where the study asks for the distances of all pairs,
-    matrix.png and map.png too.
+    The files are convergence.png, transform.png, spectrum.png and energy.png, which has one panel; where the study asks
+    for the distances of all pairs, matrix.png and map.png too.
 
     Returns:
         Paths of the pictures.
@@ -312,7 +253,7 @@ def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     if has_pairs(tree):
         figures |= {"matrix.png": matrix_figure(tree, orders), "map.png": map_figure(tree, orders)}
     if "similarity" in tree.attrs and (spectra := Spectra.of(tree)) is not None:
-        figures["spectrum.png"] = spectrum_figure(spectra, orders)
+        figures |= {"spectrum.png": spectrum_figure(spectra, orders), "energy.png": energy_figure(tree, spectra)}
     return write_figures(figures, Path(folder))
 
 
@@ -329,11 +270,6 @@ def matrix_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
 def map_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
     """Return `plot_map` for each order."""
     return panels(orders, _MAP_INCHES, partial(plot_map, tree))
-
-
-def spectrum_figure(spectra: Spectra, orders: Sequence[float]) -> Figure:
-    """Return `plot_spectrum` for each order."""
-    return panels(orders, spectrum_inches(spectra), partial(draw_spectrum, spectra))
 
 
 def has_pairs(tree: xr.DataTree) -> bool:
@@ -379,12 +315,6 @@ def _legible(points: np.ndarray, first: int) -> list[int]:
         if all(np.linalg.norm(points[i] - points[j]) > apart for j in kept):
             kept.append(i)
     return kept
-
-
-def _error_bars(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return error bars that stay above zero, as a logarithmic axis needs."""
-    known = np.nan_to_num(errors)
-    return np.stack([np.minimum(known, 0.999 * values), known])
 
 
 def _omission(tree: xr.DataTree, matrix: Matrix) -> str:

@@ -33,6 +33,8 @@ class Spectra:
         shares: Fractions (meshes, orders, bands) of the squared distance, which sum to one over the bands.
         longest: Longest wavelength (bands,) in the study's unit, decreasing; the first is infinite.
         shortest: Shortest wavelength (bands,) in the study's unit.
+        energies: Energy ∫_{|ξ|=r} |a^ - b^|² dS of the difference, as a fraction of twice both areas (meshes, bands).
+        energy_errors: Standard error of these, zero for bands of a lattice.
         own: One unit of the study in the meshes' own unit of length.
     """
 
@@ -42,6 +44,8 @@ class Spectra:
     shares: Reals
     longest: Reals
     shortest: Reals
+    energies: Reals
+    energy_errors: Reals
     own: float
 
     @classmethod
@@ -70,7 +74,18 @@ class Spectra:
             spectra = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
         shares = np.stack([np.asarray(one["share"].transpose("order", "band")) for one in spectra])
         longest, shortest = (spectra[0][name].to_numpy() for name in ("longest_wavelength", "shortest_wavelength"))
-        return cls(tuple(labels), len(others), orders, shares, longest, shortest, 1 / scale)
+        areas = finished_group(tree, "meshes")["area"]
+        limits = 2 * (areas.sel(mesh=labels).to_numpy() + areas.sel(mesh=reference).item())
+        energies = np.stack([one["energy"].to_numpy() for one in spectra]) / limits[:, None]
+        errors = np.zeros_like(energies)
+        if "octaves" in tree:
+            errors = np.stack([one["energy_error"].to_numpy() for one in spectra]) / limits[:, None]
+        return cls(tuple(labels), len(others), orders, shares, longest, shortest, energies, errors, 1 / scale)
+
+    @property
+    def wavelengths(self) -> Reals:
+        """Wavelength at the middle frequency of each band, in the study's unit."""
+        return np.asarray(2 / (1 / self.longest + 1 / self.shortest))
 
     @property
     def bands(self) -> tuple[str, ...]:

@@ -8,9 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import StoreError
 from sobolev_batch.results.tables.formatting import middle_cut
@@ -71,6 +73,12 @@ def add_legend(axes: Axes) -> None:
         labels = [*labels[:kept], f"and {len(labels) - kept} more"]
         handles = handles[: kept + 1]
     axes.legend(handles, labels, frameon=False, fontsize="small")
+
+
+def error_bars(values: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return error bars that stay above zero, as a logarithmic axis needs."""
+    known = np.nan_to_num(errors)
+    return np.stack([np.minimum(known, 0.999 * values), known])
 
 
 def save(figure: Figure, target: object, **options: object) -> None:

@@ -20,9 +20,9 @@ from sobolev_batch.results.figures.plots import (
     has_pairs,
     map_figure,
     matrix_figure,
-    spectrum_figure,
 )
 from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.figures.spectrum_plots import energy_figure, spectrum_figure
 from sobolev_batch.results.figures.style import save
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
 from sobolev_batch.results.meshes.render import render
@@ -162,6 +162,7 @@ def _pictures(tree: xr.DataTree, spectra: Spectra | None, views: Views) -> dict[
         "matrix": [],
         "map": [],
         "spectrum": [],
+        "energy": [],
         "witness": _witness_pictures(views),
     }
     if has_pairs(tree):
@@ -171,6 +172,9 @@ def _pictures(tree: xr.DataTree, spectra: Spectra | None, views: Views) -> dict[
         pictures["spectrum"] = one_for_each_order(
             "Squared distance by wavelength", lambda orders: spectrum_figure(spectra, orders)
         )
+        pictures["energy"] = [
+            Picture(_data_url(energy_figure(tree, spectra)), "Energy of the differences by wavelength")
+        ]
     return pictures
 
 

@@ -35,6 +35,7 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits:
         "convergence": _convergence(tree, orders, limits.points // len(orders)),
         "matrix": _matrices(tree, orders, limits),
         "spectrum": None if spectra is None else _spectra(spectra),
+        "energy": None if spectra is None else _energy(spectra, families_of(tree)),
         "witness": [_view(view) for view in views.views],
     }
 
@@ -95,6 +96,16 @@ def _spectra(spectra: Spectra) -> Json:
         "labels": spectra.labels,
         "bands": spectra.bands,
         "shares": [[_numbers(row, digits=3) for row in spectra.shares[:, k]] for k in range(len(spectra.orders))],
+    }
+
+
+def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> Json:
+    return {
+        "labels": spectra.labels,
+        "families": [family_of[label] for label in spectra.labels],
+        "wavelengths": _numbers(spectra.wavelengths),
+        "values": [_numbers(row) for row in spectra.energies],
+        "errors": [_numbers(row, digits=2) for row in spectra.energy_errors],
     }
 
 

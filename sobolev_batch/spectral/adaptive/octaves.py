@@ -35,6 +35,8 @@ _ROUNDS = 6
 _MOST_OCTAVES, _FEWEST_OCTAVES_OF_FACES = 24, 2
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
 _LIMIT_FRACTION = 0.4
+# Fraction of the permitted variance that may come from octaves that are not refined.
+_LEFT_FRACTION = 0.5
 # Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
 _USUAL_OCTAVES, _QUANTILE = 6, 2.9
 # Samples along an axis of the first lattice of an octave, and of the largest one.
@@ -218,7 +220,11 @@ class _Search:
         order = int(np.argmax(totals / permitted))
         if totals[order] > permitted[order]:
             each = permitted[order] / len(self.octaves)
-            finer = {n: self._finer_sampling(octave, order, each) for n, octave in enumerate(self.octaves)}
+            variances = np.array([octave.sums.variances[order] for octave in self.octaves])
+            # Those that matter least together stay as they are.
+            ascending = np.argsort(variances)
+            decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
+            finer = {int(n): self._finer_sampling(self.octaves[n], order, each) for n in decisive}
             samplings = {n: sampling for n, sampling in finer.items() if sampling is not None}
             if self.seconds + sum(map(self._seconds, samplings.values())) <= _MOST_SECONDS:
                 for number, sampling in samplings.items():

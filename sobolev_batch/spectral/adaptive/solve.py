@@ -103,7 +103,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if not problem.surfaces:
         return Solution.zero(problem.orders)
     step = _first_step(problem)
-    if prefers_octaves(problem) and not _near_duplicates(problem, step.lattice):
+    if prefers_octaves(problem) and not _near_duplicates(problem, step.lattice).any():
         return solve_in_octaves(problem, seed)
     try:
         return _solve_on_lattices(problem, step)
@@ -128,12 +128,15 @@ def permits_octaves(accuracy: Accuracy) -> bool:
     return accuracy.rtol >= _OCTAVES_AT_ALL
 
 
-def _near_duplicates(problem: Problem, lattice: Lattice) -> bool:
-    return bool(np.any(estimate(problem.samples(lattice), problem.orders) <= problem.rounding))
+def _near_duplicates(problem: Problem, lattice: Lattice) -> NDArray[np.bool_]:
+    """Tell at which orders exact values differ by no more than rounding, (orders,)."""
+    return np.asarray(estimate(problem.samples(lattice), problem.orders) <= problem.rounding)
 
 
 def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
     values: Reals | None = None
+    # Their fields may differ by a little more.
+    equal = _near_duplicates(problem, step.lattice)
     for rounds_left in reversed(range(_ROUNDS)):
         samples = problem.samples(step.lattice)
         if values is None:
@@ -143,8 +146,8 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(problem.inexact_count)
         solution, sums = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
         values = solution.estimate.values
-        near_duplicates = values <= problem.rounding
-        if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | near_duplicates):
+        has_no_digit = equal | (values <= problem.rounding)
+        if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | has_no_digit):
             break
         step = _next_step(problem, step, sums)
     return _not_below_rounding(problem, solution)

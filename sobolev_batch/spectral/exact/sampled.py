@@ -8,6 +8,7 @@ triangles are not small beside the wavelength.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,8 +21,8 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# A gap below this (radians) goes through the stable form: the plain one would lose its square in digits.
-_LEAST_GAP = 2e-3
+# A product of gaps below this (radians cubed) goes through the stable form: the plain one would lose as many digits.
+_LEAST_PRODUCT = 2e-3
 # If the longest edge is below this many radians, most triangles would go through the stable form.
 _FINE_MESH = 0.5
 # Pairs of a triangle and a frequency at a time: their temporaries stay in cache.
@@ -37,8 +38,8 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
         threads: Number of threads.
 
     Returns:
-        complex128 (P,). The error of a triangle is at most about 1e-10 of its area. Of whole meshes at random
-        frequencies it was measured to be 5e-15 of the area.
+        complex128 (P,). The error of a triangle is at most about 1e-9 of its area. Of whole meshes at random
+        frequencies it was measured to be at most 1e-13 of the area.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     lengths = np.linalg.norm(frequencies, axis=1)
@@ -47,38 +48,70 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     values[fine] = exact_transform(mesh, frequencies[fine])
     parts = np.array_split(frequencies[~fine], threads)
     with ThreadPoolExecutor(threads) as pool:
-        values[~fine] = np.concatenate(list(pool.map(partial(_plain_sums, mesh), parts)))
+        values[~fine] = np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.of(mesh)), parts)))
     return values
 
 
-def _plain_sums(mesh: Mesh, frequencies: Reals) -> Complexes:
-    triangles = np.ascontiguousarray(mesh.triangles.T)
-    corners = mesh.vertices.T[:, triangles]
-    doubled = doubled_areas((corners[:, 0], corners[:, 1], corners[:, 2]))
-    step = max(1, _PAIRS // len(doubled))
+@dataclass(frozen=True, eq=False)
+class _Triangles:
+    """Triangles of a mesh in arrays of one row per axis or corner.
+
+    Attributes:
+        vertices: Coordinates, float64 (3, n).
+        corners: Indices of the first, second and third corners, (3, m).
+        doubled: Twice the areas (m,).
+        before: Edges from the first corners to the second ones, float64 (3, m).
+        after: Edges from the second corners to the third ones, float64 (3, m).
+    """
+
+    vertices: Reals
+    corners: NDArray[np.int64]
+    doubled: Reals
+    before: Reals
+    after: Reals
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> _Triangles:
+        corners = np.ascontiguousarray(mesh.triangles.T)
+        a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
+        return cls(np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), b - a, c - b)
+
+
+def _plain_sums(triangles: _Triangles, frequencies: Reals) -> Complexes:
+    step = max(1, _PAIRS // len(triangles.doubled))
     groups = [frequencies[first : first + step] for first in range(0, len(frequencies), step)]
-    return np.concatenate([_group_sums(mesh, triangles, doubled, group) for group in groups] or [np.empty(0, complex)])
+    return np.concatenate([_group_sums(triangles, group) for group in groups] or [np.empty(0, complex)])
 
 
-def _group_sums(mesh: Mesh, triangles: NDArray[np.int64], doubled: Reals, frequencies: Reals) -> Complexes:
+def _group_sums(triangles: _Triangles, frequencies: Reals) -> Complexes:
     """Return the transform (P,) at a few frequencies."""
-    phases = (-2 * np.pi * frequencies) @ mesh.vertices.T
-    cosines, sines = cosine_and_sine(phases)
-    first, second, third = (np.take(phases, index, axis=1) for index in triangles)
-    opposite = third - second, first - third, second - first
-    product = opposite[0] * opposite[1] * opposite[2]
-    smallest = np.minimum(np.minimum(np.abs(opposite[0]), np.abs(opposite[1])), np.abs(opposite[2]))
-    close = smallest < _LEAST_GAP
+    directions = -2 * np.pi * frequencies
+    phases = directions @ triangles.vertices
+    # Of one edge, of the next, and of both.
+    first, second = directions @ triangles.before, directions @ triangles.after
+    both = first + second
+    product = first * second
+    product *= both
+    close = np.abs(product) < _LEAST_PRODUCT
     product[close] = np.inf
-    factors = doubled / product
-    # With gaps g_a = γ - β and so on, the divided difference is (e_a g_a + e_b g_b + e_c g_c) / (g_a g_b g_c).
-    real = sum(np.take(cosines, index, axis=1) * gap for index, gap in zip(triangles, opposite, strict=True))
-    imaginary = sum(np.take(sines, index, axis=1) * gap for index, gap in zip(triangles, opposite, strict=True))
-    sums = np.einsum("pt,pt->p", real, factors) + 1j * np.einsum("pt,pt->p", imaginary, factors)
+    factors = triangles.doubled / product
+    # The divided difference is (e_a g_bc + e_b g_ca + e_c g_ab) / (g_ab g_bc g_ca); the gaps g add up to zero.
+    a, b, c = triangles.corners
+    parts = []
+    for values in cosine_and_sine(phases):
+        middle = np.take(values, b, axis=1)
+        before, after = np.take(values, a, axis=1), np.take(values, c, axis=1)
+        before -= middle
+        before *= second
+        after -= middle
+        after *= first
+        before += after
+        parts.append(np.einsum("pt,pt->p", before, factors))
+    sums = -(parts[0] + 1j * parts[1])
     rows, columns = np.nonzero(close)
-    means = (first[rows, columns] + second[rows, columns] + third[rows, columns]) / 3
-    differences = second_difference(opposite[2][rows, columns], -opposite[1][rows, columns])
+    gaps = first[rows, columns], both[rows, columns]
+    means = phases[rows, b[columns]] + (gaps[1] - 2 * gaps[0]) / 3
     cosines, sines = cosine_and_sine(means)
-    terms = doubled[columns] * (cosines + 1j * sines) * differences
+    terms = triangles.doubled[columns] * (cosines + 1j * sines) * second_difference(*gaps)
     sums += np.bincount(rows, terms.real, len(sums)) + 1j * np.bincount(rows, terms.imag, len(sums))
     return np.asarray(sums)

@@ -64,7 +64,8 @@ def witness(
     Returns:
         `witness` over (order, point), or (point,) for a single order, with the coordinates `order` and `x`,
         `y`, `z` of the points: float64, or float32 with complex64, in 1 / unit length. NaN everywhere if a
-        field has NaN anywhere.
+        field has NaN anywhere. The attribute `shortest_wavelength` is 1/xi_max, in units of length: what is shorter is
+        not in the function. At orders above -3 that may be much of the distance.
 
     Raises:
         OrderError: An order is not below -1/2.
@@ -104,6 +105,7 @@ def witness(
             "description": "positive where the first surface has area that the second lacks",
             "kernel": KERNEL,
             **lattice_attributes(lattice, first, second),
+            "shortest_wavelength": 1 / lattice.xi_max,
         },
     )
 

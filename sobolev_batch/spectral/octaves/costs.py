@@ -13,7 +13,7 @@ from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 # Seconds for a quadrature point, for a sample of a lattice's block, and for a pair of a triangle and a frequency.
-_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 3.5e-7, 1e-6, 2.5e-8
+_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 # What a frequency costs beside its triangles, in triangles.

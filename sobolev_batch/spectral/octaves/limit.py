@@ -123,7 +123,7 @@ def _approach(limit: float, energies: Reals, deviations: Reals) -> tuple[float, 
     for last, energy in enumerate(energies):
         before, envelope = envelope, max(_SLOWEST_FALL * envelope, sizes[last])
         expected, spread = limit, _CAUTION * max(before, envelope)
-        fall = _regular_fall(gaps[: last + 1])
+        fall = _regular_fall(limit, gaps[: last + 1])
         if last and _STEEPEST_GROWTH * energies[last - 1] < energy < limit:
             spread = max(spread, _SWING * limit)
         elif fall is not None:
@@ -134,9 +134,15 @@ def _approach(limit: float, energies: Reals, deviations: Reals) -> tuple[float, 
     return float(mean), float(uncertain)
 
 
-def _regular_fall(gaps: Reals) -> float | None:
-    """Return the ratio of the energy's last two distances from its limit, or None unless they fall regularly."""
+def _regular_fall(limit: float, gaps: Reals) -> float | None:
+    """Return the ratio of the energy's last two distances from its limit, or None unless they fall regularly.
+
+    Energies that have just grown like |ξ|² may be about to swing.
+    """
     if len(gaps) < _REGULAR or not np.all(gaps[-_REGULAR:] > 0):
+        return None
+    energies = limit - gaps[-_REGULAR:]
+    if np.any(energies[1:] > _STEEPEST_GROWTH * energies[:-1]):
         return None
     falls = gaps[1 - _REGULAR :] / gaps[-_REGULAR:-1]
     is_regular = falls[-1] >= _FASTEST_FALL and falls[-1] >= _LEAST_STEADINESS * falls[-2]

@@ -57,6 +57,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("report")
 
 
+_CHARTS = ("convergence", "matrix", "map", "spectrum", "energy", "witness")
+
+
 @pytest.fixture(scope="module")
 def store(folder: Path) -> str:
     place = "memory://hostile.zarr"
@@ -87,7 +90,7 @@ def test_page_loads_without_complaint_or_request(reader: Browser, page: Path) ->
     drawn = reader.tell(
         "[...document.querySelectorAll('.chart')].map(e => [e.id, e.querySelectorAll('svg').length > 0])"
     )
-    assert drawn == [[f"chart-{name}", True] for name in ("convergence", "matrix", "map", "spectrum", "witness")]
+    assert drawn == [[f"chart-{name}", True] for name in _CHARTS]
     assert page.stat().st_size < 15e6
 
 
@@ -247,7 +250,7 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
 
 
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nothing: dict[str, list[Any]] = {name: [] for name in ("convergence", "matrix", "map", "spectrum", "witness")}
+    nothing: dict[str, list[Any]] = {name: [] for name in _CHARTS}
     monkeypatch.setattr(build, "_pictures", lambda *_: nothing)
     text = make_report(store, folder=folder, limits=ReportLimits(convergence_rows=6, mesh_rows=2, pairs=3, spectra=2))
     for note in (

@@ -56,16 +56,18 @@
     return { tickvals, ticktext: tickvals.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
   };
 
+  const bars = (values, errors) => ({
+    type: "data", symmetric: false, array: errors, thickness: 1, width: 3,
+    // Below zero there is no logarithm.
+    arrayminus: errors.map((error, i) => Math.min(error, 0.999 * values[i])),
+  });
+
   const convergence = () => {
     const families = data.convergence[state.order] ?? [];
     const traces = families.map((line) => ({
       type: "scatter", mode: line.joined ? "lines+markers" : "markers", name: short(line.family, 40),
       x: line.sizes, y: line.values,
-      error_y: {
-        type: "data", symmetric: false, array: line.errors, thickness: 1, width: 3,
-        // Below zero there is no logarithm.
-        arrayminus: line.errors.map((error, i) => Math.min(error, 0.999 * line.values[i])),
-      },
+      error_y: bars(line.values, line.errors),
       line: { color: series(line.family), width: 1.8 },
       marker: { color: series(line.family), symbol: symbol(line.family), size: 8 },
       text: line.labels.map((label, i) =>
@@ -175,6 +177,26 @@
     });
   };
 
+  const energy = () => {
+    const { labels, families, wavelengths, values, errors } = data.energy;
+    const traces = values.map((y, i) => ({
+      type: "scatter", mode: "lines+markers", name: short(families[i], 40), legendgroup: families[i],
+      showlegend: families.indexOf(families[i]) === i, x: wavelengths, y, error_y: bars(y, errors[i]),
+      line: { color: series(families[i]), width: 1.3 },
+      marker: { color: series(families[i]), symbol: symbol(families[i]), size: 5 },
+      text: y.map((value, j) => `${plain(labels[i])}<br>wavelength ${number(wavelengths[j])}<br>${number(value)} of the limit`),
+      hoverinfo: "text",
+    }));
+    traces.push({
+      type: "scatter", mode: "lines", name: "limit", x: [Math.max(...wavelengths), Math.min(...wavelengths)], y: [1, 1],
+      line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
+    });
+    draw("energy", traces, {
+      xaxis: { type: "log", autorange: "reversed", ...ticks(wavelengths), title: { text: "wavelength in the study’s unit" } },
+      yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "energy over its limit" } },
+    });
+  };
+
   const witness = () => {
     const { label, points: [x, y, z], corners: [i, j, k], values, triangles, shown } = data.witness[state.view];
     const whole = triangles.toLocaleString("en");
@@ -198,7 +220,7 @@
     }, space);
   };
 
-  const drawings = [convergence, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum,
+  const drawings = [convergence, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
     data.witness.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
