@@ -19,6 +19,8 @@ from sobolev_batch.surfaces.sources.decimation import DecimatedMember
 from sobolev_batch.surfaces.sources.files import FileSource
 
 Found = TypeVar("Found")
+Reals = NDArray[np.float64]
+Sum = Callable[[Reals, Reals], float]
 
 # Order, rtol, and most processor seconds, for a coarse organic mesh against a fine one.
 _REQUESTS = ((-2.0, 1e-2, 3.0), (-2.0, 1e-3, 10.0), (-1.0, 1e-2, 20.0), (-0.6, 1e-1, 20.0))
@@ -48,22 +50,34 @@ def _row(what: str, a: sb.Mesh, b: sb.Mesh | sb.Sphere, order: float, rtol: floa
 
 
 def _against_points(what: str, coarse: sb.Mesh, fine: sb.Mesh, effort: Effort) -> Iterator[Row]:
-    """Compare with double sums of the kernel of order -2, exp(-2πr), over centroids of triangles cut once and not."""
+    """Compare with double sums of the kernels of orders -2 and -1 over centroids of triangles, cut in four or not.
+
+    These kernels are π² exp(-2πr), in all pairs, and π exp(-2πr) / r, by a fast multipole method and without r = 0.
+    """
     from benchmarks.direct import exponential_sum
 
-    seconds, found = _processor_seconds(lambda: sb.distance(coarse, fine, -2.0, rtol=1e-2))
     exponential_sum(*_points(sb.icosphere(0), sb.icosphere(0), 0))  # compiled by now
-    sums = []
-    for cuts in range(1 if effort.quick else 2):
-        taken, square = _processor_seconds(partial(exponential_sum, *_points(coarse, fine, cuts)))
-        sums.append((taken, float(np.sqrt(np.pi**2 * square))))
-    for cuts, (taken, distance) in enumerate(sums):
-        digits = abs(distance - found["distance"].item()) / found["distance"].item()
-        text = f"{what}, order -2: sum over centroids, cut {cuts} times, off by {digits:.1g}"
-        yield Row("10", text, as_seconds(seconds), as_seconds(taken), taken / seconds)
+    sums: dict[float, tuple[float, Sum, int]] = {-2.0: (np.pi**2, exponential_sum, 2), -1.0: (np.pi, _yukawa_sum, 3)}
+    for order, (factor, double_sum, most_cuts) in sums.items():
+        seconds, found = _processor_seconds(partial(sb.distance, coarse, fine, order, rtol=1e-2))
+        for cuts in range(1 if effort.quick else most_cuts):
+            taken, square = _processor_seconds(partial(double_sum, *_points(coarse, fine, cuts)))
+            distance = float(np.sqrt(max(factor * square, 0.0)))
+            digits = abs(distance - found["distance"].item()) / found["distance"].item()
+            text = f"{what}, order {order:g}: sum over centroids, cut {cuts} times, off by {digits:.1g}"
+            yield Row("10", text, as_seconds(seconds), as_seconds(taken), taken / seconds)
 
 
-def _points(a: sb.Mesh, b: sb.Mesh, cuts: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _yukawa_sum(points: Reals, weights: Reals) -> float:
+    """The double sum of w_i w_j exp(-2πr) / r over the distances r > 0 of points (n, 3) with weights (n,)."""
+    import fmm3dpy
+
+    # Its kernel is exp(ikr) / (4πr).
+    found = fmm3dpy.hfmm3d(eps=1e-6, zk=2j * np.pi, sources=points.T, charges=weights.astype(np.complex128), pg=1)
+    return float(4 * np.pi * np.real(weights @ found.pot))
+
+
+def _points(a: sb.Mesh, b: sb.Mesh, cuts: int) -> tuple[Reals, Reals]:
     """Centroids (n, 3) of the triangles of both meshes, each cut in four so often, and their signed areas."""
     points, weights = [], []
     for mesh, sign in ((a, 1.0), (b, -1.0)):
