@@ -67,6 +67,9 @@ class StoreAccessor:
             mesh: Label of the mesh.
             order: One order s < -1/2, or several.
 
+        Returns:
+            As `sobolev_batch.norm`, float64, in the square root of a unit length.
+
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
         >>> f"{tree.sobolev.norm('reference', -4)['norm'].item():.3f}"
@@ -85,6 +88,16 @@ class StoreAccessor:
             mesh: Label of one mesh.
             other: Label of the other mesh, which the area part is a multiple of.
             order: One order s < -1/2, or several.
+
+        Returns:
+            As `sobolev_batch.distance`, with `area_part` and `shape_part` (order), float64, in the square root of a
+            unit length.
+
+        >>> import sobolev_batch as sb
+        >>> tree = sb.open_store("storage/icosphere.zarr")
+        >>> found = tree.sobolev.distance("icosphere/1", "reference", -4)
+        >>> bool(abs(found["area_part"] ** 2 + found["shape_part"] ** 2 - found["distance"] ** 2) < 1e-12)
+        True
         """
         fields, row, against = self._fields(mesh, other)
         _, distances, parts = fields.reducer(check_orders(order), against).norms([row])
@@ -101,11 +114,17 @@ class StoreAccessor:
             order: One order s < -1/2, or several.
 
         Returns:
-            Dataset over `band` with the coordinates `lower` and `upper` in cycles per unit length, and
+            Dataset over `band`, float64, with the coordinates `lower` and `upper` in cycles per unit length, and
             `longest_wavelength` and `shortest_wavelength` in units of length; `squared` (order, band), in units of
-            length, and its `share` of what has been measured; `energy` (band), the mean of ∫_{|ξ|=r} |a^ - b^|² dS, and
-            its standard error `energy_error`, in squared units of length. The attribute `energy_limit` is twice the
-            area of all surfaces, which the energy tends to if no parts of them coincide.
+            length, and its `share` of what has been measured, NaN between equal meshes; `energy` (band), the mean of
+            ∫_{|ξ|=r} |a^ - b^|² dS, and its standard error `energy_error`, in squared units of length. The attribute
+            `energy_limit` is twice the area of all surfaces, which the energy tends to if no parts of them coincide.
+
+        >>> import sobolev_batch as sb
+        >>> tree = sb.open_store("storage/icosphere.zarr")
+        >>> bands = tree.sobolev.spectrum("icosphere/1", "reference", -4)
+        >>> round(bands["share"].sum().item(), 6)
+        1.0
         """
         rows = self._fields(mesh) if other is None else self._fields(mesh, other)
         fields, indices, orders = rows[0], [int(row) for row in rows[1:]], check_orders(order)
@@ -117,12 +136,13 @@ class StoreAccessor:
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
         areas = reducer.areas[indices].sum()
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             longest = 1 / lower
+            share = squared / squared.sum(axis=-1)[..., None]
         return xr.Dataset(
             {
                 "squared": ((*dims, "band"), squared, described("squared value", LENGTH)),
-                "share": ((*dims, "band"), squared / squared.sum(axis=-1)[..., None], described("share", NUMBER)),
+                "share": ((*dims, "band"), share, described("share", NUMBER)),
                 "energy": ("band", energies, described("energy on a sphere of frequencies", AREA)),
                 "energy_error": ("band", deviations, described("standard error of the energy", AREA)),
             },

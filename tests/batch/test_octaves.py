@@ -115,14 +115,16 @@ def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave
     radii = np.linspace(0, 200, 200_001)[1:]
     difference = 2 / radii * (np.sin(2 * np.pi * radii) - BALL.radius * np.sin(2 * np.pi * BALL.radius * radii))
     exact = 4 * np.pi * radii**2 * difference**2 / (8 * np.pi * (1 + BALL.radius**2))
-    tree = open_store(octave_store)
-    highest = tree.attrs["study"]["octaves"]["cutoff"] * 2.0 ** np.arange(
-        -1, len(tree.attrs["study"]["octaves"]["octaves"]) + 1
-    )
-    for number in range(1, len(highest)):
-        window = step_down(radii / highest[number]) - step_down(radii / highest[number - 1])
-        mean = np.average(exact, weights=window)
-        assert energies[number - len(highest)] == pytest.approx(mean, rel=0.15)
+    octaves = open_store(octave_store).attrs["study"]["octaves"]
+    ends = octaves["cutoff"] * 2.0 ** (np.arange(len(energies)) - (len(energies) - 1 - len(octaves["octaves"])))
+    inner = np.zeros_like(radii)
+    for end, energy in zip(ends, energies, strict=True):
+        outer = step_down(radii / end)
+        assert energy == pytest.approx(np.average(exact, weights=outer - inner), rel=0.15)
+        inner = outer
+    bars = np.array([np.ptp(segment[:, 1]) for segment in drawn.lines[2][0].get_segments()])
+    assert (bars[: -len(octaves["octaves"])] == 0).all()
+    assert (bars[-len(octaves["octaves"]) :] > 0).all()
     assert energies[-1] == pytest.approx(1, abs=0.3)
 
 
@@ -202,6 +204,15 @@ def test_damaged_frequencies_are_named_and_written_again(store: Path, client: Cl
     run(Study.from_table(asking()), store, client)
     assert verify(store).is_sound
     assert np.array_equal(variable(open_store(store), "fourier", "xi_x").values, before)
+
+
+def test_damaged_labels_of_octaves_are_named_and_written_again(store: Path, client: Client) -> None:
+    flip(next((store / "octaves/mesh/c").rglob("[0-9]")))
+    assert set(verify(store).tables) == {"octaves/mesh"}
+    run(Study.from_table(asking()), store, client)
+    assert verify(store).is_sound
+    tree = open_store(store)
+    assert np.array_equal(variable(tree, "octaves", "mesh").values, variable(tree, "fourier", "mesh").values)
 
 
 def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client) -> None:

@@ -91,9 +91,9 @@ class TailReducer:
             for j, other in enumerate(others):
                 if j < first and j < shared:
                     continue
-                values = self.read(other)
+                values = held[j] if j < shared and j in held else self.read(other)
                 for i, own in held.items():
-                    if j < shared and i in held and (j, i) in tails:
+                    if j < shared and (j, i) in tails:
                         tails[i, j] = tails[j, i]
                     elif rows[i] != other:
                         tails[i, j] = self.of_pair(rows[i], other, own - values, inner[:, i, j])

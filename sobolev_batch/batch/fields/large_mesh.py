@@ -15,7 +15,6 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.cluster.worker_plugin import worker_backend
 from sobolev_batch.batch.fields.tasks import Job, StoredBlocks, facts_of, finish_octaves
 from sobolev_batch.batch.store.records import Facts
 from sobolev_batch.errors import MeshError, StoreError
@@ -27,7 +26,7 @@ from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import require_inside, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -120,10 +119,9 @@ def transform_batch(job: Job, split: SplitMesh, number: int, block: Block) -> Bl
         return BlockSum()
     started = time.perf_counter()
     lattice = job.settings.lattice
-    execution = Execution(worker_backend(job.settings.backend), allowed_bytes=job.allowed_bytes)
     try:
         batch = job.store.scratch.read(job.index, split.token, number)
-        result = transform_block(batch, lattice, block, split.transform, execution)
+        result = transform_block(batch, lattice, block, split.transform, job.execution)
         exact = exact_transform(batch, split.draws.within(block).frequencies)
     except StoreError:
         raise

@@ -43,6 +43,7 @@ class TaskSizes:
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
         loading_bytes: Projected memory of the task that loads the mesh.
         batch_bytes: Projected memory of any other task; the same where the mesh is whole.
+        octave_tasks: Number of tasks of their own for octaves, where the field has more than one task.
     """
 
     batches: int
@@ -50,6 +51,7 @@ class TaskSizes:
     allowed_bytes: float
     loading_bytes: float
     batch_bytes: float
+    octave_tasks: int = 0
 
     @property
     def projected_bytes(self) -> float:
@@ -60,9 +62,10 @@ class TaskSizes:
     def task_count(self) -> int:
         """Number of tasks."""
         if self.batches == 1:
-            return len(self.block_groups) + (len(self.block_groups) > 1)
+            # Several groups have a task for the record too.
+            return 1 if len(self.block_groups) == 1 else len(self.block_groups) + 1 + self.octave_tasks
         # Batches, their sums in pairs, and the storing of each block; the split and the record.
-        return 2 * self.batches * sum(map(len, self.block_groups)) + 2
+        return 2 * self.batches * sum(map(len, self.block_groups)) + 2 + self.octave_tasks
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
@@ -170,4 +173,4 @@ def size_tasks(
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
     if batches == 1:
         loading_bytes = max(loading_bytes, batch_bytes)
-    return TaskSizes(batches, groups, allowed_bytes, loading_bytes, batch_bytes)
+    return TaskSizes(batches, groups, allowed_bytes, loading_bytes, batch_bytes, octave_tasks=int(octaves.held > 0))

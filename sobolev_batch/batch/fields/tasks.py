@@ -104,7 +104,12 @@ class Job:
         Raises:
             MeshError: See `load`.
         """
-        return None if self.reference is None else self._loaded(self.reference)
+        if self.reference is None:
+            return None
+        try:
+            return self._loaded(self.reference)
+        except MeshError as error:
+            raise MeshError(f"the reference: {error}") from error
 
     def _loaded(self, row: Row) -> Surface:
         surface = self.settings.similarity.apply(row.member.load())

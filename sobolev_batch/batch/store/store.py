@@ -24,6 +24,7 @@ from sobolev_batch.batch.storage.scratch import Scratch
 from sobolev_batch.batch.store.hierarchy import (
     FIELD,
     LABELS,
+    OCTAVE_LABELS,
     OCTAVES,
     QUALITY,
     RECORD,
@@ -126,8 +127,10 @@ class Store(Hierarchy):
 
     def repair_labels(self) -> None:
         """Write damaged labels again, from the table of meshes."""
-        if not self._labels_of(LABELS):
-            self.write(LABELS, ..., np.array(self.labels(), dtype=object))
+        names = (LABELS, OCTAVE_LABELS) if self.has_octaves else (LABELS,)
+        for name in names:
+            if not self._labels_of(name):
+                self.write(name, ..., np.array(self.labels(), dtype=object))
 
     @property
     def record_table(self) -> RecordTable[Record]:

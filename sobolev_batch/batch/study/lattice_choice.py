@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import AccuracyError, InputError, StudyError
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, good_intervals, lattice_of
+from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.solve import Pilot, permits_octaves, prefers_octaves, run_pilot
@@ -48,9 +48,9 @@ _LARGEST_GROWTH = 2.0
 _PILOT_FRACTION = 0.7
 # Fractions of the accuracy above which the statistical error, and that beyond the last octave, are lessened.
 _STATISTICAL_PART, _TRUNCATION_PART = 0.4, 0.4
-# Factors by which samples of octaves multiply at a time, and the M of a lattice whose images are too large.
-_LEAST_REFINEMENT, _LARGEST_REFINEMENT, _FINER_LATTICE = 1.5, 8.0, 1.15
-# A mesh has no more samples: 160 MB.
+# Factors by which samples of octaves multiply at a time.
+_LEAST_REFINEMENT, _LARGEST_REFINEMENT = 1.5, 8.0
+# Most samples of a mesh; their values take 160 MB in double precision.
 _MOST_SAMPLES = 10_000_000
 
 
@@ -140,17 +140,20 @@ class LatticeChoice:
         if statistical > _STATISTICAL_PART:
             factor = min(max((statistical / _STATISTICAL_PART) ** 2, _LEAST_REFINEMENT), _LARGEST_REFINEMENT)
         more_octaves = int(truncation > _TRUNCATION_PART)
-        if factor * tail.size > _MOST_SAMPLES or len(tail.octaves) + more_octaves > MOST_OCTAVES:
+        if len(tail.octaves) + more_octaves > MOST_OCTAVES:
             return None
         lattice = self.lattice
         if aliasing * accuracy.rtol > accuracy.aliasing_part:
-            intervals = good_intervals(_FINER_LATTICE * lattice.M)
+            intervals = good_intervals(FINER_LATTICE * lattice.M)
             if intervals > accuracy.largest_intervals:
                 return None
             lattice = Lattice(lattice.xi_max, intervals)
         if factor == 1.0 and not more_octaves and lattice == self.lattice:
             return None
-        refined = tail.refined(factor, more_octaves, seed=tail.size)
+        # Another seed than that of the samples before.
+        refined = tail.refined(factor, more_octaves, accuracy.largest_intervals, seed=tail.size)
+        if refined.size > _MOST_SAMPLES:
+            return None
         reason = f"grown from {len(tail.octaves)} octaves with {tail.size:,} samples, whose errors were too large"
         return replace(self, lattice=lattice, tail=refined, reasons=(*self.reasons, reason))
 

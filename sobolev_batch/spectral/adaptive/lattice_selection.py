@@ -41,6 +41,8 @@ _CLEARANCE = 1.001
 # An accuracy called reachable must hold when it is asked for, on a pilot that differs a little.
 _REACHABLE_MARGIN = 1.5
 _STEP = 1.04
+# Factor of the M of a lattice with octaves whose images are too large.
+FINER_LATTICE = 1.15
 # At this distance the kernel exp(-2πr) is below the smallest double.
 _VANISHED = 120.0
 

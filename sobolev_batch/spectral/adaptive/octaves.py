@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, rounded_up
+from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, rounded_up
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_of_root, sums_of_shells
@@ -41,7 +41,7 @@ _LEFT_FRACTION = 0.5
 _USUAL_OCTAVES, _QUANTILE = 6, 2.9
 # Samples along an axis of the first lattice of an octave, and of the largest one.
 _FIRST_M, _LARGEST_M = 64, 192
-# Draws of an octave: the fewest, the most, and the time that draws may take beside a lattice, as a fraction of its.
+# Draws of an octave: the fewest, the most, and the most time for draws beside a lattice, as a fraction of its own.
 _FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 256, 1_000_000, 0.5
 # The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
 _FEWEST_FLAT_DRAWS = 20_000
@@ -134,18 +134,18 @@ def solve_in_octaves(problem: Problem, seed: int, acceptable: Accuracy | None = 
         acceptable: Accuracy that will do where that of the problem is out of reach.
 
     Returns:
-        The solution of the first of a few rounds that meets the accuracy, or of the last.
+        The first solution that meets the accuracy; else the last one, if it is acceptable.
 
     Raises:
         AccuracyError: The accuracy lies below the rounding of fields, or would take too many samples.
     """
     search = _Search.begin(problem, seed)
-    for _ in range(_ROUNDS):
+    for rounds_left in reversed(range(_ROUNDS)):
         search.measure_outwards()
         solution = search.solution()
         if np.all(problem.accuracy.met(solution.estimate)):
             return solution
-        if not search.refine():
+        if not (rounds_left and search.refine()):
             break
     if acceptable is not None and np.all(acceptable.met(solution.estimate)):
         return solution
@@ -211,12 +211,12 @@ class _Search:
         values = np.sqrt(self.squares)
         if np.any(change_of_root(self.squares, self.core.images) > accuracy.aliasing_part * values):
             lattice = self.core.lattice
-            larger = 2 * round(0.575 * lattice.M)
+            larger = good_intervals(FINER_LATTICE * lattice.M)
             if larger <= accuracy.largest_intervals:
                 self.core = Core.of(self.problem, Lattice(lattice.xi_max, larger), self.cutoff)
                 refined = True
         permitted = self.permitted_variances
-        totals = np.sum([octave.sums.variances for octave in self.octaves], axis=0)
+        totals = sum((octave.sums.variances for octave in self.octaves), np.zeros(len(permitted)))
         order = int(np.argmax(totals / permitted))
         if totals[order] > permitted[order]:
             each = permitted[order] / len(self.octaves)
@@ -226,7 +226,8 @@ class _Search:
             decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
             finer = {int(n): self._finer_sampling(self.octaves[n], order, each) for n in decisive}
             samplings = {n: sampling for n, sampling in finer.items() if sampling is not None}
-            if self.seconds + sum(map(self._seconds, samplings.values())) <= _MOST_SECONDS:
+            seconds = sum(self._seconds(sampling, self.octaves[n].sampling) for n, sampling in samplings.items())
+            if self.seconds + seconds <= _MOST_SECONDS:
                 for number, sampling in samplings.items():
                     self.octaves[number] = self._measured(sampling, self.octaves[number])
                     refined = True
@@ -245,7 +246,7 @@ class _Search:
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
-        self.seconds += self._seconds(sampling)
+        self.seconds += self._seconds(sampling, known.sampling if known else None)
         values = np.sqrt(self.squares)
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
@@ -321,9 +322,9 @@ class _Search:
     def _lattice_seconds(self, lattice: OctaveLattice) -> float:
         return sum(size.lattice_seconds(lattice) for size in self.sizes)
 
-    def _seconds(self, sampling: OctaveSampling) -> float:
-        """Predict the processor time of all samples of an octave."""
-        return sum(size.sampling_seconds(sampling) for size in self.sizes)
+    def _seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Predict the processor time of the samples of an octave, without those that are known."""
+        return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
 
     @property
     def _can_draw(self) -> bool:
@@ -341,7 +342,8 @@ def _out_of_reach(problem: Problem, found: NormEstimate) -> AccuracyError:
     relative = found.errors / found.values
     worst = int(np.argmax(relative))
     order, rtol = problem.orders[worst], problem.accuracy.rtol
-    reachable = rounded_up(_REACHABLE_MARGIN * float(relative[worst]))
+    reachable = _REACHABLE_MARGIN * float(relative[worst])
+    reachable = rounded_up(reachable) if np.isfinite(reachable) else reachable
     advice = f"about {reachable:g} can be reached; ask for that, or take a more negative order"
     if reachable >= 1:
         advice = "not even one digit can be reached; take a more negative order"

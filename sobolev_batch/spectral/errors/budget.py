@@ -86,7 +86,7 @@ class NormEstimate:
 
     Attributes:
         values: Norms or distances.
-        truncation: Bound on the part beyond xi_max, which can only add to the value.
+        truncation: Bound on the error by frequencies beyond the highest one; without octaves they can only add.
         aliasing: Estimate of the change by the lattice's spacing, either way.
         discretisation: Bound on the error by the triangle rules and the NUFFT.
         statistical: Bound on the error by random frequencies, which holds with a probability; zero without these.

@@ -33,7 +33,9 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
     "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
     "error": described("bound on the error", NORM, description="truncation + aliasing + discretisation + statistical"),
-    "truncation": described("error of truncation", NORM, description="frequencies beyond xi_max, which can only add"),
+    "truncation": described(
+        "error of truncation", NORM, description="frequencies beyond the highest one; without octaves they only add"
+    ),
     "aliasing": described("error of aliasing", NORM, description="spacing of the lattice"),
     "discretisation": described("error of discretisation", NORM, description="quadrature and NUFFT"),
     "statistical": described("error of random frequencies", NORM, description="holds in 99 % of cases"),

@@ -62,12 +62,14 @@ def norm(
         rtol: Largest relative error, in place of a lattice; see `distance`.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
+            A whole number from 0 on.
 
     Returns:
-        Dataset over `order` with `norm`, its `error`, and the three parts of the error: `truncation`
-        (frequencies beyond xi_max; it can only add to the norm), `aliasing` and `discretisation`. All are
-        float64, in the square root of a unit length. The error is NaN for fields without the attribute
-        `quality`. A single order has no dimension. Attributes hold the lattice and the kernel.
+        Dataset over `order` with `norm`, its `error`, and the four parts of the error: `truncation`
+        (frequencies beyond the highest one; without octaves it can only add to the norm), `aliasing`,
+        `discretisation` and `statistical` (zero without octaves). All are float64, in the square root of a unit
+        length. The error is NaN for fields without the attribute `quality`. A single order has no dimension.
+        Attributes hold the lattice and the kernel.
 
     Raises:
         OrderError: An order is not below -1/2.
@@ -166,6 +168,7 @@ def distance(
             attributes of the dataset hold the last choice.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
+            A whole number from 0 on.
 
     Returns:
         Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. With
@@ -215,6 +218,8 @@ def _to_accuracy(
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     for surface in surfaces:
         check_surface(surface)
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
     solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1), seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     dataset = _dataset(name, order, solution.estimate, attributes)

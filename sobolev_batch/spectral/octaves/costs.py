@@ -53,9 +53,16 @@ class SurfaceSize:
         """Tell whether the exact transform at all samples of a lattice is cheaper than a nonuniform FFT."""
         return self._exact_seconds(lattice) < self._nufft_seconds(lattice)
 
-    def sampling_seconds(self, sampling: OctaveSampling) -> float:
-        """Return the time of the transforms at all samples of an octave."""
-        return sum(map(self.lattice_seconds, sampling.lattices)) + len(sampling.drawn) * self.draw_seconds
+    def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Return the time of the transforms at the samples of an octave, without those of a known sampling.
+
+        The known one has some of the same lattices, from the first on, and maybe the same drawn frequencies.
+        """
+        lattices, draws = sampling.lattices, len(sampling.drawn)
+        if known is not None:
+            lattices = lattices[len(known.lattices) :]
+            draws = 0 if known.drawn is sampling.drawn else draws
+        return sum(map(self.lattice_seconds, lattices)) + draws * self.draw_seconds
 
     def _nufft_seconds(self, lattice: OctaveLattice) -> float:
         seconds = _SAMPLE_SECONDS * lattice.half.size

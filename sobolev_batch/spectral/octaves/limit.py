@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import beta, betainc
 
+from sobolev_batch.spectral.octaves.normals import without_sign
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import OctaveSums
 from sobolev_batch.spectral.shells import smooth_step
@@ -29,8 +30,6 @@ _BATCH = 1 << 17
 _CLOSENESS, _MARGIN = 1e-8, 1e-9
 # A plane is one number, a combination of its normal and offset; those of surfaces that coincide differ by no more.
 _OF_NORMAL, _OF_OFFSET, _PLANE_CLOSENESS = np.array([0.7346, -0.5178, 0.9571]), 0.6294, 3e-8
-# Entries of normals along this direction decide which of two opposite ones is taken.
-_UPWARDS = np.array([0.3, 0.5, 0.81])
 # Octaves in which the energy's distances from its limit must fall regularly; the least ratio of two of them, and the
 # least ratio of two such ratios; the fraction of the next distance by which the energy may exceed the limit.
 _REGULAR, _FASTEST_FALL, _LEAST_STEADINESS, _OVERSHOOT = 3, 0.25, 0.6, 0.4
@@ -71,7 +70,7 @@ class EnergyLimit:
         rng = np.random.default_rng(seed)
         meshes = [(surface, sign) for surface, sign in zip(surfaces, signs, strict=True) if isinstance(surface, Mesh)]
         value, variance = 2 * sum(surface.area for surface in surfaces), 0.0
-        size = max((float(np.ptp(mesh.vertices, axis=0).max()) for mesh, _ in meshes), default=0.0)
+        size = max((float(np.ptp(mesh.used_coordinates, axis=1).max()) for mesh, _ in meshes), default=0.0)
         candidates = _in_common_planes([mesh for mesh, _ in meshes], size)
         shared = [(mesh, sign) for mesh, (_, sign) in zip(candidates, meshes, strict=True) if mesh is not None]
         pairs = sum(len(mesh.triangles) for mesh, _ in shared) * max(len(shared), 1)
@@ -186,7 +185,7 @@ def _planes(mesh: Mesh, size: float) -> Reals:
         with np.errstate(divide="ignore", invalid="ignore"):
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         # Either side of a triangle may be its front.
-        normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
+        normals = without_sign(normals)
         offsets = np.einsum("ij,ij->i", normals, a) / max(size, np.finfo(np.float64).tiny)
         planes[batch] = normals @ _OF_NORMAL + _OF_OFFSET * offsets
     return planes

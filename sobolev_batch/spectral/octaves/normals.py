@@ -18,10 +18,10 @@ Reals = NDArray[np.float64]
 _DIRECTION_PARTS = 500
 # A direction counts if the faces along it hold this fraction of the area; so many directions at most.
 _LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
-# Width of the spots around a normal: a fraction of |ξ| · 2π · size of the faces, whose transform falls off there.
+# κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
 _SPOT_FRACTION = 0.5
-# Entries along this direction decide which of two opposite normals is taken.
-_UPWARDS = np.array([0.3, 0.5, 0.81])
+# No direction of small whole numbers is orthogonal to this one, where rounding would decide.
+_UPWARDS = np.array([1.0, np.sqrt(2.0), np.pi])
 _NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
@@ -54,7 +54,7 @@ class FaceNormals:
         return len(self.shares) > 0
 
     def draw(self, radii: Reals, rng: np.random.Generator) -> Reals:
-        """Draw a unit direction for each |ξ| (n,) by the density, float64 (n, 3)."""
+        """Draw a unit direction on the side of a normal for each |ξ| (n,) by the density, float64 (n, 3)."""
         chosen = rng.choice(len(self.shares), len(radii), p=self.shares)
         axes = self.directions[chosen]
         squares = self._concentrations(radii, self.sizes[chosen])
@@ -66,8 +66,8 @@ class FaceNormals:
         across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
-        signs = np.where(rng.random(len(radii)) < 0.5, 1.0, -1.0)
-        return np.asarray((signs * cosines)[:, None] * axes + sines[:, None] * sideways)
+        # Of each direction and its opposite one will do: all integrands are even.
+        return np.asarray(cosines[:, None] * axes + sines[:, None] * sideways)
 
     def density(self, directions: Reals, radii: Reals) -> Reals:
         """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
@@ -84,6 +84,11 @@ class FaceNormals:
         return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
 
 
+def without_sign(normals: Reals) -> Reals:
+    """Return of each normal (n, 3) and its opposite the same one."""
+    return np.where((normals @ _UPWARDS < 0)[:, None], -normals, normals)
+
+
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
     corners = mesh.vertices[mesh.triangles]
@@ -91,7 +96,7 @@ def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     doubled = np.linalg.norm(crosses, axis=1)
     kept = doubled > 0
     normals, areas, corners = crosses[kept] / doubled[kept, None], doubled[kept] / 2, corners[kept]
-    normals *= np.where(normals @ _UPWARDS < 0, -1.0, 1.0)[:, None]
+    normals = without_sign(normals)
     _, members = np.unique(np.round(normals * _DIRECTION_PARTS), axis=0, return_inverse=True)
     members = members.ravel()
     sums = np.bincount(members, weights=areas)

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 Reals = NDArray[np.float64]
 
 # The true value lies within the statistical error with this probability, if sums over groups are normal.
-_CONFIDENCE = 0.995
+_CONFIDENCE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
     total = variances.sum(axis=0)
     tiny = np.finfo(np.float64).tiny
     effective = total**2 / np.maximum(np.sum(variances**2 / np.maximum(degrees, 1)[:, None], axis=0), tiny)
-    return np.asarray(np.sqrt(total) * students_t.ppf(_CONFIDENCE, np.maximum(effective, 1.0)))
+    return np.asarray(np.sqrt(total) * students_t.ppf((1 + _CONFIDENCE) / 2, np.maximum(effective, 1.0)))
 
 
 def window_integral(octave: Octave, order: float) -> float:

@@ -42,9 +42,13 @@ class Tail:
         orders: Sequence[float],
         inner: Sequence[float],
     ) -> Self:
-        """Return the tail by the sums over octaves and the limit of the energy; see `beyond`. None has no octaves."""
+        """Return the tail by the sums over octaves and the limit of the energy; see `beyond`.
+
+        Without octaves nothing is known of it.
+        """
         if not octaves:
-            return cls(*np.zeros((4, len(orders))))
+            none = np.zeros(len(orders))
+            return cls(none, none, none, none + np.inf)
         measured = np.sum([one.squares for one in sums], axis=0)
         return cls(measured, statistical_errors(sums), *beyond(octaves, sums, limit, orders, inner))
 

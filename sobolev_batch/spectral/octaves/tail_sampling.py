@@ -157,11 +157,14 @@ class TailSampling:
         octaves = tuple(OctaveWeights(quadrature, tuple(orders)) for quadrature in self.quadratures)
         return TailWeights(octaves, tuple(self.slices))
 
-    def refined(self, factor: float, more_octaves: int, seed: int) -> TailSampling:
-        """Return a sampling with about ``factor`` times as many samples in each octave, and further octaves."""
+    def refined(self, factor: float, more_octaves: int, largest: int, seed: int) -> TailSampling:
+        """Return a sampling with about ``factor`` times as many samples in each octave, and further octaves.
+
+        No lattice gets an M above ``largest``.
+        """
         rng = np.random.default_rng(seed)
         first = self.octaves[0].drawn
-        samplings = [_refined(sampling, factor, rng) for sampling in self.octaves]
+        samplings = [_refined(sampling, factor, largest, rng) for sampling in self.octaves]
         for index in range(len(samplings) + 1, len(samplings) + 1 + more_octaves):
             octave, last = Octave(self.cutoff, index), samplings[-1]
             lattices = tuple(OctaveLattice.random(octave.lowest, octave.highest, one.M, rng) for one in last.lattices)
@@ -173,12 +176,10 @@ class TailSampling:
         return TailSampling(self.cutoff, tuple(samplings))
 
 
-def _refined(sampling: OctaveSampling, factor: float, rng: np.random.Generator) -> OctaveSampling:
+def _refined(sampling: OctaveSampling, factor: float, largest: int, rng: np.random.Generator) -> OctaveSampling:
     octave, drawn = sampling.octave, sampling.drawn
-    lattices = tuple(
-        OctaveLattice.random(octave.lowest, octave.highest, 2 * round(one.M * factor ** (1 / 3) / 2), rng)
-        for one in sampling.lattices
-    )
+    sizes = [min(2 * round(one.M * factor ** (1 / 3) / 2), max(largest, one.M)) for one in sampling.lattices]
+    lattices = tuple(OctaveLattice.random(octave.lowest, octave.highest, M, rng) for M in sizes)
     count = round(factor * drawn.count)
     more = DrawnFrequencies(octave, count, int(rng.integers(2**53)), drawn.normals, drawn.uniform_fraction)
     return OctaveSampling(octave, lattices, more)

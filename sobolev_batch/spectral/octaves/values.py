@@ -29,8 +29,8 @@ Complexes = NDArray[np.complex128]
 # Settings of the transform of a surface on a lattice.
 Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 
-# Draws at which the values on a lattice are checked: of a small mesh, of a huge one, and pairs of a triangle and a
-# frequency in between.
+# Values on a lattice are checked at so many samples: for small meshes, for huge ones, and in between as many as make so
+# many pairs of a triangle and a frequency.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
 
 

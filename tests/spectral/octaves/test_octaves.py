@@ -14,7 +14,6 @@ from sobolev_batch import Mesh, Sphere, Torus, icosphere
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
@@ -187,56 +186,20 @@ def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
     assert (statistical_errors([mixed]) / np.sqrt(mixed.variances) > 3.4).all()
 
 
-# The limit of the energy.
+def test_one_sample_that_carries_the_sum_may_stand_for_others() -> None:
+    octave = SampledOctave.of(sampling_of(BOX, 0, 0, 400))
+    squares = np.zeros(400)
+    squares[7] = 1.0
+    weights = OctaveWeights(octave.quadrature, ORDERS)
+    sums = weights.sums(squares)
+    assert (sums.variances >= 1.9 * weights.integrals(squares) ** 2).all()
 
 
-def test_the_energy_tends_to_twice_the_area() -> None:
-    other = BOX.vertices @ np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]) + 0.01
-    for surfaces, area in (([BOX], BOX.area), ([BOX, Mesh(other, BOX.triangles)], 2 * BOX.area)):
-        limit = EnergyLimit.of(surfaces, [1, -1][: len(surfaces)])
-        assert limit.value == pytest.approx(2 * area)
-        assert limit.deviation == 0
-
-
-def test_parts_that_coincide_cancel() -> None:
-    assert EnergyLimit.of([BOX, Mesh(BOX.vertices, BOX.triangles)], [1, -1]).value == 0
-    # Moved along x by a quarter of its length: three quarters of the four long faces coincide.
-    moved = Mesh(BOX.vertices + np.array([0.25, 0, 0]), BOX.triangles)
-    limit = EnergyLimit.of([BOX, moved], [1, -1])
-    long_faces = 2 * (1.0 * 0.6 + 1.0 * 0.4)
-    assert limit.value == pytest.approx(2 * (2 * BOX.area - 2 * 0.75 * long_faces), abs=4 * limit.deviation)
-    # Counted twice, an area weighs four times as much.
-    twice = Mesh(np.concatenate([BOX.vertices] * 2), np.concatenate([BOX.triangles, BOX.triangles + len(BOX.vertices)]))
-    assert EnergyLimit.of([twice], [1]).value == pytest.approx(8 * BOX.area)
-
-
-def beyond_energies(energies: Reals, limit: float) -> tuple[float, float]:
-    """Mean energy beyond octaves of known energies, and how far off it may be."""
-    octaves = [Octave(1.0, index) for index in range(1, len(energies) + 1)]
-    zero = np.zeros(1)
-    sums = [OctaveSums(zero, zero, zero, float(energy), 0.0, 7, 0) for energy in energies]
-    mean, uncertain = beyond(octaves, sums, EnergyLimit(limit), (-1.0,))
-    tail = tail_integral(octaves[-1].highest, -1.0)
-    return mean.item() / tail, uncertain.item() / tail
-
-
-@pytest.mark.parametrize("gap", np.geomspace(0.01, 0.3, 25))
-def test_swings_about_the_limit_are_allowed_for(gap: float) -> None:
-    # Parallel surfaces: the energy swings about its limit, and is averaged over octaves.
-    def energy(cutoff: float) -> float:
-        radii = np.linspace(cutoff / 4, cutoff, 4001)
-        window = smooth_step(radii, cutoff) - smooth_step(radii, cutoff / 2)
-        return float(np.sum(window * (1 - np.cos(2 * np.pi * radii * gap))) / np.sum(window))
-
-    radii = np.linspace(1, 4096, 400_001)
-    for count in range(3, 8):
-        found, uncertain = beyond_energies(np.array([energy(2.0**k) for k in range(1, count + 1)]), 1.0)
-        weights = (1 - smooth_step(radii, 2.0**count)) / (1 + radii**2)
-        true = float(np.sum(weights * (1 - np.cos(2 * np.pi * radii * gap))) / np.sum(weights))
-        assert abs(true - found) <= uncertain + 1e-3, count
-
-
-def test_a_regular_approach_to_the_limit_goes_on() -> None:
-    found, uncertain = beyond_energies(np.array([1 - 0.5**k for k in range(1, 6)]), 1.0)
-    assert pytest.approx(found, abs=0.02) == 1 - 0.5**6
-    assert uncertain < 0.02
+def test_wrong_values_have_large_errors() -> None:
+    values = values_of(icosphere(2), sampling_of(icosphere(2), 0))
+    off = replace(values.checks, differences=values.checks.differences + 0.1)
+    window = OCTAVE.highest - OCTAVE.lowest
+    for order, norm in zip(ORDERS, replace(values, checks=off).error_norms(ORDERS), strict=True):
+        radii = np.linspace(OCTAVE.lowest, OCTAVE.highest, 1001)
+        square = np.mean(OCTAVE.window(radii) * (1 + radii**2) ** order * 0.01 * 4 * np.pi * radii**2) * window
+        assert 0.8 * np.sqrt(square) < norm < 4 * np.sqrt(square)
