@@ -156,6 +156,7 @@
   const spectrum = () => {
     const { labels, bands, shares } = data.spectrum;
     const z = shares[state.order];
+    const crowded = narrow() || bands.length > 6;
     const percent = (share) => (share === null ? "" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`);
     draw("spectrum", [{
       type: "heatmap", z, text: z.map((row) => row.map((share) => (share >= 0.005 ? percent(share) : ""))),
@@ -165,10 +166,10 @@
       hoverinfo: "text",
     }], {
       // Slanted labels reach beyond the last column.
-      ...(narrow() ? { margin: { l: 10, r: 45, t: 30, b: 10 } } : {}),
+      ...(crowded ? { margin: { l: 10, r: 45, t: 30, b: 10 } } : {}),
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
-        title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: narrow() ? -60 : 0,
+        title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: crowded ? -60 : 0,
       },
       yaxis: {
         autorange: "reversed", showgrid: false, zeroline: false, ticks: "", tickvals: labels.map((_, i) => i),
