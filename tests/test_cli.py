@@ -92,7 +92,7 @@ def test_matrices(folder: Path) -> None:
 
 def test_plot_draws_every_picture(folder: Path) -> None:
     done = call("plot", "storage/cli.zarr", "--output", "pictures", folder=folder)
-    names = ["convergence", "transform", "matrix", "map", "spectrum"]
+    names = ["convergence", "transform", "matrix", "map", "spectrum", "energy"]
     if obstacle() is None:
         names += ["witness-0001-ico-1", "witness-0000-ico-0", "witness"]
         assert done.stderr == ""
@@ -136,6 +136,21 @@ def test_an_accuracy_out_of_reach_is_wrong_input(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--rtol", "1e-3", "--M", "64", folder=pair)
     assert done.returncode == 2
     assert "--rtol chooses the lattice" in done.stderr
+
+
+def test_files_with_equal_triangles_need_no_computation(pair: Path) -> None:
+    done = call("compare", "3.off", "3.off", "--order", "-0.6", "--rtol", "1e-2", folder=pair)
+    assert done.returncode == 0, done.stderr
+    assert "both files have the same triangles" in done.stdout
+    assert re.search(r"^order -0.6: 0\.0+e\+00 ± 0e\+00", done.stdout, re.MULTILINE)
+
+
+def test_an_accuracy_at_a_low_order_says_what_was_sampled(pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-1", folder=pair)
+    assert re.search(r"^xi_max .*, \d+ octaves up to \d.*, seed 0$", done.stdout, re.MULTILINE)
+    number, *parts = re.findall(r"\d\.?\d*e[+-]\d+", done.stdout.splitlines()[-1])[1:]
+    assert len(parts) == 4
+    assert sum(map(float, parts)) == pytest.approx(float(number), rel=0.3)
 
 
 def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:

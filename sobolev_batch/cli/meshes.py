@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -57,11 +59,14 @@ def compare_command(
     orders = tuple(dict.fromkeys(orders)) or (-2.0,)
     results = distance(*pair, orders, lattice=lattice, rtol=rtol, memory=memory)
     click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
-    if rtol is not None:
-        click.echo(f"xi_max {results.attrs['xi_max']:.4g}, M {results.attrs['M']}, {results.attrs['dtype']}")
+    if rtol is not None and "M" not in results.attrs:
+        click.echo("both files have the same triangles: nothing had to be computed")
+    elif rtol is not None:
+        click.echo(_settings_text(results.attrs))
     for order in results["order"].values:
         result = results.sel(order=order)
-        parts = ", ".join(f"{name} {result[name].item():.0e}" for name in ("truncation", "aliasing", "discretisation"))
+        names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
+        parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
         remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
         click.echo(f"order {order:g}: {result['distance'].item():.9e} ± {result['error'].item():.0e} ({parts}){remark}")
     if nearness is not None:
@@ -69,3 +74,13 @@ def compare_command(
             f"Hausdorff at least {nearness.hausdorff:.2e}, "
             f"Chamfer {nearness.chamfer:.4e} ± {nearness.chamfer_error:.0e} (s.e.)"
         )
+
+
+def _settings_text(attributes: Mapping[str, Any]) -> str:
+    """Return what was chosen for an accuracy, on one line."""
+    text = f"xi_max {attributes['xi_max']:.4g}, M {attributes['M']}, {attributes['dtype']}"
+    if attributes["octaves"]:
+        text += (
+            f", {attributes['octaves']} octaves up to {attributes['highest_frequency']:.4g}, seed {attributes['seed']}"
+        )
+    return text

@@ -176,7 +176,8 @@ def _repair_axes(store: Store, plan: Plan) -> None:
             stored = np.asarray(array[...])
         except ValueError:
             stored = None
-        if stored is None or np.isnan(stored).any():
+        # Of a deleted array the fill values are left: NaN, or zeros for whole numbers.
+        if stored is None or np.isnan(stored).any() or not stored.any():
             array[...] = axis
         elif not np.allclose(stored, axis, rtol=1e-9, atol=1e-12):
             if name.startswith("fourier"):

@@ -122,6 +122,10 @@ def plot_energy(store: AnyStore, ax: Axes | None = None) -> Axes:
 def draw_energy(tree: xr.DataTree, spectra: Spectra, ax: Axes | None = None) -> Axes:
     """Plot the energies of spectra; see `plot_energy`."""
     axes = ax or new_axes(_ENERGY_INCHES)
+    if not (spectra.energies > 0).any():
+        axes.text(0.5, 0.5, "no mesh differs from the reference", transform=axes.transAxes, ha="center")
+        axes.set_axis_off()
+        return axes
     styles, family_of, shown = family_styles(tree), families_of(tree), set[str]()
     for label, energies, errors in zip(spectra.labels, spectra.energies, spectra.energy_errors, strict=True):
         family = family_of[label]

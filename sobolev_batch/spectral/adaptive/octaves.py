@@ -271,8 +271,10 @@ class _Search:
         outside = np.array([tail_integral(octave.highest, order) for order in orders])
         deviation = _FLAT_DEVIATION if self.normals else _CURVED_DEVIATION
         # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
-        own = np.sqrt(self.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
-        further = _LIMIT_FRACTION * self.tail_changes / (_QUANTILE * energy * outside)
+        # Very negative orders have nothing there.
+        with np.errstate(divide="ignore"):
+            own = np.sqrt(self.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
+            further = _LIMIT_FRACTION * self.tail_changes / (_QUANTILE * energy * outside)
         count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
         lattice = self._lattice(octave, _FIRST_M)
         seconds = self._lattice_seconds(lattice)

@@ -183,7 +183,9 @@ def _compared(
         if part.is_drawn or not count:
             continue
         weights = quadrature.weights[part.samples]
-        by_order = weights * [(1 + quadrature.radii[part.samples] ** 2) ** order for order in orders]
+        # Relative to the lowest frequency, so that high powers do not all underflow.
+        lengths = 1 + quadrature.radii[part.samples] ** 2
+        by_order = weights * [(lengths / lengths[weights > 0].min()) ** order for order in orders]
         chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
         drawn = np.random.default_rng(number).choice(len(chances), count, p=chances)
         chosen.append(part.samples.start + drawn)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
+import numpy as np
 import pytest
 
-from sobolev_batch import Mesh, Sphere, distance, icosphere, norm
+from sobolev_batch import InputError, Mesh, Sphere, distance, icosphere, norm
 from tests.support.rectangles import Rectangles
 
 BOX = Rectangles.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -55,6 +57,29 @@ def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> Non
     assert first["statistical"].item() > 0
     parts = first["truncation"] + first["aliasing"] + first["discretisation"] + first["statistical"]
     assert first["error"].item() == pytest.approx(parts.item(), rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", True, None])
+def test_a_seed_is_a_whole_number(seed: Any) -> None:
+    with pytest.raises(InputError, match="seed must be a whole number from 0 on"):
+        distance(icosphere(1), icosphere(2), -1.0, rtol=0.05, seed=seed)
+
+
+def test_the_unit_of_length_may_be_tiny_beside_the_surfaces() -> None:
+    scale, ball, smaller = 1e9, icosphere(1), icosphere(1).moved(0.9, (0.0, 0.0, 0.0))
+    pair = (ball.moved(scale, (0.0, 0.0, 0.0)), smaller.moved(scale, (0.0, 0.0, 0.0)))
+    found = distance(*pair, -1.0, rtol=3e-2)
+    assert found["within"].item()
+    # Far beyond a wavelength of one unit the measures have nothing in common: the energy is at its limit everywhere.
+    squares = 2 * (pair[0].area + pair[1].area) * np.pi / 2
+    assert found["distance"].item() == pytest.approx(np.sqrt(squares), rel=0.05)
+
+
+def test_very_negative_orders_beside_low_ones_have_no_tail() -> None:
+    found = distance(icosphere(1), icosphere(2), [-0.6, -4.0, -100.0], rtol=5e-2)
+    assert found["within"].all()
+    exact = distance(icosphere(1), icosphere(2), -100.0, rtol=1e-4)
+    assert found["distance"].values[2] == pytest.approx(exact["distance"].item(), rel=1e-3)
 
 
 def test_many_orders_are_served_by_the_same_octaves() -> None:
