@@ -18,7 +18,6 @@ from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
-    FREQUENCY,
     KERNEL,
     LENGTH,
     NUMBER,
@@ -26,10 +25,12 @@ from sobolev_batch.spectral.metrics.datasets import (
     labelled,
     order_axis,
 )
+from sobolev_batch.spectral.metrics.spectrum import band_coordinates
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import squared_moduli
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 
 # The innermost octave has this many spacings of the lattice within it.
@@ -114,8 +115,9 @@ class StoreAccessor:
             order: One order s < -1/2, or several.
 
         Returns:
-            Dataset over `band`, float64, with the coordinates `lower` and `upper` in cycles per unit length, and
-            `longest_wavelength` and `shortest_wavelength` in units of length; `squared` (order, band), in units of
+            Dataset over `band`, float64, with the coordinates `lower` and `upper` in cycles per unit length,
+            `longest_wavelength` and `shortest_wavelength` in units of length, and `own_longest_wavelength` and
+            `own_shortest_wavelength` in the meshes' own unit; `squared` (order, band), in units of
             length, and its `share` of what has been measured, NaN between equal meshes; `energy` (band), the mean of
             ∫_{|ξ|=r} |a^ - b^|² dS, and its standard error `energy_error`, in squared units of length. The attribute
             `energy_limit` is twice the area of all surfaces, which the energy tends to if no parts of them coincide.
@@ -136,8 +138,9 @@ class StoreAccessor:
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
         areas = reducer.areas[indices].sum()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            longest = 1 / lower
+        stored = self._tree.attrs["similarity"]
+        similarity = Similarity(stored["scale"], tuple(stored["origin"]))
+        with np.errstate(invalid="ignore"):
             share = squared / squared.sum(axis=-1)[..., None]
         return xr.Dataset(
             {
@@ -146,13 +149,7 @@ class StoreAccessor:
                 "energy": ("band", energies, described("energy on a sphere of frequencies", AREA)),
                 "energy_error": ("band", deviations, described("standard error of the energy", AREA)),
             },
-            coords={
-                "order": axis,
-                "lower": ("band", lower, described("lower end", FREQUENCY)),
-                "upper": ("band", upper, described("upper end", FREQUENCY)),
-                "longest_wavelength": ("band", longest, described("longest wavelength", LENGTH)),
-                "shortest_wavelength": ("band", 1 / upper, described("shortest wavelength", LENGTH)),
-            },
+            coords={"order": axis, **band_coordinates(lower, upper, similarity)},
             attrs={"kernel": KERNEL, "energy_limit": 2 * float(areas)},
         )
 

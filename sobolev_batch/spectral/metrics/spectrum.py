@@ -101,7 +101,7 @@ def spectrum(
             "mean_square": ("band", mean, described("mean square of the field", "unit length to the fourth")),
             "energy": ("band", mean * surfaces, described("energy on a sphere of frequencies", AREA)),
         },
-        coords={"order": axis, **_band_coordinates(lower, upper, similarity)},
+        coords={"order": axis, **band_coordinates(lower, upper, similarity)},
         attrs={"kernel": KERNEL, **lattice_attributes(lattice, *fields)},
     )
 
@@ -138,9 +138,10 @@ def _sums_of_bands(values: Reals, bands: NDArray[np.intp], count: int) -> Reals:
     return np.asarray(np.bincount(bands, weights=values, minlength=count + 2)[1 : count + 1])
 
 
-def _band_coordinates(
+def band_coordinates(
     lower: Reals, upper: Reals, similarity: Similarity | None
 ) -> dict[str, tuple[str, Reals, dict[str, str]]]:
+    """Return the ends of bands (bands,) and the wavelengths there, as coordinates; see `spectrum`."""
     with np.errstate(divide="ignore"):
         longest, shortest = 1 / lower, 1 / upper
     coordinates = {
