@@ -1,22 +1,25 @@
 """Sobolev distances of negative order between surface meshes, for thousands of meshes at once.
 
 A study file names families of meshes, a reference and a frequency lattice. Each mesh becomes a Dask
-task; a reduction over the stored fields makes the tables. Data flows one way through four folders:
+task; a reduction over the stored fields makes the tables. Data flows one way through the folders:
 
     surfaces   study file -> sources -> Mesh or closed-form surface -> one similarity transform
     spectral   -> weighted points, in batches -> NUFFT -> a block of the Fourier field
+    fitting    -> derivatives of distances, meshes that come nearer to a target
     batch      -> zarr store -> norms, distances, convergence (a study as tasks on a cluster)
     results    -> tables, plots, a report, a lazy DataTree
 
-`surfaces` imports none of the others; `spectral` imports neither dask nor zarr. See docs/design.md.
+`surfaces` imports none of the others; `spectral` and `fitting` import neither dask nor zarr. See docs/design.md.
 
 The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`, `inner_product`.
 - The causes of a distance: `proportion` (area or shape), `spectrum` (wavelengths), `witness` (places).
+- Meshes made by the metric: `fit` gives a `Fit`, with its `Closeness` before and after, and `FitProgress` on the way;
+  `gradient` and `SquaredDistance` are for optimisers of your own.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
-- Surfaces: `Mesh`, `read_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two
-  `Interval`; a `Similarity` scales and moves them.
+- Surfaces: `Mesh`, `read_mesh`, `write_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over
+  two `Interval`; a `Similarity` scales and moves them.
 - Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
 - For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
 - Studies: `Study`, `plan` and its `StudyPlan`, `run` and its `Summary`, `submit` and its `Submission`.

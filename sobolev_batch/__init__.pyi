@@ -20,6 +20,12 @@ from .errors import OrderError as OrderError
 from .errors import SobolevBatchError as SobolevBatchError
 from .errors import StoreError as StoreError
 from .errors import StudyError as StudyError
+from .fitting.closeness import Closeness as Closeness
+from .fitting.fit import Fit as Fit
+from .fitting.fit import FitProgress as FitProgress
+from .fitting.fit import fit as fit
+from .fitting.gradient import gradient as gradient
+from .fitting.objective import SquaredDistance as SquaredDistance
 from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.plots import plot_convergence as plot_convergence
 from .results.figures.plots import plot_map as plot_map
@@ -47,6 +53,7 @@ from .spectral.metrics.norms import norm as norm
 from .spectral.metrics.spectrum import spectrum as spectrum
 from .spectral.metrics.witness import witness as witness
 from .surfaces.formats.readers import read_mesh as read_mesh
+from .surfaces.formats.writers import write_mesh as write_mesh
 from .surfaces.proximity import Proximity as Proximity
 from .surfaces.proximity import proximity as proximity
 from .surfaces.shapes.ellipsoid import Ellipsoid as Ellipsoid

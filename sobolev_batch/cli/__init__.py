@@ -7,7 +7,7 @@ import sys
 import click
 
 # Importing these modules adds their commands to the group.
-from sobolev_batch.cli import meshes, stores, studies  # noqa: F401
+from sobolev_batch.cli import fitting, meshes, stores, studies  # noqa: F401
 from sobolev_batch.cli.group import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_OTHER, EXIT_TERMINATED, cli
 from sobolev_batch.cli.interruption import Terminated, ignore_requests, raise_when_asked
 from sobolev_batch.errors import InputError, SobolevBatchError

@@ -65,6 +65,10 @@ class Backend(ABC):
             spec: Specification with its oversampling set.
         """
 
+    @abstractmethod
+    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
+        """Return a type-2 plan with the sign +1, the adjoint of `plan`."""
+
 
 class _Cpu(Backend):
     def upload(self, array: Array) -> Array:
@@ -75,6 +79,9 @@ class _Cpu(Backend):
 
     def plan(self, spec: NufftSpec) -> NufftPlan:
         return _finufft_plan(1, -1, spec)
+
+    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
+        return _finufft_plan(2, 1, spec)
 
     def __reduce__(self) -> str:
         return "CPU"
@@ -124,18 +131,30 @@ class Gpu(Backend):
         return self.libraries.cupy.asnumpy(array)
 
     def plan(self, spec: NufftSpec) -> NufftPlan:
-        """Return a plan of cuFINUFFT with all of its options set.
+        """Return a type-1 plan of cuFINUFFT.
 
         Raises:
             RuntimeError: cuFINUFFT failed to make it; it does not say why.
         """
+        return self._cufinufft_plan(1, -1, spec)
+
+    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
+        """Return a type-2 plan of cuFINUFFT.
+
+        Raises:
+            RuntimeError: See `plan`.
+        """
+        return self._cufinufft_plan(2, 1, spec)
+
+    def _cufinufft_plan(self, nufft_type: int, sign: int, spec: NufftSpec) -> NufftPlan:
+        """Return a plan of cuFINUFFT with all of its options set."""
         # The defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac automatic.
         plan: NufftPlan = self.libraries.plan(
-            1,
+            nufft_type,
             spec.shape,
             n_trans=1,
             eps=spec.eps,
-            isign=-1,
+            isign=sign,
             dtype=spec.dtype,
             modeord=0,
             upsampfac=spec.oversampling,
@@ -156,11 +175,6 @@ class Gpu(Backend):
 
 
 CPU: Backend = _Cpu("cpu", "finufft", CPU_COSTS)
-
-
-def evaluation_plan(spec: NufftSpec) -> NufftPlan:
-    """Return a type-2 plan on the processor with the sign +1; the modes of an axis of n start at -(n // 2)."""
-    return _finufft_plan(2, 1, spec)
 
 
 def _finufft_plan(nufft_type: int, sign: int, spec: NufftSpec) -> NufftPlan:

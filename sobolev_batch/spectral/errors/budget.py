@@ -220,6 +220,18 @@ def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     return ALIASING_CAUTION * largest
 
 
+def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
+    """Return the size of images at the period over that of images at half the period, which even indices alone bring.
+
+    Args:
+        spacing: Spacing h of the lattice, in cycles per unit length.
+        order: Order s.
+        widths: See `image_weight`.
+    """
+    (_, _, halves) = _SUBLATTICES[-1]
+    return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, halves)
+
+
 def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:
     """Sum the kernel over the least distances of surfaces to their images at n/h, relative to its peak.
 

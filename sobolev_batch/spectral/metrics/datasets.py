@@ -30,6 +30,8 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
     **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
     "inner_product": described("Sobolev inner product", LENGTH),
+    "squared_distance": described("squared Sobolev distance", LENGTH),
+    "gradient": described("derivative of the squared distance with respect to the vertices", NUMBER),
     "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
     "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
     "error": described("bound on the error", NORM, description="truncation + aliasing + discretisation + statistical"),

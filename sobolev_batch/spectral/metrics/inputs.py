@@ -56,14 +56,23 @@ def pair_of(
         LatticeError: As for `field_of`, or the fields lie on different lattices.
         InputError: As for `field_of`.
     """
-    lattices = [Lattice.of(x) for x in (a, b) if isinstance(x, xr.DataArray)]
+    common = common_lattice((a, b), lattice)
+    return field_of(a, common, orders), field_of(b, common, orders)
+
+
+def common_lattice(operands: Sequence[Operand], lattice: Lattice | None) -> Lattice | None:
+    """Return the lattice of the fields among some operands, or the given one; None if there is neither.
+
+    Raises:
+        LatticeError: They differ.
+    """
+    lattices = [Lattice.of(x) for x in operands if isinstance(x, xr.DataArray)]
     if lattice is not None:
         lattices.append(lattice)
     for other in lattices[1:]:
         if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
             raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")
-    common = lattices[0] if lattices else None
-    return field_of(a, common, orders), field_of(b, common, orders)
+    return lattices[0] if lattices else None
 
 
 def point_array(values: ArrayLike, name: str) -> Reals:

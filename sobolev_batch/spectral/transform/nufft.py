@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends.arrays import Array, combine, cosine_and_sine
-from sobolev_batch.spectral.backends.backends import CPU, Backend, NufftPlan, evaluation_plan
+from sobolev_batch.spectral.backends.backends import CPU, Backend, NufftPlan
 from sobolev_batch.spectral.backends.costs import NufftSpec
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
@@ -90,7 +90,7 @@ def evaluate_at(
     count = coordinates.shape[1]
     values = np.zeros((len(coefficients), count))
     spec = CPU.costs.with_oversampling(batching.spec, count)
-    plan = evaluation_plan(spec)
+    plan = CPU.evaluation_plan(spec)
     scale = 2 * np.pi * lattice.spacing
     for first in range(0, count, batching.batch):
         batch = slice(first, min(first + batching.batch, count))

@@ -1,0 +1,188 @@
+"""The transform of a mesh as a function of its vertices, and the derivatives of sums over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.fitting.nodes import MovingNodes
+from sobolev_batch.spectral.backends.backends import Backend
+from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.dtypes import Complexes
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.quadrature.meshes import RuleAssignment, WeightedPoints
+from sobolev_batch.spectral.transform.nufft import transform_points
+from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import require_points_inside
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+
+Reals = NDArray[np.float64]
+
+# Fraction of eps that the coefficients which are left out may carry together.
+_NEGLIGIBLE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTransform:
+    """The transform of a mesh with given triangles on a half lattice, for any positions of the vertices.
+
+    Attributes:
+        triangles: Indices of the corners of each triangle, int64 (m, 3).
+        count: Number n of vertices.
+        nodes: Quadrature nodes.
+        lattice: Lattice of the frequencies.
+        eps: Accuracy of nonuniform FFTs.
+        execution: Backend and threads.
+    """
+
+    triangles: NDArray[np.int64]
+    count: int
+    nodes: MovingNodes
+    lattice: Lattice
+    eps: float
+    execution: Execution = ON_CPU
+
+    @classmethod
+    def of(cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU) -> Self:
+        """Return the transform of a mesh, with the triangle rules that its present shape needs."""
+        rules = RuleAssignment.of(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
+        nodes = MovingNodes.of(mesh, rules)
+        triangles = np.asarray(mesh.triangles, dtype=np.int64)
+        return cls(triangles, len(mesh.vertices), nodes, lattice, settings.eps, execution)
+
+    def at(self, vertices: Reals) -> PlacedMesh:
+        """Return the mesh with its vertices at positions (n, 3), in units of length.
+
+        Raises:
+            InputError: The positions are not finite or not (n, 3).
+            LatticeError: Quadrature nodes lie beyond the lattice's half period.
+        """
+        if vertices.shape != (self.count, 3):
+            raise InputError(
+                f"the mesh has {self.count} vertices: pass positions ({self.count}, 3), or "
+                f"{3 * self.count} numbers; found the shape {vertices.shape}"
+            )
+        coordinates = np.ascontiguousarray((self.nodes.of_vertices @ vertices).T)
+        if not np.isfinite(coordinates).all():
+            raise InputError("positions of vertices must be finite: found NaN or infinity")
+        require_points_inside(coordinates, self.lattice)
+        areas = _Areas(vertices, self.triangles)
+        return PlacedMesh(self, WeightedPoints(coordinates, self.nodes.of_areas @ areas.values), areas)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMesh:
+    """A mesh with its vertices at given positions.
+
+    Attributes:
+        of: Transform that the mesh belongs to.
+        points: Quadrature nodes with their weights.
+        areas: Areas of the triangles.
+    """
+
+    of: MeshTransform
+    points: WeightedPoints
+    areas: _Areas
+
+    def transform(self) -> Complexes:
+        """Return the transform on the half lattice, complex128."""
+        lattice, backend = self.of.lattice, self._backend
+        spec = NufftSpec(lattice.shape, self.of.eps, threads=self.of.execution.threads)
+        points = WeightedPoints(backend.upload(self.points.coordinates), backend.upload(self.points.weights))
+        values, _ = transform_points([points], lattice, lattice.half, spec, backend)
+        return np.asarray(backend.download(values))
+
+    def derivative(self, coefficients: Complexes) -> Reals:
+        """Return the derivative of Re Σ conj(c(ξ)) μ^(ξ) over the half lattice with respect to the vertices, (n, 3).
+
+        It is that of the sum over quadrature nodes x_j with weights a_j, at any number of nodes. The function
+        w(x) = Re Σ c(ξ) exp(+2πi ξ·x) and its gradient at the nodes give Σ_j (w(x_j) da_j + a_j ∇w(x_j) · dx_j).
+
+        Args:
+            coefficients: c, complex128 on the half lattice.
+        """
+        values, slopes = self._evaluated(coefficients)
+        nodes = self.of.nodes
+        gradient = nodes.of_vertices.T @ (self.points.weights[:, None] * slopes)
+        return np.asarray(gradient + self.areas.pulled_back(nodes.of_areas.T @ values, self.of.count))
+
+    def _evaluated(self, coefficients: Complexes) -> tuple[Reals, Reals]:
+        """Return the function of the coefficients (k,) and its gradient (k, 3) at the nodes.
+
+        Each NUFFT gives two real functions, as real and imaginary part: the coefficients of f + i g on the whole
+        lattice are F + i G with those of f and g.
+        """
+        lattice, backend, eps = self.of.lattice, self._backend, self.of.eps
+        most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * eps)
+        middle, axis = lattice.M // 2, 2 * np.pi * lattice.spacing * np.arange(-most, most + 1)
+        inner = slice(middle - most, middle + most + 1)
+        whole = _whole(coefficients[inner, inner, : most + 1])
+        x, y, z = np.ix_(axis, axis, axis)
+        spec = NufftSpec(whole.shape, eps, threads=self.of.execution.threads)
+        points = self.points.coordinates
+        plan = backend.evaluation_plan(backend.costs.with_oversampling(spec, points.shape[1]))
+        # setpts keeps references, not copies: the angles live until both functions are evaluated.
+        angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
+        plan.setpts(*angles)
+        pairs = (whole * (1 - x), whole * (1j * y - z))
+        first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
+        return first.real, np.stack([first.imag, second.real, second.imag], axis=1)
+
+    @property
+    def _backend(self) -> Backend:
+        return self.of.execution.backend
+
+
+def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:
+    """Return the largest |k| along an axis beyond which coefficients carry a negligible fraction of a gradient.
+
+    The weight (1 + |ξ|²)^s of a very negative order leaves few of them, and a small NUFFT.
+    """
+    cubes = _cubes(lattice)
+    amounts = np.bincount(cubes.ravel(), np.abs(coefficients).ravel()) * (
+        1 + 2 * np.pi * lattice.spacing * np.arange(cubes.max() + 1)
+    )
+    beyond = amounts.sum() - np.cumsum(amounts)
+    return max(int(np.argmax(beyond <= fraction * amounts.sum())), 1)
+
+
+@lru_cache(maxsize=4)
+def _cubes(lattice: Lattice) -> NDArray[np.intp]:
+    """Return the largest |k| along an axis of each sample of a half lattice."""
+    x, y, z = (np.abs(lattice.half.indices(axis)) for axis in range(3))
+    return np.maximum(np.maximum(x[:, None, None], y[:, None]), z)
+
+
+def _whole(half: Complexes) -> Complexes:
+    """Return the coefficients of a real function on the whole lattice, from those on its half that count twice."""
+    inner = half[:, :, 1:] / 2
+    return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
+
+
+class _Areas:
+    """Areas of triangles, and their derivative."""
+
+    def __init__(self, vertices: Reals, triangles: NDArray[np.int64]) -> None:
+        self.triangles = triangles
+        self.corners = [vertices[corner] for corner in triangles.T]
+        a, b, c = self.corners
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1)
+        self.values: Reals = lengths / 2
+        # At a triangle without an area, the area has no derivative; take zero.
+        self.normals: Reals = normals / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
+
+    def pulled_back(self, slopes: Reals, count: int) -> Reals:
+        """Return Σ slope · ∂area/∂vertex over the triangles for each of so many vertices (count, 3)."""
+        gradient = np.zeros((count, 3))
+        for corner in range(3):
+            opposite = self.corners[corner - 1] - self.corners[corner - 2]
+            terms = slopes[:, None] * np.cross(self.normals, opposite) / 2
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(self.triangles[:, corner], terms[:, axis], count)
+        return gradient
