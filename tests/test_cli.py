@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 from pathlib import Path
 
@@ -309,3 +310,72 @@ def test_a_terminal_gets_a_bar(folder: Path) -> None:
     assert b"transforms" in shown
     assert b"3/3" in shown
     assert b"[3/3] " not in shown
+
+
+@pytest.fixture
+def balls(tmp_path: Path) -> Path:
+    """A folder with a coarse ball and a finer, larger one, in millimetres and away from the origin."""
+    for name, level, radius in (("start", 2, 30.0), ("target", 4, 31.0)):
+        ball = icosphere(level)
+        trimesh.Trimesh(radius * ball.vertices + [100.0, 0, 0], ball.triangles, process=False).export(
+            tmp_path / f"{name}.ply"
+        )
+    return tmp_path
+
+
+def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(balls: Path) -> None:
+    done = command("fit", "start.ply", "target.ply", "-o", "fitted.obj", "--order", "-4", "--steps", "20", folder=balls)
+    assert done.returncode == 0, done.stderr
+    numbers = r"distance (\S+e-\d\d) ± \S+, Hausdorff at least (\S+), Chamfer (\S+), smallest angle (\S+) degrees"
+    before, after = (re.search(rf"{word}: +{numbers}", done.stdout) for word in ("before", "after"))
+    assert before is not None
+    assert after is not None
+    assert float(after[1]) < float(before[1]) / 5
+    assert 0.9 < float(before[2]) < 2.0  # millimetres
+    assert float(after[2]) < float(before[2])
+    assert max(map(len, done.stdout.splitlines())) <= 130
+    fitted = trimesh.load_mesh(balls / "fitted.obj")
+    assert fitted.bounds.mean(axis=0) == pytest.approx([100.0, 0, 0], abs=0.05)
+    assert fitted.area == pytest.approx(4 * 3.14159265 * 31.0**2, rel=0.01)
+
+
+def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
+    arguments = ("start.ply", "target.ply", "-o", "fitted.ply", "--order", "-4", "--smoothing", "1000")
+    main, worker = pty.openpty()
+    process = subprocess.Popen(
+        [*COMMAND, "fit", *arguments], cwd=balls, stdout=subprocess.PIPE, stderr=worker, stdin=subprocess.DEVNULL
+    )
+    os.close(worker)
+    shown = b""
+    # The bar moves with the first step.
+    while b"1%" not in shown and process.poll() is None:
+        shown += os.read(main, 4096)
+    process.send_signal(signal.SIGINT)
+    while select.select([main], [], [], 0.1)[0] or process.poll() is None:
+        try:
+            if not os.read(main, 4096):
+                break
+        except OSError:
+            break
+    output = process.communicate()[0].decode()
+    os.close(main)
+    assert process.returncode == 0, shown
+    assert "it was interrupted" in output
+    assert len(trimesh.load_mesh(balls / "fitted.ply").faces) == 320
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("start.ply", "target.ply", "-o", "fitted.step"), "meshes are written as .ply, .obj, .off, .stl"),
+        (("start.ply", "target.ply", "-o", "nowhere/fitted.ply"), "there is no folder nowhere"),
+        (("start.ply", "target.ply", "-o", "f.ply", "--order", "-0.4"), "only for orders below -1/2, found -0.4"),
+        (("start.ply", "target.ply", "-o", "f.ply", "--steps", "0"), "steps must be a whole number from 1 on"),
+        (("lost.ply", "target.ply", "-o", "f.ply"), "lost.ply"),
+    ],
+)
+def test_a_fit_that_cannot_be_is_refused_in_one_line(balls: Path, arguments: tuple[str, ...], message: str) -> None:
+    done = call("fit", *arguments, folder=balls)
+    assert done.returncode in (1, 2)
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1

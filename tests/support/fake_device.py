@@ -326,7 +326,8 @@ class _Plan:
         for name in options:
             if name not in OPTIONS:
                 raise TypeError(f"Invalid option '{name}'")
-        assert (nufft_type, n_trans, len(n_modes)) == (1, 1, 3)
+        assert (n_trans, len(n_modes)) == (1, 3)
+        assert nufft_type in (1, 2)
         assert isign in (-1, 1)
         assert options["gpu_device_id"] == 0
         device.options.append({"eps": eps, "isign": isign, "dtype": dtype, "n_modes": n_modes, **options})
@@ -343,7 +344,7 @@ class _Plan:
         # The grid, and the FFT's work area.
         self._take("plan", 2 * cells * self._dtype.itemsize)
         self._made = finufft.Plan(
-            1,
+            nufft_type,
             n_modes,
             eps=eps,
             isign=isign,
@@ -354,7 +355,7 @@ class _Plan:
             spread_kerformula=1,
             showwarn=0,
         )
-        self._n_modes = n_modes
+        self._type, self._n_modes = nufft_type, n_modes
         self._plan = ctypes.c_void_p(1)
 
     def _take(self, where: str, size: int) -> None:
@@ -378,7 +379,7 @@ class _Plan:
         with self._device.alone():
             self._device.fail("execute")
             self._check(data, self._dtype)
-            assert data.shape == self._references[0].shape
+            assert data.shape == (self._references[0].shape if self._type == 1 else self._n_modes)
             return Array(self._device, self._made.execute(data.host))
 
     def _check(self, array: Array, dtype: Any) -> None:

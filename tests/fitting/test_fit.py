@@ -1,0 +1,183 @@
+"""Fits: nearer by an independent measure, with the triangles, boundaries and promises kept."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from typing import Any
+
+import fast_simplification
+import numpy as np
+import pytest
+import xarray as xr
+
+import sobolev_batch as sb
+from sobolev_batch.fitting import fit as fitting
+
+
+def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:
+    vertices, triangles = fast_simplification.simplify(
+        np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32), target_count=count
+    )
+    return sb.Mesh(vertices, triangles)
+
+
+def bumpy(level: int) -> sb.Mesh:
+    """A ball with bumps, whose decimation loses something."""
+    ball = sb.icosphere(level)
+    x, y, z = np.array(ball.vertices).T
+    return sb.Mesh(ball.vertices * (0.8 + 0.15 * np.sin(4 * x) * np.cos(3 * y + z))[:, None], ball.triangles)
+
+
+TARGET = bumpy(4)
+START = decimated(TARGET, 400)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> sb.Fit:
+    return sb.fit(START, TARGET, -4.0)
+
+
+def normals(mesh: sb.Mesh) -> np.ndarray:
+    a, b, c = mesh.corners()
+    return np.cross(b - a, c - a)
+
+
+def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.Fit) -> None:
+    orders = [-1.5, -2.0, -4.0]
+    before, after = (sb.distance(mesh, TARGET, orders, rtol=3e-2)["distance"].values for mesh in (START, fitted.mesh))
+    assert (after < 0.8 * before).all()
+    assert after[-1] < before[-1] / 3
+    assert fitted.before.distance == pytest.approx(before[-1], rel=0.05)
+    assert fitted.after.distance == pytest.approx(after[-1], rel=0.05)
+    assert fitted.after.error < 0.05 * fitted.after.distance
+
+
+def test_it_keeps_the_triangles_and_turns_none_over(fitted: sb.Fit) -> None:
+    np.testing.assert_array_equal(fitted.mesh.triangles, START.triangles)
+    assert (np.sum(normals(fitted.mesh) * normals(START), axis=1) > 0).all()
+    assert fitted.after.smallest_angle > 0.3 * fitted.before.smallest_angle
+
+
+def test_it_reports_distances_of_points_too(fitted: sb.Fit) -> None:
+    near = sb.proximity(fitted.mesh, TARGET)
+    assert (fitted.after.hausdorff, fitted.after.chamfer) == (near.hausdorff, near.chamfer)
+    grown = fitted.after.hausdorff > 1.5 * fitted.before.hausdorff
+    assert grown == any("Hausdorff distance grew" in remark for remark in fitted.remarks)
+
+
+def test_a_field_is_target_enough(fitted: sb.Fit) -> None:
+    field = sb.fourier_transform(TARGET, sb.Lattice(6.0, 54), 1e-7, order=[-4.0])
+    from_field = sb.fit(START, field, -4.0)
+    assert from_field.after.distance < from_field.before.distance / 3
+    assert np.isnan(from_field.after.hausdorff)
+    assert sb.distance(from_field.mesh, TARGET, -4.0, rtol=1e-2)["distance"] < fitted.before.distance / 3
+
+
+def test_a_ball_becomes_something_else() -> None:
+    ball = sb.icosphere(2)
+    fitted = sb.fit(sb.Mesh(0.5 * ball.vertices, ball.triangles), TARGET, -2.0, steps=80)
+    assert fitted.after.distance < fitted.before.distance / 15
+    assert fitted.after.chamfer < fitted.before.chamfer / 5
+
+
+def test_moving_both_moves_the_result() -> None:
+    by = np.array([30.0, -5.0, 7.0])
+    moved = [sb.Mesh(mesh.vertices + by, mesh.triangles) for mesh in (START, TARGET)]
+    one, other = sb.fit(START, TARGET, -4.0, steps=5), sb.fit(*moved, -4.0, steps=5)
+    assert np.abs(other.mesh.vertices - by - one.mesh.vertices).max() < 1e-4
+
+
+def test_boundaries_stay_if_asked() -> None:
+    cap = np.asarray(START.vertices)[START.triangles][:, :, 2].mean(axis=1) > 0.1
+    half = sb.Mesh(START.vertices, START.triangles[cap])
+    sides = np.sort(half.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, counts = np.unique(sides, axis=0, return_counts=True)
+    rim = np.unique(edges[counts == 1])
+    stray = np.setdiff1d(np.arange(len(half.vertices)), half.triangles)
+    free, kept = (sb.fit(half, TARGET, -4.0, steps=10, keep_boundary=keep).mesh for keep in (False, True))
+    np.testing.assert_allclose(kept.vertices[rim], half.vertices[rim], rtol=0, atol=1e-14)
+    assert np.abs(free.vertices[rim] - half.vertices[rim]).max() > 1e-3
+    for mesh in (free, kept):
+        np.testing.assert_allclose(mesh.vertices[stray], half.vertices[stray], rtol=0, atol=1e-14)
+        assert np.abs(mesh.vertices - half.vertices).max() > 1e-3
+
+
+def test_triangles_without_common_vertices_stay_together() -> None:
+    soup = sb.Mesh(np.asarray(START.vertices)[START.triangles].reshape(-1, 3), np.arange(1200).reshape(-1, 3))
+    fitted, whole = (sb.fit(mesh, TARGET, -4.0, steps=10).mesh for mesh in (soup, START))
+    np.testing.assert_allclose(
+        np.asarray(fitted.vertices)[fitted.triangles], np.asarray(whole.vertices)[whole.triangles], atol=1e-3
+    )
+    assert len(np.unique(fitted.vertices, axis=0)) == len(np.unique(START.vertices, axis=0))
+
+
+def test_an_interrupt_keeps_the_best_so_far() -> None:
+    seen: list[sb.FitProgress] = []
+
+    def interrupt(progress: sb.FitProgress) -> None:
+        seen.append(progress)
+        if progress.step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    fitted = sb.fit(START, TARGET, -4.0, notify=interrupt)
+    assert fitted.end == "it was interrupted"
+    assert fitted.steps == len(seen) == 3
+    assert fitted.after.distance < fitted.before.distance
+    assert [progress.relative for progress in seen] == sorted((one.relative for one in seen), reverse=True)
+
+
+def test_nothing_is_fitted_below_the_error_of_a_field() -> None:
+    field = sb.fourier_transform(TARGET, sb.Lattice(4.0, 36), 1e-2, order=[-4.0])
+    fitted = sb.fit(START, field, -4.0)
+    assert fitted.end == "the distance is down to the error of its fields"
+    assert fitted.after.distance > fitted.after.error
+
+
+def test_a_mesh_at_its_target_stays() -> None:
+    fitted = sb.fit(START, START, -2.0)
+    assert (fitted.before.distance, fitted.after.distance, fitted.steps) == (0, 0, 0)
+    np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
+
+
+def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(run: Any, stages: Any) -> np.ndarray:
+        return np.asarray(run.problem.mesh.vertices) * 1.1
+
+    monkeypatch.setattr(fitting._Run, "carried_out", away)
+    fitted = sb.fit(START, TARGET, -4.0)
+    np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
+    assert fitted.after == fitted.before
+    assert "no nearer mesh was found" in fitted.remarks[0]
+
+
+def far_field() -> xr.DataArray:
+    return sb.fourier_transform(TARGET, sb.Lattice(0.5, 8))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mesh": sb.Sphere()}, "only the vertices of a Mesh can move, found Sphere"),
+        ({"target": "ball"}, "expected a Mesh, a Sphere, a parametrised surface"),
+        ({"target": sb.Sphere(1.0, (9, 0, 0))}, "do not overlap: move one of them to the other first"),
+        ({"target": sb.Sphere(1000.0)}, "are both in the same unit of length?"),
+        ({"order": -0.5}, "finite only for orders below -1/2, found -0.5"),
+        ({"order": [-2.0, -3.0]}, "one order is needed, found 2"),
+        ({"steps": 0}, "steps must be a whole number from 1 on, found 0"),
+        ({"smoothing": -1.0}, "smoothing must be a number from 0 on, found -1.0"),
+        ({"smoothing": np.nan}, "smoothing must be a number from 0 on, found nan"),
+        ({"lattice": sb.Lattice(8.0, 8)}, "the mesh reaches to |coordinate|"),
+        ({"keep_boundary": True, "mesh": sb.Mesh(np.eye(3), [[0, 1, 2]])}, "all vertices lie on the boundary"),
+    ],
+)
+def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
+    arguments = {"mesh": START, "target": TARGET, "order": -4.0, **change}
+    with pytest.raises(sb.SobolevBatchError, match=re.escape(message)):
+        sb.fit(**arguments)
+
+
+def test_an_order_that_a_field_cannot_serve_is_refused() -> None:
+    with pytest.raises(sb.InputError, match="take a more negative order, or a field on a larger lattice"):
+        sb.fit(START, far_field(), -1.0)

@@ -1,0 +1,198 @@
+"""Derivatives of squared distances against plain sums, differences, symmetries and finer lattices."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from itertools import product
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+
+import sobolev_batch as sb
+from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.spectral.backends import backends
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from tests.support.fake_device import Device
+from tests.support.moving_meshes import PlainSums
+
+Reals = NDArray[np.float64]
+
+SPHERE = sb.Sphere(0.7, (0.2, -0.1, 0.05))
+# A small lattice, so that plain sums are possible, with a period of 10.
+SMALL = sb.Lattice(0.5, 10)
+
+
+def tetrahedron() -> sb.Mesh:
+    return sb.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
+def wrinkled(seed: int) -> sb.Mesh:
+    ball, rng = sb.icosphere(0), np.random.default_rng(seed)
+    return sb.Mesh(ball.vertices + 0.2 * rng.normal(size=ball.vertices.shape), ball.triangles)
+
+
+def moved(mesh: sb.Mesh, *by: float) -> sb.Mesh:
+    return sb.Mesh(mesh.vertices + np.array(by), mesh.triangles)
+
+
+MESHES = {
+    "ball": sb.icosphere(0),
+    "wrinkled": wrinkled(1),
+    "open": sb.Mesh(sb.icosphere(0).vertices, sb.icosphere(0).triangles[:7]),
+    "a single triangle": sb.Mesh([[0, 0, 0], [2.0, 0, 0], [0, 1.5, 0.5]], [[0, 1, 2]]),
+    "slivers": sb.Mesh([[0, 0, 0], [1, 0, 0], [2, 1e-6, 0], [1, 1e-3, 1]], [[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
+    "three at an edge": sb.Mesh(
+        [[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1.0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]]
+    ),
+    "a triangle twice": sb.Mesh(tetrahedron().vertices, [[0, 2, 1], [0, 2, 1], [1, 2, 3]]),
+    "far from the origin": moved(tetrahedron(), 2.5, -3.5, 2.0),
+    "tiny beside large": sb.Mesh(
+        np.concatenate([3 * tetrahedron().vertices - 1, 1e-3 * tetrahedron().vertices]),
+        np.concatenate([tetrahedron().triangles, tetrahedron().triangles + 4]),
+    ),
+    "stray vertices": sb.Mesh(
+        np.concatenate([tetrahedron().vertices, [[50.0, 0, 0]]]),
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3]],
+    ),
+}
+
+
+@pytest.mark.parametrize("order", [-0.75, -2.0, -6.0])
+@pytest.mark.parametrize("name", MESHES)
+def test_it_is_the_derivative_of_plain_sums(name: str, order: float) -> None:
+    mesh = MESHES[name]
+    vertices, sums = np.array(mesh.vertices), PlainSums(0.7, np.array(SPHERE.center), SMALL.xi_max, SMALL.M, order)
+    square, expected = sums.value_and_derivative(vertices, mesh.triangles)
+    value, found = sb.SquaredDistance.of(mesh, SPHERE, order, lattice=SMALL, eps=1e-12)(vertices)
+    assert value == pytest.approx(square, rel=1e-9)
+    assert np.linalg.norm(found - expected) <= 1e-9 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 1e-3, 1e-8])
+def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> None:
+    mesh, lattice = sb.icosphere(2), sb.Lattice(4.0, 40)
+    fine = sb.SquaredDistance.of(mesh, SPHERE, -2.0, lattice=lattice)
+    transform = MeshTransform.of(mesh, lattice, TransformSettings(1e-13, tolerance=tolerance))
+    squared = sb.SquaredDistance(transform, fine.target, fine.factors)
+    rng = np.random.default_rng(0)
+    direction, vertices, step = rng.normal(size=mesh.vertices.shape), np.array(mesh.vertices), 1e-5
+    _, found = squared(vertices)
+    change = (squared.value(vertices + step * direction) - squared.value(vertices - step * direction)) / (2 * step)
+    assert np.sum(found * direction) == pytest.approx(change, rel=1e-6)
+
+
+def test_the_value_is_the_squared_distance() -> None:
+    lattice = sb.Lattice(4.0, 40)
+    squared = sb.SquaredDistance.of(sb.icosphere(2), SPHERE, -2.0, lattice=lattice)
+    expected = sb.distance(sb.icosphere(2), SPHERE, -2.0, lattice=lattice)["distance"].item() ** 2
+    assert squared.value(sb.icosphere(2).vertices) == pytest.approx(expected, rel=1e-8)
+    assert squared(sb.icosphere(2).vertices)[0] == pytest.approx(expected, rel=1e-8)
+
+
+def test_flat_vertices_give_a_flat_derivative() -> None:
+    squared = sb.SquaredDistance.of(sb.icosphere(1), SPHERE, -2.0, lattice=SMALL)
+    value, gradient = squared(sb.icosphere(1).vertices)
+    flat_value, flat = squared(sb.icosphere(1).vertices.ravel())
+    assert (flat_value, flat.shape) == (value, (126,))
+    np.testing.assert_array_equal(flat.reshape(-1, 3), gradient)
+
+
+def test_two_meshes_that_move_together_keep_their_distance() -> None:
+    a, b, lattice = wrinkled(2), moved(wrinkled(3), 0.3, 0, 0.1), sb.Lattice(3.0, 40)
+    of_a, of_b = (sb.gradient(*pair, -3.0, lattice=lattice, eps=1e-11) for pair in ((a, b), (b, a)))
+    first, second = of_a["gradient"].values, of_b["gradient"].values
+    scale = np.abs(first).sum()
+    assert np.abs(first.sum(axis=0) + second.sum(axis=0)).max() < 1e-9 * scale
+    # Turned together, they do so up to what the cube leaves out: its corners turn.
+    torque = np.cross(a.vertices, first).sum(axis=0) + np.cross(b.vertices, second).sum(axis=0)
+    assert np.abs(torque).max() < 5 * (of_a["error"].item() + of_b["error"].item())
+
+
+def test_a_quarter_turn_of_both_turns_the_derivative() -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    a, b = wrinkled(4), wrinkled(5)
+    found = sb.gradient(a, b, -2.0, lattice=SMALL)["gradient"].values
+    turned = sb.gradient(
+        sb.Mesh(a.vertices @ turn.T, a.triangles), sb.Mesh(b.vertices @ turn.T, b.triangles), -2.0, lattice=SMALL
+    )["gradient"].values
+    np.testing.assert_allclose(turned, found @ turn.T, rtol=0, atol=1e-7 * np.abs(found).max())
+
+
+ORDERS = [-1.5, -2.0, -4.0]
+
+
+@cache
+def pair_and_gradient(name: str) -> tuple[sb.Mesh, sb.Mesh | sb.Sphere, xr.Dataset]:
+    """A mesh, its target, and the derivative from a lattice that is finer and reaches farther than others."""
+    corners = np.array(list(product([-0.5, 0.5], repeat=3)))
+    faces = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    box = sb.Mesh(corners, np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]]))
+    mesh, target = {
+        "ball in ball": (sb.icosphere(2), sb.Sphere()),
+        "moved": (sb.icosphere(2), sb.Sphere(1.0, (0.2, 0, 0))),
+        "box": (box, moved(box, 0.05, 0.02, 0.01)),
+    }[name]
+    return mesh, target, sb.gradient(mesh, target, ORDERS, lattice=sb.Lattice(14.0, 112), eps=1e-10)
+
+
+@pytest.mark.parametrize(("highest", "intervals", "eps"), [(2.0, 20, 1e-4), (3.0, 24, 1e-9), (5.0, 60, 1e-2)])
+@pytest.mark.parametrize("name", ["ball in ball", "moved", "box"])
+def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, intervals: int, eps: float) -> None:
+    mesh, target, finest = pair_and_gradient(name)
+    lattice = sb.Lattice(highest, intervals)
+    for operand in (target, sb.fourier_transform(target, lattice, eps, order=ORDERS)):
+        found = sb.gradient(mesh, operand, ORDERS, lattice=lattice, eps=eps)
+        off = np.sqrt(((found["gradient"] - finest["gradient"]) ** 2).sum(["vertex", "axis"]))
+        assert (off <= found["error"] + finest["error"]).all()
+        assert (found["error"] <= 200 * off + 1e-6 * abs(found["gradient"]).sum(["vertex", "axis"])).all()
+        parts = found["truncation"] + found["aliasing"] + found["discretisation"]
+        np.testing.assert_allclose(parts, found["error"])
+
+
+def test_a_field_of_unknown_quality_gives_a_gradient_without_an_error() -> None:
+    field = sb.fourier_transform(SPHERE, SMALL).drop_attrs()
+    found = sb.gradient(sb.icosphere(1), field, -2.0)
+    assert np.isfinite(found["gradient"]).all()
+    assert np.isnan(found["error"])
+
+
+def test_a_gpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = sb.gradient(sb.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL)["gradient"]
+    monkeypatch.setattr(backends, "gpu_backend", lambda: Device().backend())
+    found = sb.gradient(sb.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL, backend="gpu")["gradient"]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * float(abs(expected).max()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((sb.Sphere(), SPHERE, -2.0), "only the vertices of a Mesh can move, found Sphere"),
+        ((sb.icosphere(0), SPHERE, -0.5), "finite only for orders below -1/2, found -0.5"),
+        ((sb.icosphere(0), "sphere", -2.0), "expected a Mesh, a Sphere, a parametrised surface"),
+        ((moved(sb.icosphere(0), 9, 0, 0), SPHERE, -2.0), "to |coordinate| = 9.8"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: tuple[sb.Mesh, sb.Sphere, float], message: str) -> None:
+    for function in (sb.gradient, sb.SquaredDistance.of):
+        with pytest.raises(sb.SobolevBatchError, match=re.escape(message)):
+            function(*arguments, lattice=SMALL)
+
+
+def test_positions_are_checked() -> None:
+    squared = sb.SquaredDistance.of(sb.icosphere(0), SPHERE, -2.0, lattice=SMALL)
+    with pytest.raises(sb.InputError, match=r"the mesh has 12 vertices: pass positions \(12, 3\), or 36 numbers"):
+        squared(np.zeros((11, 3)))
+    with pytest.raises(sb.InputError, match="must be finite: found NaN or infinity"):
+        squared(np.full((12, 3), np.nan))
+    with pytest.raises(sb.LatticeError, match="hold"):
+        squared(sb.icosphere(0).vertices + 10.0)
+
+
+def test_a_lattice_is_needed() -> None:
+    with pytest.raises(sb.InputError, match="needs a lattice"):
+        sb.gradient(sb.icosphere(0), SPHERE, -2.0)
+    with pytest.raises(sb.InputError, match="one order is needed, found 2"):
+        sb.SquaredDistance.of(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
