@@ -26,6 +26,8 @@ from .fitting.fit import FitProgress as FitProgress
 from .fitting.fit import fit as fit
 from .fitting.gradient import gradient as gradient
 from .fitting.objective import SquaredDistance as SquaredDistance
+from .fitting.tensors import jax_function as jax_function
+from .fitting.tensors import torch_function as torch_function
 from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.plots import plot_convergence as plot_convergence
 from .results.figures.plots import plot_map as plot_map

@@ -84,8 +84,8 @@ def test_a_ball_becomes_something_else() -> None:
 
 def test_moving_both_moves_the_result() -> None:
     by = np.array([30.0, -5.0, 7.0])
-    moved = [sb.Mesh(mesh.vertices + by, mesh.triangles) for mesh in (START, TARGET)]
-    one, other = sb.fit(START, TARGET, -4.0, steps=5), sb.fit(*moved, -4.0, steps=5)
+    start, target = (sb.Mesh(mesh.vertices + by, mesh.triangles) for mesh in (START, TARGET))
+    one, other = sb.fit(START, TARGET, -4.0, steps=5), sb.fit(start, target, -4.0, steps=5)
     assert np.abs(other.mesh.vertices - by - one.mesh.vertices).max() < 1e-4
 
 

@@ -26,7 +26,7 @@ SMALL = sb.Lattice(0.5, 10)
 
 
 def tetrahedron() -> sb.Mesh:
-    return sb.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    return sb.Mesh([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0], [0.0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
 def wrinkled(seed: int) -> sb.Mesh:
@@ -42,10 +42,10 @@ MESHES = {
     "ball": sb.icosphere(0),
     "wrinkled": wrinkled(1),
     "open": sb.Mesh(sb.icosphere(0).vertices, sb.icosphere(0).triangles[:7]),
-    "a single triangle": sb.Mesh([[0, 0, 0], [2.0, 0, 0], [0, 1.5, 0.5]], [[0, 1, 2]]),
-    "slivers": sb.Mesh([[0, 0, 0], [1, 0, 0], [2, 1e-6, 0], [1, 1e-3, 1]], [[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
+    "a single triangle": sb.Mesh([[0.0, 0, 0], [2.0, 0, 0], [0.0, 1.5, 0.5]], [[0, 1, 2]]),
+    "slivers": sb.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 1e-6, 0], [1.0, 1e-3, 1]], [[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
     "three at an edge": sb.Mesh(
-        [[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1.0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]]
+        [[0.0, 0, 0], [1.0, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1.0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]]
     ),
     "a triangle twice": sb.Mesh(tetrahedron().vertices, [[0, 2, 1], [0, 2, 1], [1, 2, 3]]),
     "far from the origin": moved(tetrahedron(), 2.5, -3.5, 2.0),
@@ -130,11 +130,12 @@ def pair_and_gradient(name: str) -> tuple[sb.Mesh, sb.Mesh | sb.Sphere, xr.Datas
     corners = np.array(list(product([-0.5, 0.5], repeat=3)))
     faces = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     box = sb.Mesh(corners, np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]]))
-    mesh, target = {
+    pairs: dict[str, tuple[sb.Mesh, sb.Mesh | sb.Sphere]] = {
         "ball in ball": (sb.icosphere(2), sb.Sphere()),
         "moved": (sb.icosphere(2), sb.Sphere(1.0, (0.2, 0, 0))),
         "box": (box, moved(box, 0.05, 0.02, 0.01)),
-    }[name]
+    }
+    mesh, target = pairs[name]
     return mesh, target, sb.gradient(mesh, target, ORDERS, lattice=sb.Lattice(14.0, 112), eps=1e-10)
 
 
