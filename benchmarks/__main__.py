@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.accuracy import left_to_us, stored_bytes
 from benchmarks.devices import on_a_gpu
+from benchmarks.fitting import fits
 from benchmarks.low_orders import low_orders
 from benchmarks.memory import peaks
 from benchmarks.scale import tiny_meshes
@@ -28,6 +29,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "8": peaks,
     "9": on_a_gpu,
     "10": low_orders,
+    "11": fits,
     "growth": growth,
     "scale": tiny_meshes,
 }
@@ -45,8 +47,8 @@ def main() -> None:
     facts = [
         *machine_facts(),
         f"times are medians of {effort.repeats} turns each, taken alternately",
-        "items 1 to 4: ratios of times are other / ours; items 5 to 7 and 9: ours / other; item 10: processor seconds, "
-        "and other / ours against sums; "
+        "items 1 to 4: ratios of times are other / ours; items 5 to 7, 9 and 11: ours / other; item 10: processor "
+        "seconds, and other / ours against sums; "
         "distances: relative difference",
     ]
     print("\n".join(["", format_table(rows), "", *facts]))

@@ -5,18 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.util import find_spec
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
+from benchmarks.meshes import pair_of_cortex
 from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort
-from sobolev_batch.surfaces.sources.decimation import DecimatedMember
-from sobolev_batch.surfaces.sources.files import FileSource
 
 Found = TypeVar("Found")
 Reals = NDArray[np.float64]
@@ -25,12 +22,11 @@ Sum = Callable[[Reals, Reals], float]
 # Order, rtol, and most processor seconds, for a coarse organic mesh against a fine one.
 _REQUESTS = ((-2.0, 1e-2, 3.0), (-2.0, 1e-3, 10.0), (-1.0, 1e-2, 20.0), (-0.6, 1e-1, 20.0))
 _OF_SPHERE = (-2.0, 1e-3, 10.0)
-_CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 
 
 def low_orders(effort: Effort) -> Iterator[Row]:
     """Item 10: distances of meshes at low orders, and the sum over points that a user would write instead."""
-    coarse, fine = _pair(effort)
+    coarse, fine = pair_of_cortex(effort, 1280)
     # What is loaded and prepared once.
     sb.distance(sb.icosphere(0), sb.icosphere(1), -2.0, rtol=1e-2)
     what = f"{len(coarse.triangles):,} against {len(fine.triangles):,} triangles"
@@ -95,16 +91,3 @@ def _processor_seconds(work: Callable[[], Found]) -> tuple[float, Found]:
     started = time.process_time()
     result = work()
     return time.process_time() - started, result
-
-
-def _pair(effort: Effort) -> tuple[sb.Mesh, sb.Mesh]:
-    """A cortical surface and its decimation, or two icospheres where it is not installed."""
-    if effort.quick or find_spec("nilearn") is None:
-        return sb.icosphere(1), sb.icosphere(3)
-    (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
-    fine = original.load()
-    coarse = DecimatedMember("cortex", 0, original, 1280).load()
-    assert isinstance(fine, sb.Mesh)
-    assert isinstance(coarse, sb.Mesh)
-    unit = sb.Similarity.to_unit_ball(fine)
-    return coarse.moved(unit.scale, unit.origin), fine.moved(unit.scale, unit.origin)

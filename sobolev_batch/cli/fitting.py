@@ -12,7 +12,8 @@ import numpy as np
 
 from sobolev_batch.cli.group import cli
 from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.fit import DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress, fit
+from sobolev_batch.fitting.fit import fit
+from sobolev_batch.fitting.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress
 from sobolev_batch.surfaces.formats.readers import read_mesh
 from sobolev_batch.surfaces.formats.writers import require_writable_format, write_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -29,7 +30,9 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
     required=True,
     help="File to write, .ply, .obj, .off or .stl.",
 )
-@click.option("--order", type=float, default=-2.0, show_default=True, help="Sobolev order of the distance to lower.")
+@click.option(
+    "--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Sobolev order of the distance to lower."
+)
 @click.option("--steps", type=int, default=DEFAULT_STEPS, show_default=True, help="Largest number of steps.")
 @click.option(
     "--smoothing",

@@ -17,7 +17,7 @@ from sobolev_batch.fitting.shapes import ShapePenalty
 from sobolev_batch.fitting.smoothing import Smoothing
 
 Reals = NDArray[np.float64]
-Notify = Callable[[float], None]
+Notify = Callable[[Reals, float], None]
 
 # Pairs of steps and gradients that L-BFGS remembers.
 _MEMORY = 20
@@ -73,7 +73,7 @@ def descend(
         steps: Largest number of steps.
         floor: Squared distance below which nothing is left to gain.
         unit: Length of a long step, such as that of an edge.
-        notify: Called with the squared distance after each step.
+        notify: Called with the positions and the squared distance after each step.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.
@@ -90,8 +90,6 @@ def descend(
             callback=path.accept,
             options={"maxiter": steps, "maxfun": 3 * steps, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
         )
-    except KeyboardInterrupt:
-        path.end = End.INTERRUPTED
     except LatticeError:
         path.end = End.LEFT
     if path.end is End.CONVERGED and path.steps >= steps:
@@ -142,7 +140,7 @@ class _Path:
         self.squared = float(intermediate_result.fun) * self.first
         self.steps += 1
         self._history.append(self.squared)
-        self.notify(self.squared)
+        self.notify(vertices, self.squared)
         if self.squared <= self.floor:
             self._stop(End.ERROR)
         before = self._history[-_PATIENCE - 1] if len(self._history) > _PATIENCE else np.inf

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -12,12 +13,18 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.descent import End, descend
-from sobolev_batch.fitting.problem import FitProblem, Weighting
-from sobolev_batch.fitting.smoothing import Smoothing
+from sobolev_batch.fitting.problem import FitProblem
+from sobolev_batch.fitting.stages import (
+    DEFAULT_ORDER,
+    DEFAULT_SMOOTHING,
+    DEFAULT_STEPS,
+    FitProgress,
+    FitSettings,
+    Run,
+    stages_of,
+)
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
-from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -26,39 +33,9 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 
-DEFAULT_STEPS, DEFAULT_SMOOTHING = 150, 0.25
-# Far away, very negative orders lead: their kernels are wide.
-_COARSE_ORDER = -4.0
-# Beyond this relative distance at the coarse order, a mesh is far from its target.
-_FAR = 0.05
-# Smoothing of the stages that bring a far mesh near, and the fraction of all steps for each.
-_FAR_SMOOTHINGS, _FAR_STEPS = (16.0, 4.0), 0.25
-# The share of a squared distance at half the order, which keeps detail that the order itself hardly sees.
-_DETAIL_SHARE, _HIGHEST_DETAILED = 0.1, -1.5
-# After a step that would turn triangles over, smoothing is increased by this factor, so often at most.
-_SMOOTHER, _MOST_RETREATS = 4.0, 4
 # Start and target whose sizes differ by this factor are in different units.
 _OTHER_UNIT = 20.0
 _HAUSDORFF_GROWTH = 1.5
-
-
-@dataclass(frozen=True)
-class FitProgress:
-    """The state of a fit after a step.
-
-    Attributes:
-        step: Number of steps so far.
-        steps: Largest number of steps.
-        relative: Present objective over that at the start of the stage, as a ratio of distances.
-
-    >>> import sobolev_batch as sb
-    >>> sb.FitProgress(step=3, steps=150, relative=0.5).relative
-    0.5
-    """
-
-    step: int
-    steps: int
-    relative: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +69,7 @@ class Fit:
 def fit(
     mesh: Mesh,
     target: Operand,
-    order: float = -2.0,
+    order: float = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
     steps: int = DEFAULT_STEPS,
@@ -135,132 +112,108 @@ def fit(
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
-    (checked,) = _one_order(order)
-    _check(mesh, target, steps, smoothing)
-    execution = Execution(threads=threads or os.cpu_count() or 1)
-    start, place = _welded(mesh)
-    move = Similarity()
-    if isinstance(target, xr.DataArray):
-        field = field_of(target, common_lattice((target,), lattice), (checked,))
-        problem = FitProblem.of_field(start, field, execution)
-    else:
-        if lattice is None:
-            move = _centering(start, target)
-        start, target = move.apply(start), move.apply(target)
-        problem = FitProblem.of_surface(start, target, lattice, _orders_of(checked), execution)
-    before = Closeness.of(start, target, checked, problem.lattice)
+    settings = FitSettings(order, steps, smoothing, keep_boundary)
+    task = _Task.of(mesh, target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1))
+    before = task.closeness(task.start)
     if before.error >= before.distance > 0 and isinstance(target, xr.DataArray):
         raise InputError(
-            f"the field ends at the frequency {problem.lattice.xi_max:g}: at order {checked:g} the distance "
-            f"{before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could lower; "
-            "take a more negative order, or a field on a larger lattice"
+            f"the field ends at the frequency {task.problem.lattice.xi_max:g}: at order {settings.order:g} the "
+            f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
+            "lower; take a more negative order, or a field on a larger lattice"
         )
-    run = _Run(problem, _free_vertices(start, keep_boundary=keep_boundary), steps, notify)
-    vertices = run.carried_out(_stages(problem, checked, smoothing, steps))
-    fitted = Mesh(vertices, start.triangles)
-    after = Closeness.of(fitted, target, checked, problem.lattice)
+    run = Run(task.problem, task.free, steps, notify)
+    fitted = Mesh(run.carried_out(stages_of(task.problem, settings)), task.start.triangles)
+    after = task.closeness(fitted)
     remarks = []
     if after.distance - after.error > before.distance + before.error:
         remarks.append("no nearer mesh was found: this is the start")
-        fitted, after = start, before
+        fitted, after = task.start, before
     if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
         remarks.append(
             f"the Hausdorff distance grew from {before.hausdorff:.2g} to {after.hausdorff:.2g}: the worst point lies "
             "farther away than before; take a larger smoothing or a less negative order"
         )
-    own = Mesh(np.asarray(fitted.vertices)[place] / move.scale + np.asarray(move.origin), mesh.triangles)
-    return Fit(own, checked, before, after, run.taken, run.end.value, tuple(remarks))
+    return Fit(task.own(fitted), settings.order, before, after, run.taken, run.end.value, tuple(remarks))
 
 
-@dataclass(frozen=True)
-class _Stage:
-    """A part of a fit: orders with the share of each in the objective, smoothing, and a largest number of steps."""
+def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
+    """Return the mesh that `fit` finds, without measures of its closeness; the start if it would be farther away.
 
-    shares: tuple[tuple[float, float], ...]
-    smoothing: float
-    steps: int
-
-
-class _Run:
-    """A fit that is under way."""
-
-    def __init__(
-        self, problem: FitProblem, free: NDArray[np.int64], steps: int, notify: Callable[[FitProgress], None] | None
-    ) -> None:
-        self.problem, self.free, self.steps, self.notify = problem, free, steps, notify
-        self.taken = 0
-        self.end = End.CONVERGED
-
-    def carried_out(self, stages: list[_Stage]) -> Reals:
-        """Return the vertices after all stages."""
-        vertices = np.asarray(self.problem.mesh.vertices)
-        for stage in stages:
-            vertices = self._after(stage, vertices)
-            if self.end is End.INTERRUPTED:
-                break
-        return vertices
-
-    def _after(self, stage: _Stage, vertices: Reals) -> Reals:
-        """Return the vertices after a stage: descents with ever finer fields, and smoother steps where needed."""
-        orders = tuple(order for order, _ in stage.shares)
-        squares = np.maximum(self.problem.squares(vertices, orders), np.finfo(np.float64).tiny)
-        weighting = Weighting(orders, tuple(share / one for (_, share), one in zip(stage.shares, squares, strict=True)))
-        smoothing = Smoothing.of(self.problem.mesh, self.free, stage.smoothing)
-        unit, left, retreats = self.problem.mesh.edge_length_range[0], stage.steps, 0
-        while left > 0:
-            objective, floor = self.problem.objective(vertices, weighting)
-            descent = descend(objective, vertices, smoothing, left, floor, unit, self._counted)
-            vertices, left, self.end = descent.vertices, left - descent.steps, descent.end
-            if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
-                retreats += 1
-                smoothing = replace(smoothing, amount=max(_SMOOTHER * smoothing.amount, 1.0))
-            # Finer fields may show the way on, unless they are as fine as they can be.
-            elif descent.end is not End.ERROR or not descent.steps:
-                break
-        return vertices
-
-    def _counted(self, squared: float) -> None:
-        self.taken += 1
-        if self.notify is not None:
-            self.notify(FitProgress(self.taken, self.steps, float(np.sqrt(squared))))
+    Raises:
+        LatticeError: The mesh does not fit into the lattice of a field.
+        InputError: See `fit`.
+    """
+    task = _Task.of(mesh, target, None, settings, execution)
+    vertices = Run(task.problem, task.free, settings.steps, None).carried_out(stages_of(task.problem, settings))
+    before, after = (
+        task.problem.squares(one, [settings.order])[0] for one in (np.asarray(task.start.vertices), vertices)
+    )
+    return task.own(Mesh(vertices, task.start.triangles)) if after <= before else mesh
 
 
-def _stages(problem: FitProblem, order: float, smoothing: float, steps: int) -> list[_Stage]:
-    vertices = np.asarray(problem.mesh.vertices)
-    coarse = min(order, _COARSE_ORDER)
-    stages = []
-    if problem.relative(vertices, coarse) > _FAR:
-        part = max(1, int(_FAR_STEPS * steps))
-        stages = [_Stage(((coarse, 1.0),), amount, part) for amount in _FAR_SMOOTHINGS]
-        smoothing = max(smoothing, _FAR_SMOOTHINGS[-1])
-    shares = ((order, 1.0), (order / 2, _DETAIL_SHARE)) if order <= _HIGHEST_DETAILED else ((order, 1.0),)
-    return [*stages, _Stage(shares, smoothing, max(1, steps - sum(stage.steps for stage in stages)))]
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A fit, brought to a common centre and to vertices that all differ.
+
+    Attributes:
+        mesh: Mesh as it was given.
+        start: The same mesh, prepared.
+        place: Vertex of the prepared mesh for each vertex of the given one.
+        move: Movement to the centre.
+        target: Target, moved with the mesh.
+        problem: Mesh and field of the target.
+        settings: Settings.
+    """
+
+    mesh: Mesh
+    start: Mesh
+    place: NDArray[np.int64]
+    move: Similarity
+    target: Operand
+    problem: FitProblem
+    settings: FitSettings
+
+    @classmethod
+    def of(
+        cls, mesh: Mesh, target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
+    ) -> Self:
+        _require_comparable(mesh, target)
+        start, place = _welded(mesh)
+        move = Similarity()
+        if isinstance(target, xr.DataArray):
+            field = field_of(target, common_lattice((target,), lattice), (settings.order,))
+            problem = FitProblem.of_field(start, field, execution)
+        else:
+            if lattice is None:
+                move = _centering(start, target)
+            start, target = move.apply(start), move.apply(target)
+            orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
+            problem = FitProblem.of_surface(start, target, lattice, orders, execution)
+        return cls(mesh, start, place, move, target, problem, settings)
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Vertices that may move."""
+        return _free_vertices(self.start, keep_boundary=self.settings.keep_boundary)
+
+    def closeness(self, mesh: Mesh) -> Closeness:
+        """Measure how close a prepared mesh is to the target."""
+        return Closeness.of(mesh, self.target, self.settings.order, self.problem.lattice)
+
+    def own(self, mesh: Mesh) -> Mesh:
+        """Return a prepared mesh with the vertices and triangles of the given one, at its place."""
+        vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
+        return Mesh(vertices, self.mesh.triangles)
 
 
-def _orders_of(order: float) -> tuple[float, ...]:
-    """Return the orders at which a fit looks."""
-    return tuple(dict.fromkeys((order, min(order, _COARSE_ORDER))))
-
-
-def _one_order(order: float) -> tuple[float, ...]:
-    orders = check_orders(order)
-    if len(orders) > 1:
-        raise InputError(f"one order is needed, found {len(orders)}")
-    return orders
-
-
-def _check(mesh: Mesh, target: Operand, steps: int, smoothing: float) -> None:
-    """Refuse arguments with which there is nothing to fit.
+def _require_comparable(mesh: Mesh, target: Operand) -> None:
+    """Refuse a mesh and target with which there is nothing to fit.
 
     Raises:
         InputError: See `fit`.
     """
     if not isinstance(mesh, Mesh):
         raise InputError(f"only the vertices of a Mesh can move, found {type(mesh).__name__}")
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise InputError(f"steps must be a whole number from 1 on, found {steps!r}")
-    if isinstance(smoothing, bool) or not isinstance(smoothing, int | float) or not 0 <= smoothing < np.inf:
-        raise InputError(f"smoothing must be a number from 0 on, found {smoothing!r}")
     if isinstance(target, xr.DataArray):
         quality = quality_of(target)
         extent = None if quality is None else quality.extent

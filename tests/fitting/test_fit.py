@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.fitting import fit as fitting
+from sobolev_batch.fitting.stages import Run
 
 
 def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:
@@ -145,7 +145,7 @@ def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPa
     def away(run: Any, stages: Any) -> np.ndarray:
         return np.asarray(run.problem.mesh.vertices) * 1.1
 
-    monkeypatch.setattr(fitting._Run, "carried_out", away)
+    monkeypatch.setattr(Run, "carried_out", away)
     fitted = sb.fit(START, TARGET, -4.0)
     np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
     assert fitted.after == fitted.before

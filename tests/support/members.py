@@ -21,6 +21,12 @@ KINDS: dict[str, dict[str, Any]] = {
     "files": {"source": "files", "paths": ["box.off"]},
     "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
     "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
+    "fit": {
+        "source": "fit",
+        "mesh": {"source": "icosphere", "levels": [1, 0]},
+        "target": {"source": "sphere", "radius": 1.1},
+        "steps": 3,
+    },
     "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -202,6 +202,9 @@ class Study:
             )
         families = tuple(_family(i, entry) for i, entry in enumerate(document.family))
         _require_distinct(families)
+        reference = _reference(document.reference, families)
+        if isinstance(reference, Source):
+            families = tuple(replace(family, source=family.source.with_reference(reference)) for family in families)
         try:
             orders = distinct_orders(document.norm.orders)
             return cls(
@@ -215,7 +218,7 @@ class Study:
                 orders=orders,
                 pairs=document.norm.pairs,
                 families=families,
-                reference=_reference(document.reference, families),
+                reference=reference,
                 scaling=_scaling(document),
                 witness=() if document.witness is None else document.witness.settings(orders),
                 proximity=None if document.proximity is None else document.proximity.points,

@@ -62,6 +62,14 @@ class Source(BaseModel, ABC):
         """Distributions that the surfaces need, besides those that sobolev-batch requires."""
         return ()
 
+    def with_reference(self, reference: Source) -> Source:
+        """Return the source for a study with a reference. Override it if the surfaces depend on that.
+
+        Args:
+            reference: Source of the study's reference.
+        """
+        return self
+
     @abstractmethod
     def members(self, folder: Path) -> tuple[Member, ...]:
         """List the surfaces of the family, from coarse to fine where that has a meaning.

@@ -1,0 +1,149 @@
+"""The source `fit`: meshes of another source, fitted to the reference of a study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, SerializeAsAny, field_validator
+
+from sobolev_batch.errors import InputError, MeshError, StudyError
+from sobolev_batch.fitting.fit import fitted_mesh
+from sobolev_batch.fitting.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
+from sobolev_batch.spectral.transform.settings import Execution
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.sources.fingerprints import installed_version
+from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh
+from sobolev_batch.surfaces.sources.registry import (
+    ExpectedSize,
+    Fingerprint,
+    Member,
+    Source,
+    parse_source,
+    single_member,
+)
+
+# Raise it whenever a fit of the same mesh gives another one.
+_VERSION = 1
+# Measured peak of a fit: its lattice, and for each triangle of the mesh and of the target.
+_LATTICE_BYTES, _TRIANGLE_BYTES, _TARGET_BYTES = 3e8, 2e3, 400.0
+_KEPT = 8
+
+
+class FitSource(NestedSource):
+    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`.
+
+    Distances are those in the unit ball of the target, as in a study that is scaled by its reference.
+
+    Attributes:
+        mesh: Table of the source of the meshes to start from.
+        target: Table of a source with one surface; the study's reference if left out.
+        order: Order s of the distance to lower.
+        steps: Largest number of steps.
+        smoothing: Smoothing of the steps.
+        keep_boundary: True if vertices of open boundaries stay where they are.
+    """
+
+    target: SerializeAsAny[Source] | None = None
+    order: Annotated[float, Field(lt=-0.5, ge=-100.0, strict=False)] = DEFAULT_ORDER
+    steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
+    smoothing: Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=False)] = DEFAULT_SMOOTHING
+    keep_boundary: bool = False
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions that both sources need."""
+        return *super().libraries, *(() if self.target is None else self.target.libraries)
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _parse_target(cls, table: object) -> object:
+        if not isinstance(table, dict):
+            raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
+        return parse_source(table)
+
+    def with_reference(self, reference: Source) -> Self:
+        """Return the source with the study's reference as its target, unless it has one of its own."""
+        return self if self.target is not None else self.model_copy(update={"target": reference})
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each mesh to start from."""
+        if self.target is None:
+            raise StudyError(
+                "there is nothing to fit to, since the study's reference is a member of a family: name a target, such "
+                'as target = { source = "files", paths = ["a.ply"] }'
+            )
+        target = single_member(self.target, folder)
+        settings = FitSettings(self.order, self.steps, self.smoothing, self.keep_boundary)
+        starts = self.mesh.members(folder)
+        return tuple(FittedMember(start.name, start.level, start, target, settings) for start in starts)
+
+
+@dataclass(frozen=True)
+class FittedMember(Member):
+    """A mesh with its vertices moved.
+
+    Attributes:
+        start: Member of the mesh to start from.
+        target: Member of the surface to come nearer to.
+        settings: Settings of the fit.
+    """
+
+    start: Member
+    target: Member
+    settings: FitSettings
+
+    def load(self) -> Surface:
+        """Fit the mesh, or take it over from an earlier call in this process."""
+        return _fitted(_Request(self.fingerprint_digest(), self))
+
+    def fit(self) -> Mesh:
+        """Return the fitted mesh.
+
+        Raises:
+            MeshError: A mesh or the target cannot be made, or the one cannot be fitted to the other.
+        """
+        start, target = load_mesh(self.start), self.target.load()
+        similarity = Similarity.to_unit_ball(target)
+        try:
+            # The result must not depend on the worker, so one thread it is.
+            fitted = fitted_mesh(similarity.apply(start), similarity.apply(target), self.settings, Execution())
+        except InputError as error:
+            raise MeshError(f"{self.start.name} cannot be fitted to {self.target.name}: {error}") from error
+        vertices = np.asarray(fitted.vertices) / similarity.scale + np.asarray(similarity.origin)
+        return Mesh(vertices, start.triangles)
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the fingerprints of both members, the settings, and the versions of the libraries."""
+        settings = self.settings
+        return {
+            "fit": dict(self.start.fingerprint()),
+            "target": dict(self.target.fingerprint()),
+            "settings": [settings.order, settings.steps, settings.smoothing, settings.keep_boundary],
+            "version": _VERSION,
+            **{library: installed_version(library) for library in ("finufft", "scipy")},
+        }
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the size of the mesh, and the memory that the fit takes."""
+        start, target = self.start.expected_size(), self.target.expected_size()
+        own_bytes = _LATTICE_BYTES + _TRIANGLE_BYTES * start.triangles + _TARGET_BYTES * target.triangles
+        return ExpectedSize(start.triangles, max(start.projected_bytes, target.projected_bytes, own_bytes))
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A member, equal to others of the same fingerprint."""
+
+    digest: str
+    member: FittedMember = field(compare=False)
+
+
+@lru_cache(maxsize=_KEPT)
+def _fitted(request: _Request) -> Mesh:
+    return request.member.fit()

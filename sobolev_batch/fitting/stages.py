@@ -1,0 +1,158 @@
+"""The stages of a fit, from coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.fitting.descent import End, descend
+from sobolev_batch.fitting.problem import FitProblem, Weighting
+from sobolev_batch.fitting.smoothing import Smoothing
+from sobolev_batch.spectral.shells import check_orders
+
+Reals = NDArray[np.float64]
+
+DEFAULT_ORDER, DEFAULT_STEPS, DEFAULT_SMOOTHING = -2.0, 150, 0.25
+# Far away, very negative orders lead: their kernels are wide.
+_COARSE_ORDER = -4.0
+# Beyond this relative distance at the coarse order, a mesh is far from its target.
+_FAR = 0.05
+# Smoothing of the stages that bring a far mesh near, and the fraction of all steps for each.
+_FAR_SMOOTHINGS, _FAR_STEPS = (16.0, 4.0), 0.25
+# The share of a squared distance at half the order, which keeps detail that the order itself hardly sees.
+_DETAIL_SHARE, _HIGHEST_DETAILED = 0.1, -1.5
+# After a step that would turn triangles over, smoothing is increased by this factor, so often at most.
+_SMOOTHER, _MOST_RETREATS = 4.0, 4
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a fit is to lower, and how.
+
+    Attributes:
+        order: Order s of the distance.
+        steps: Largest number of steps.
+        smoothing: Weight λ of the mesh's Laplacian in steps.
+        keep_boundary: True if vertices of open boundaries stay where they are.
+
+    Raises:
+        OrderError: The order is not below -1/2.
+        InputError: Another setting is out of range.
+    """
+
+    order: float = DEFAULT_ORDER
+    steps: int = DEFAULT_STEPS
+    smoothing: float = DEFAULT_SMOOTHING
+    keep_boundary: bool = False
+
+    def __post_init__(self) -> None:
+        orders = check_orders(self.order)
+        if len(orders) > 1:
+            raise InputError(f"one order is needed, found {len(orders)}")
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
+            raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
+        is_number = isinstance(self.smoothing, int | float) and not isinstance(self.smoothing, bool)
+        if not is_number or not 0 <= self.smoothing < np.inf:
+            raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")
+        object.__setattr__(self, "order", orders[0])
+
+    @property
+    def coarse_order(self) -> float:
+        """Order that brings far meshes near."""
+        return min(self.order, _COARSE_ORDER)
+
+    @property
+    def shares(self) -> tuple[tuple[float, float], ...]:
+        """Orders with the share of each in the objective."""
+        detail = ((self.order / 2, _DETAIL_SHARE),) if self.order <= _HIGHEST_DETAILED else ()
+        return (self.order, 1.0), *detail
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """The state of a fit after a step.
+
+    Attributes:
+        step: Number of steps so far.
+        steps: Largest number of steps.
+        relative: Present objective over that at the start of the stage, as a ratio of distances.
+
+    >>> import sobolev_batch as sb
+    >>> sb.FitProgress(step=3, steps=150, relative=0.5).relative
+    0.5
+    """
+
+    step: int
+    steps: int
+    relative: float
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a fit: orders with the share of each in the objective, smoothing, and a largest number of steps."""
+
+    shares: tuple[tuple[float, float], ...]
+    smoothing: float
+    steps: int
+
+
+class Run:
+    """A fit that is under way."""
+
+    def __init__(
+        self, problem: FitProblem, free: NDArray[np.int64], steps: int, notify: Callable[[FitProgress], None] | None
+    ) -> None:
+        self.problem, self.free, self.steps, self.notify = problem, free, steps, notify
+        self.taken = 0
+        self.end = End.CONVERGED
+        self._vertices = np.asarray(problem.mesh.vertices)
+
+    def carried_out(self, stages: list[Stage]) -> Reals:
+        """Return the vertices after all stages, or after the last step before an interrupt."""
+        try:
+            for stage in stages:
+                self._vertices = self._after(stage, self._vertices)
+        except KeyboardInterrupt:
+            self.end = End.INTERRUPTED
+        return self._vertices
+
+    def _after(self, stage: Stage, vertices: Reals) -> Reals:
+        """Return the vertices after a stage: descents with ever finer fields, and smoother steps where needed."""
+        orders = tuple(order for order, _ in stage.shares)
+        squares = np.maximum(self.problem.squares(vertices, orders), np.finfo(np.float64).tiny)
+        weighting = Weighting(orders, tuple(share / one for (_, share), one in zip(stage.shares, squares, strict=True)))
+        smoothing = Smoothing.of(self.problem.mesh, self.free, stage.smoothing)
+        unit, retreats = self.problem.mesh.edge_length_range[0], 0
+        left = min(stage.steps, self.steps - self.taken)
+        while left > 0:
+            objective, floor = self.problem.objective(vertices, weighting)
+            descent = descend(objective, vertices, smoothing, left, floor, unit, self._counted)
+            vertices, left, self.end = descent.vertices, left - descent.steps, descent.end
+            if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
+                retreats += 1
+                smoothing = replace(smoothing, amount=max(_SMOOTHER * smoothing.amount, 1.0))
+            # Finer fields may show the way on, unless they are as fine as they can be.
+            elif descent.end is not End.ERROR or not descent.steps:
+                break
+        return vertices
+
+    def _counted(self, vertices: Reals, squared: float) -> None:
+        self._vertices = vertices
+        self.taken += 1
+        if self.notify is not None:
+            self.notify(FitProgress(self.taken, self.steps, float(np.sqrt(squared))))
+
+
+def stages_of(problem: FitProblem, settings: FitSettings) -> list[Stage]:
+    """Return the stages of a fit: a far mesh comes near at a coarse order first."""
+    stages, smoothing = [], settings.smoothing
+    if problem.relative(np.asarray(problem.mesh.vertices), settings.coarse_order) > _FAR:
+        part = max(1, int(_FAR_STEPS * settings.steps))
+        stages = [Stage(((settings.coarse_order, 1.0),), amount, part) for amount in _FAR_SMOOTHINGS]
+        smoothing = max(smoothing, _FAR_SMOOTHINGS[-1])
+    left = max(1, settings.steps - sum(stage.steps for stage in stages))
+    return [*stages, Stage(settings.shares, smoothing, left)]

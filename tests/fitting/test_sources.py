@@ -1,0 +1,124 @@
+"""Studies of fitted meshes: nearer than what they start from, the same in every process, kept like all others."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.fitting import sources
+from sobolev_batch.surfaces.sources.registry import parse_source
+from tests.support.members import loaded, members
+from tests.support.repository import blocks
+
+SPHERE: dict[str, Any] = {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]}
+STARTS: dict[str, Any] = {"source": "ellipsoid-levels", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1, 2]}
+FIT: dict[str, Any] = {"source": "fit", "mesh": STARTS, "steps": 15}
+
+
+def table(**fit: Any) -> dict[str, Any]:
+    return {
+        "study": {"name": "fitted"},
+        "lattice": {"xi_max": 3.0, "M": 32},
+        "norm": {"orders": [-2.0]},
+        "reference": SPHERE,
+        "family": [{"name": "start", **STARTS}, {"name": "fitted", **FIT, **fit}],
+    }
+
+
+def test_a_study_fits_to_its_reference_and_reuses_what_it_has(client: Client, tmp_path: Path) -> None:
+    study = sb.Study.from_table(table())
+    assert len(sb.run(study, store=tmp_path / "store.zarr", client=client).computed) == 5
+    tree = sb.open_store(tmp_path / "store.zarr")
+    distances = sb.table(tree).set_index("mesh")["distance"]
+    assert distances["fitted/1"] < distances["start/1"] / 3
+    assert distances["fitted/2"] < distances["start/2"] / 3
+    again = sb.run(study, store=tmp_path / "store.zarr", client=client)
+    assert (len(again.computed), len(again.reused)) == (0, 5)
+    assert sb.verify(tmp_path / "store.zarr").is_sound
+    other = sb.Study.from_table(table(order=-4.0))
+    assert sb.run(other, store=tmp_path / "store.zarr", client=client).computed == ("fitted/1", "fitted/2")
+
+
+def test_a_member_is_the_fit_in_the_unit_ball_of_its_target() -> None:
+    _, member = members({**FIT, "target": SPHERE})
+    start, found = loaded(members(STARTS)[1]), loaded(member)
+    scaled = sb.Mesh((start.vertices - [100, 0, 0]) / 30, start.triangles)
+    expected = sb.fit(scaled, sb.Sphere(), steps=15, threads=1).mesh
+    np.testing.assert_allclose((found.vertices - [100, 0, 0]) / 30, expected.vertices, rtol=0, atol=1e-9)
+
+
+def test_every_process_makes_the_same_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    member = members({**FIT, "target": SPHERE})[0]
+    program = "import pickle, sys; print(pickle.load(sys.stdin.buffer).load().digest)"
+    found = subprocess.run(
+        [sys.executable, "-c", program], input=pickle.dumps(member), capture_output=True, check=True
+    ).stdout.decode()
+    assert found.strip() == loaded(member).digest
+
+
+def test_one_process_fits_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    member = members({**FIT, "target": SPHERE, "steps": 2})[0]
+    first = member.load()
+    monkeypatch.setattr(sources, "fitted_mesh", None)
+    assert pickle.loads(pickle.dumps(member)).load() is first
+
+
+def test_the_settings_are_part_of_the_fingerprint() -> None:
+    changes: list[dict[str, Any]] = [{}, {"order": -3.0}, {"steps": 16}, {"smoothing": 1.0}, {"keep_boundary": True}]
+    found = {members({**FIT, "target": SPHERE, **change})[0].fingerprint_digest() for change in changes}
+    found.add(members({**FIT, "target": {**SPHERE, "radius": 31.0}})[0].fingerprint_digest())
+    assert len(found) == len(changes) + 1
+
+
+def test_a_target_of_its_own_stays() -> None:
+    own = {"source": "sphere", "radius": 29.0, "center": [100.0, 0.0, 0.0]}
+    with_own, without = parse_source({**FIT, "target": own}), parse_source(FIT)
+    reference = parse_source(SPHERE)
+    assert with_own.with_reference(reference) == with_own
+    assert without.with_reference(reference) == parse_source({**FIT, "target": SPHERE})
+    assert parse_source(STARTS).with_reference(reference) == parse_source(STARTS)
+
+
+def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
+    (member,) = members({**FIT, "mesh": {**STARTS, "levels": [1]}, "target": {"source": "sphere"}})
+    with pytest.raises(sb.MeshError, match=r"1 cannot be fitted to sphere: .*the same unit of length"):
+        member.load()
+    (closed_form,) = members({**FIT, "mesh": {"source": "sphere"}, "target": SPHERE})
+    with pytest.raises(sb.MeshError, match="closed form"):
+        closed_form.load()
+
+
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        ({"order": -0.5}, "order"),
+        ({"steps": 0}, "steps"),
+        ({"smoothing": -1}, "smoothing"),
+        ({"target": 3}, "must be a table that names a source"),
+        ({"mesh": "ball.ply"}, "must be a table that names a source"),
+        ({"speed": 1}, "speed"),
+    ],
+)
+def test_wrong_keys_are_named(fit: dict[str, Any], message: str) -> None:
+    with pytest.raises(sb.StudyError, match=message):
+        sb.Study.from_table(table(**fit))
+
+
+def test_a_reference_of_a_family_needs_a_target() -> None:
+    study = {**table(), "reference": {"source": "family", "family": "start"}}
+    with pytest.raises(sb.StudyError, match="family 'fitted': there is nothing to fit to"):
+        sb.plan(sb.Study.from_table(study))
+
+
+def test_the_study_of_the_page_is_valid(tmp_path: Path) -> None:
+    (text,) = blocks("docs/fitting.md", "toml")
+    (tmp_path / "study.toml").write_text(text)
+    assert [family.name for family in sb.Study.from_toml(tmp_path / "study.toml").families] == ["decimated", "fitted"]
