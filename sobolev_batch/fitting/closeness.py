@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+import xarray as xr
 
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.fitting.shapes import smallest_angle
@@ -48,7 +49,7 @@ class Closeness:
         The distance is measured to a relative accuracy where the target is a surface, else on the lattice.
         """
         found = None
-        for rtol in _RTOLS if not hasattr(target, "dims") else ():
+        for rtol in () if isinstance(target, xr.DataArray) else _RTOLS:
             try:
                 found = distance(mesh, target, order, rtol=rtol)
                 break

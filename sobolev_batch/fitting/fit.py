@@ -23,6 +23,7 @@ from sobolev_batch.fitting.stages import (
     Run,
     stages_of,
 )
+from sobolev_batch.fitting.transform import require_mesh
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
 from sobolev_batch.spectral.transform.settings import Execution
@@ -212,8 +213,7 @@ def _require_comparable(mesh: Mesh, target: Operand) -> None:
     Raises:
         InputError: See `fit`.
     """
-    if not isinstance(mesh, Mesh):
-        raise InputError(f"only the vertices of a Mesh can move, found {type(mesh).__name__}")
+    require_mesh(mesh)
     if isinstance(target, xr.DataArray):
         quality = quality_of(target)
         extent = None if quality is None else quality.extent

@@ -11,9 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.objective import factors_of
-from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh
+from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh, require_mesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
@@ -90,8 +89,7 @@ def gradient(
     >>> bool(found["error"] < 0.2 * abs(found["gradient"]).sum())
     True
     """
-    if not isinstance(mesh, Mesh):
-        raise InputError(f"only the vertices of a Mesh can move, found {type(mesh).__name__}")
+    require_mesh(mesh)
     orders = check_orders(order)
     settings = TransformSettings(eps)
     finer = TransformSettings(max(settings.eps / _REFINEMENT, FINEST_EPS["complex128"]))

@@ -9,13 +9,12 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.fitting.transform import MeshTransform, require_mesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of
-from sobolev_batch.spectral.shells import SobolevWeights, check_orders
+from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -81,11 +80,8 @@ class SquaredDistance:
             InputError: The mesh is none, there is no lattice, or settings are out of range.
             BackendError: "gpu", and no GPU is usable.
         """
-        if not isinstance(mesh, Mesh):
-            raise InputError(f"only the vertices of a Mesh can move, found {type(mesh).__name__}")
-        orders = check_orders(order)
-        if len(orders) > 1:
-            raise InputError(f"one order is needed, found {len(orders)}")
+        require_mesh(mesh)
+        orders = (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)
         own = Lattice.of(field)
         values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)

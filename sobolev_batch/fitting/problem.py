@@ -61,7 +61,7 @@ class FitProblem:
         mesh: Mesh at the start, in units of length; no two of its vertices coincide.
         lattice: Lattice of the field.
         target: Transform of the target on the half lattice.
-        target_error: Function of the error of this field in the norm of some orders.
+        quality: Quality of this field, from which its errors follow; None if unknown.
         execution: Threads.
     """
 

@@ -18,13 +18,12 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.fingerprints import installed_version
-from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh
+from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh, parse_nested
 from sobolev_batch.surfaces.sources.registry import (
     ExpectedSize,
     Fingerprint,
     Member,
     Source,
-    parse_source,
     single_member,
 )
 
@@ -63,9 +62,7 @@ class FitSource(NestedSource):
     @field_validator("target", mode="before")
     @classmethod
     def _parse_target(cls, table: object) -> object:
-        if not isinstance(table, dict):
-            raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
-        return parse_source(table)
+        return parse_nested(table)
 
     def with_reference(self, reference: Source) -> Self:
         """Return the source with the study's reference as its target, unless it has one of its own."""

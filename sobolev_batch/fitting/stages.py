@@ -12,7 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.descent import End, descend
 from sobolev_batch.fitting.problem import FitProblem, Weighting
 from sobolev_batch.fitting.smoothing import Smoothing
-from sobolev_batch.spectral.shells import check_orders
+from sobolev_batch.spectral.shells import single_order
 
 Reals = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ _SMOOTHER, _MOST_RETREATS = 4.0, 4
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What a fit is to lower, and how.
+    """Settings of a fit.
 
     Attributes:
         order: Order s of the distance.
@@ -50,15 +50,12 @@ class FitSettings:
     keep_boundary: bool = False
 
     def __post_init__(self) -> None:
-        orders = check_orders(self.order)
-        if len(orders) > 1:
-            raise InputError(f"one order is needed, found {len(orders)}")
+        object.__setattr__(self, "order", single_order(self.order))
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
         is_number = isinstance(self.smoothing, int | float) and not isinstance(self.smoothing, bool)
         if not is_number or not 0 <= self.smoothing < np.inf:
             raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")
-        object.__setattr__(self, "order", orders[0])
 
     @property
     def coarse_order(self) -> float:

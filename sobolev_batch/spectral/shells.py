@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from sobolev_batch.errors import OrderError
+from sobolev_batch.errors import InputError, OrderError
 from sobolev_batch.spectral.lattice import Block, Lattice
 
 Reals = NDArray[np.float64]
@@ -77,6 +77,19 @@ def check_orders(order: Orders) -> tuple[float, ...]:
         if s < _LOWEST_ORDER:
             raise OrderError(f"orders go down to {_LOWEST_ORDER:g}, where weights leave double precision, found {s:g}")
     return orders
+
+
+def single_order(order: float) -> float:
+    """Return an order as a float.
+
+    Raises:
+        OrderError: It does not lie between -100 and -1/2.
+        InputError: There are several.
+    """
+    orders = check_orders(order)
+    if len(orders) > 1:
+        raise InputError(f"one order is needed, found {len(orders)}")
+    return orders[0]
 
 
 def shell_sums(

@@ -44,9 +44,19 @@ class NestedSource(Source):
     @field_validator("mesh", mode="before")
     @classmethod
     def _parse_mesh(cls, table: object) -> object:
-        if not isinstance(table, dict):
-            raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
-        return parse_source(table)
+        return parse_nested(table)
+
+
+def parse_nested(table: object) -> Source:
+    """Return the source that a table within the table of another source names.
+
+    Raises:
+        ValueError: It is no table.
+        StudyError: See `parse_source`.
+    """
+    if not isinstance(table, dict):
+        raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
+    return parse_source(table)
 
 
 class ReducedSource(NestedSource, ABC):
