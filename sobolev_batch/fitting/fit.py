@@ -88,7 +88,7 @@ def fit(
         target: Surface in the same unit of length, or its field from `fourier_transform` or a store. Distances depend
             on the unit: bring both to the unit ball with a `Similarity` unless you have reasons.
         order: Order s < -1/2 of the distance. At orders up to -1.5, a tenth of the squared distance at half the order
-            is added, relative to the start,, so that the mesh keeps its detail.
+            is added, relative to the start, so that the mesh keeps its detail.
         lattice: Lattice of the frequencies that the fit looks at; chosen by the mean edge if not given. A field brings
             its own.
         steps: Largest number of steps.

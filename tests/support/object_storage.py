@@ -112,7 +112,7 @@ def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
 @contextmanager
 def serving() -> Iterator[Server]:
     """Run a server with one empty bucket, on a free port."""
-    command = [sys.executable, "-u", "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
+    command = [sys.executable, "-u", "-m", "tests.support.s3_server"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stderr is not None
