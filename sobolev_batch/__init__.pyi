@@ -23,11 +23,11 @@ from .errors import StudyError as StudyError
 from .fitting.closeness import Closeness as Closeness
 from .fitting.fit import Fit as Fit
 from .fitting.fit import fit as fit
-from .fitting.gradient import gradient as gradient
-from .fitting.objective import SquaredDistance as SquaredDistance
-from .fitting.stages import FitProgress as FitProgress
-from .fitting.tensors import jax_function as jax_function
-from .fitting.tensors import torch_function as torch_function
+from .fitting.derivative.gradient import gradient as gradient
+from .fitting.derivative.objective import SquaredDistance as SquaredDistance
+from .fitting.optimisation.stages import FitProgress as FitProgress
+from .fitting.derivative.tensors import jax_function as jax_function
+from .fitting.derivative.tensors import torch_function as torch_function
 from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.plots import plot_convergence as plot_convergence
 from .results.figures.plots import plot_map as plot_map

@@ -13,7 +13,7 @@ import numpy as np
 from sobolev_batch.cli.group import cli
 from sobolev_batch.fitting.closeness import Closeness
 from sobolev_batch.fitting.fit import fit
-from sobolev_batch.fitting.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress
+from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress
 from sobolev_batch.surfaces.formats.readers import read_mesh
 from sobolev_batch.surfaces.formats.writers import require_writable_format, write_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.fitting.shapes import smallest_angle
+from sobolev_batch.fitting.optimisation.shapes import smallest_angle
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand
 from sobolev_batch.spectral.metrics.norms import distance

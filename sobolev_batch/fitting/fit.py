@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.problem import FitProblem
-from sobolev_batch.fitting.stages import (
+from sobolev_batch.fitting.derivative.transform import require_mesh
+from sobolev_batch.fitting.optimisation.problem import FitProblem
+from sobolev_batch.fitting.optimisation.stages import (
     DEFAULT_ORDER,
     DEFAULT_SMOOTHING,
     DEFAULT_STEPS,
@@ -23,7 +24,6 @@ from sobolev_batch.fitting.stages import (
     Run,
     stages_of,
 )
-from sobolev_batch.fitting.transform import require_mesh
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
 from sobolev_batch.spectral.transform.settings import Execution

@@ -12,7 +12,7 @@ from pydantic import Field, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting.fit import fitted_mesh
-from sobolev_batch.fitting.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
+from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity

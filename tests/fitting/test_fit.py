@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.stages import Run
+from sobolev_batch.fitting.optimisation.stages import Run
 
 
 def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.fitting.derivative.transform import MeshTransform
 from sobolev_batch.spectral.backends import backends
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from tests.support.fake_device import Device

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.shapes import ShapePenalty, smallest_angle
-from sobolev_batch.fitting.smoothing import Smoothing
+from sobolev_batch.fitting.optimisation.shapes import ShapePenalty, smallest_angle
+from sobolev_batch.fitting.optimisation.smoothing import Smoothing
 
 
 def test_shapes_that_hardly_change_cost_nothing() -> None:

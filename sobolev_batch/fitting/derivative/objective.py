@@ -9,7 +9,7 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.fitting.transform import MeshTransform, require_mesh
+from sobolev_batch.fitting.derivative.transform import MeshTransform, require_mesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.lattice import AXES, Lattice

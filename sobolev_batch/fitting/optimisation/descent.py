@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, minimize
 
 from sobolev_batch.errors import LatticeError
-from sobolev_batch.fitting.objective import SquaredDistance
-from sobolev_batch.fitting.shapes import ShapePenalty
-from sobolev_batch.fitting.smoothing import Smoothing
+from sobolev_batch.fitting.derivative.objective import SquaredDistance
+from sobolev_batch.fitting.optimisation.shapes import ShapePenalty
+from sobolev_batch.fitting.optimisation.smoothing import Smoothing
 
 Reals = NDArray[np.float64]
 Notify = Callable[[Reals, float], None]

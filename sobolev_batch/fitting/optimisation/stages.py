@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.descent import End, descend
-from sobolev_batch.fitting.problem import FitProblem, Weighting
-from sobolev_batch.fitting.smoothing import Smoothing
+from sobolev_batch.fitting.optimisation.descent import End, descend
+from sobolev_batch.fitting.optimisation.problem import FitProblem, Weighting
+from sobolev_batch.fitting.optimisation.smoothing import Smoothing
 from sobolev_batch.spectral.shells import single_order
 
 Reals = NDArray[np.float64]

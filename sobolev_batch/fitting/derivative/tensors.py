@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.objective import SquaredDistance
+from sobolev_batch.fitting.derivative.objective import SquaredDistance
 
 
 def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:

@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.fitting.objective import SquaredDistance, factors_of
-from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.fitting.derivative.objective import SquaredDistance, factors_of
+from sobolev_batch.fitting.derivative.transform import MeshTransform
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import Complexes

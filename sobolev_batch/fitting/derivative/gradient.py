@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.fitting.objective import factors_of
-from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh, require_mesh
+from sobolev_batch.fitting.derivative.objective import factors_of
+from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh, require_mesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
