@@ -15,8 +15,9 @@ The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`, `inner_product`.
 - The causes of a distance: `proportion` (area or shape), `spectrum` (wavelengths), `witness` (places).
-- Meshes made by the metric: `fit` gives a `Fit`, with its `Closeness` before and after, and `FitProgress` on the way;
-  `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for tensors.
+- Meshes made by the metric: `fit` and `refine` give a `Fit`, with its `Closeness` before and after, and `FitProgress`
+  on the way; `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for
+  tensors.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
 - Surfaces: `Mesh`, `read_mesh`, `write_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over
   two `Interval`; a `Similarity` scales and moves them.
@@ -24,8 +25,9 @@ The public names by subject:
 - For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
 - Studies: `Study`, `plan` and its `StudyPlan`, `run` and its `Summary`, `submit` and its `Submission`.
 - Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.
-- Results of a store: `table`, `matrix`, `report`, `write_witness`; plots on Matplotlib axes: `plot_convergence`,
-  `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_energy`, `plot_transform`, `plot_witness`.
+- Results of a store: `table`, `matrix`, `evolution` (over time), `report`, `write_witness`; plots on Matplotlib axes:
+  `plot_convergence`, `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_energy`, `plot_transform`, `plot_evolution`,
+  `plot_witness`.
 - Errors: all derive from `SobolevBatchError`.
 """
 

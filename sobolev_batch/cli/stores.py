@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from sobolev_batch.errors import SobolevBatchError, StoreError
 from sobolev_batch.results.open import fields_read, open_store
 from sobolev_batch.results.status import status
 from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch.results.tables.evolution import REMESHING_FACTOR, format_evolution
 from sobolev_batch.results.tables.matrix import format_matrix
 from sobolev_batch.results.tables.text import FORMATS, Format
 
@@ -95,10 +97,31 @@ def release_command(store: Location, force: bool) -> None:
 @click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
 @order_option
 @click.option("--matrix", is_flag=True, help="Print the distances of every mesh to every other instead.")
-def table_command(store: Location, style: Format, orders: tuple[float, ...], matrix: bool) -> None:
+@click.option("--over-time", is_flag=True, help="Print the distances of meshes that move, over time, instead.")
+@click.option("--truth", metavar="FAMILY", help="True surface of --over-time if it moves. [default: the reference]")
+@click.option(
+    "--factor",
+    type=click.FloatRange(min=1.0, min_open=True),
+    default=REMESHING_FACTOR,
+    show_default=True,
+    help="Growth of the distance at which a new mesh pays, for --over-time.",
+)
+def table_command(
+    store: Location,
+    style: Format,
+    orders: tuple[float, ...],
+    matrix: bool,
+    over_time: bool,
+    truth: str | None,
+    factor: float,
+) -> None:
     """Print the tables or distance matrices of STORE."""
-    form = format_matrix if matrix else format_table
-    click.echo(form(open_store(store), style, orders or None))
+    if matrix and over_time:
+        raise click.UsageError("--matrix and --over-time are two tables: ask for one of them")
+    if truth is not None and not over_time:
+        raise click.UsageError("--truth belongs to --over-time")
+    form = partial(format_evolution, truth=truth, factor=factor) if over_time else format_table
+    click.echo((format_matrix if matrix else form)(open_store(store), style, orders or None))
 
 
 @cli.command("plot")

@@ -5,16 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.derivative.transform import require_mesh
-from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.stages import (
     DEFAULT_ORDER,
     DEFAULT_SMOOTHING,
@@ -22,20 +18,14 @@ from sobolev_batch.fitting.optimisation.stages import (
     FitProgress,
     FitSettings,
     Run,
-    stages_of,
 )
+from sobolev_batch.fitting.task import FitTask
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
+from sobolev_batch.spectral.metrics.inputs import Operand
 from sobolev_batch.spectral.transform.settings import Execution
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
 
-Reals = NDArray[np.float64]
-
-# Start and target whose sizes differ by this factor are in different units.
-_OTHER_UNIT = 20.0
+# Growth of the Hausdorff distance that a user should know.
 _HAUSDORFF_GROWTH = 1.5
 
 
@@ -44,7 +34,7 @@ class Fit:
     """A fitted mesh.
 
     Attributes:
-        mesh: The mesh, with the triangles of the start and moved vertices, in the start's unit of length.
+        mesh: The mesh, in the start's unit of length; from `fit` with the triangles of the start.
         order: Order s of the distance that was lowered.
         before: Closeness of the start to the target.
         after: Closeness of the fitted mesh.
@@ -114,27 +104,10 @@ def fit(
     True
     """
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    task = _Task.of(mesh, target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1))
-    before = task.closeness(task.start)
-    if before.error >= before.distance > 0 and isinstance(target, xr.DataArray):
-        raise InputError(
-            f"the field ends at the frequency {task.problem.lattice.xi_max:g}: at order {settings.order:g} the "
-            f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
-            "lower; take a more negative order, or a field on a larger lattice"
-        )
-    run = Run(task.problem, task.free, steps, notify)
-    fitted = Mesh(run.carried_out(stages_of(task.problem, settings)), task.start.triangles)
-    after = task.closeness(fitted)
-    remarks = []
-    if after.distance - after.error > before.distance + before.error:
-        remarks.append("no nearer mesh was found: this is the start")
-        fitted, after = task.start, before
-    if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
-        remarks.append(
-            f"the Hausdorff distance grew from {before.hausdorff:.2g} to {after.hausdorff:.2g}: the worst point lies "
-            "farther away than before; take a larger smoothing or a less negative order"
-        )
-    return Fit(task.own(fitted), settings.order, before, after, run.taken, run.end.value, tuple(remarks))
+    task = FitTask.of(mesh, target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1))
+    before = measured(task)
+    fitted, run = task.run(notify)
+    return concluded(mesh, before, task, fitted, run)
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
@@ -144,129 +117,47 @@ def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: E
         LatticeError: The mesh does not fit into the lattice of a field.
         InputError: See `fit`.
     """
-    task = _Task.of(mesh, target, None, settings, execution)
-    vertices = Run(task.problem, task.free, settings.steps, None).carried_out(stages_of(task.problem, settings))
+    task = FitTask.of(mesh, target, None, settings, execution)
+    fitted, _ = task.run()
     before, after = (
-        task.problem.squares(one, [settings.order])[0] for one in (np.asarray(task.start.vertices), vertices)
+        task.problem.squares(np.asarray(one.vertices), [settings.order])[0] for one in (task.start, fitted)
     )
-    return task.own(Mesh(vertices, task.start.triangles)) if after <= before else mesh
+    return task.own(fitted) if after <= before else mesh
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """A fit, brought to a common centre and to vertices that all differ.
-
-    Attributes:
-        mesh: Mesh as it was given.
-        start: The same mesh, prepared.
-        place: Vertex of the prepared mesh for each vertex of the given one.
-        move: Movement to the centre.
-        target: Target, moved with the mesh.
-        problem: Mesh and field of the target.
-        settings: Settings.
-    """
-
-    mesh: Mesh
-    start: Mesh
-    place: NDArray[np.int64]
-    move: Similarity
-    target: Operand
-    problem: FitProblem
-    settings: FitSettings
-
-    @classmethod
-    def of(
-        cls, mesh: Mesh, target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
-    ) -> Self:
-        _require_comparable(mesh, target)
-        start, place = _welded(mesh)
-        move = Similarity()
-        if isinstance(target, xr.DataArray):
-            field = field_of(target, common_lattice((target,), lattice), (settings.order,))
-            problem = FitProblem.of_field(start, field, execution)
-        else:
-            if lattice is None:
-                move = _centering(start, target)
-            start, target = move.apply(start), move.apply(target)
-            orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
-            problem = FitProblem.of_surface(start, target, lattice, orders, execution)
-        return cls(mesh, start, place, move, target, problem, settings)
-
-    @property
-    def free(self) -> NDArray[np.int64]:
-        """Vertices that may move."""
-        return _free_vertices(self.start, keep_boundary=self.settings.keep_boundary)
-
-    def closeness(self, mesh: Mesh) -> Closeness:
-        """Measure how close a prepared mesh is to the target."""
-        return Closeness.of(mesh, self.target, self.settings.order, self.problem.lattice)
-
-    def own(self, mesh: Mesh) -> Mesh:
-        """Return a prepared mesh with the vertices and triangles of the given one, at its place."""
-        vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
-        return Mesh(vertices, self.mesh.triangles)
-
-
-def _require_comparable(mesh: Mesh, target: Operand) -> None:
-    """Refuse a mesh and target with which there is nothing to fit.
+def measured(task: FitTask) -> Closeness:
+    """Return the closeness of the start.
 
     Raises:
-        InputError: See `fit`.
+        InputError: The field cannot serve the order.
     """
-    require_mesh(mesh)
-    if isinstance(target, xr.DataArray):
-        quality = quality_of(target)
-        extent = None if quality is None else quality.extent
-    else:
-        check_surface(target)
-        extent = target.extent
-    if extent is not None:
-        _require_one_place(mesh.extent, extent)
-
-
-def _require_one_place(start: Extent, target: Extent) -> None:
-    ratio = float(start.widths.max() / target.widths.max())
-    if not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
+    before = task.closeness(task.start)
+    if before.error >= before.distance > 0 and isinstance(task.target, xr.DataArray):
         raise InputError(
-            f"the start is {start.widths.max():.3g} units wide and the target {target.widths.max():.3g}: "
-            "are both in the same unit of length?"
+            f"the field ends at the frequency {task.problem.lattice.xi_max:g}: at order {task.settings.order:g} the "
+            f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
+            "lower; take a more negative order, or a field on a larger lattice"
         )
-    (low, high), (other_low, other_high) = start.box, target.box
-    if np.any(low > other_high) or np.any(other_low > high):
-        raise InputError(
-            f"the start ({_corners(low, high)}) and the target ({_corners(other_low, other_high)}) do not overlap: "
-            "move one of them to the other first"
-        )
+    return before
 
 
-def _corners(low: Reals, high: Reals) -> str:
-    return " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high))
+def concluded(start: Mesh, before: Closeness, task: FitTask, fitted: Mesh, run: Run) -> Fit:
+    """Return a fit with its end, or with the start if that is nearer.
 
-
-def _welded(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
-    """Return a mesh without coinciding vertices, and the vertex there of each vertex of the mesh."""
-    # Zero has two signs.
-    places, place = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
-    return Mesh(places, place.reshape(-1)[mesh.triangles]), place.reshape(-1)
-
-
-def _centering(start: Mesh, target: Surface) -> Similarity:
-    low, high = Extent.union([start.extent, target.extent]).box
-    x, y, z = ((low + high) / 2).tolist()
-    return Similarity(1.0, (x, y, z))
-
-
-def _free_vertices(mesh: Mesh, *, keep_boundary: bool) -> NDArray[np.int64]:
-    """Return the vertices that may move: those of triangles, without boundaries if these are kept.
-
-    Raises:
-        InputError: There are none.
+    Args:
+        start: Mesh that was given.
+        before: Closeness of the start.
+        task: Last task of the fit.
+        fitted: Prepared mesh at its end.
+        run: Its run.
     """
-    free = np.asarray(mesh.used_vertices)
-    if keep_boundary:
-        sides = np.sort(np.asarray(mesh.triangles)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        edges, counts = np.unique(sides, axis=0, return_counts=True)
-        free = np.setdiff1d(free, edges[counts == 1])
-    if not len(free):
-        raise InputError("all vertices lie on the boundary: there is nothing to move")
-    return free
+    mesh, after, remarks = task.own(fitted), task.closeness(fitted), []
+    if after.distance - after.error > before.distance + before.error:
+        remarks.append("no nearer mesh was found: this is the start")
+        mesh, after = start, before
+    if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
+        remarks.append(
+            f"the Hausdorff distance grew from {before.hausdorff:.2g} to {after.hausdorff:.2g}: the worst point lies "
+            "farther away than before; take a larger smoothing or a less negative order"
+        )
+    return Fit(mesh, task.settings.order, before, after, run.taken, run.end.value, tuple(remarks))

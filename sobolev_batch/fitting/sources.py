@@ -1,7 +1,8 @@
-"""The source `fit`: meshes of another source, fitted to the reference of a study."""
+"""The sources `fit` and `refine`: meshes of another source, brought nearer to the reference of a study."""
 
 from __future__ import annotations
 
+from abc import ABC
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from pydantic import Field, SerializeAsAny, field_validator
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting.fit import fitted_mesh
 from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
+from sobolev_batch.fitting.refine import MOST_TRIANGLES, refined_mesh
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -20,10 +22,12 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.fingerprints import installed_version
 from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh, parse_nested
 from sobolev_batch.surfaces.sources.registry import (
+    MOST_ENTRIES,
     ExpectedSize,
     Fingerprint,
     Member,
     Source,
+    at_most,
     single_member,
 )
 
@@ -34,8 +38,8 @@ _LATTICE_BYTES, _TRIANGLE_BYTES, _TARGET_BYTES = 3e8, 2e3, 400.0
 _KEPT = 8
 
 
-class FitSource(NestedSource):
-    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`.
+class TargetSource(NestedSource, ABC):
+    """A source of meshes that come nearer to a target.
 
     Distances are those in the unit ball of the target, as in a study that is scaled by its reference.
 
@@ -68,32 +72,73 @@ class FitSource(NestedSource):
         """Return the source with the study's reference as its target, unless it has one of its own."""
         return self if self.target is not None else self.model_copy(update={"target": reference})
 
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member for each mesh to start from."""
+    @property
+    def settings(self) -> FitSettings:
+        """Settings of fits."""
+        return FitSettings(self.order, self.steps, self.smoothing, self.keep_boundary)
+
+    def target_member(self, folder: Path) -> Member:
+        """Return the member of the target.
+
+        Raises:
+            StudyError: There is no target, or several.
+        """
         if self.target is None:
             raise StudyError(
                 "there is nothing to fit to, since the study's reference is a member of a family: name a target, such "
                 'as target = { source = "files", paths = ["a.ply"] }'
             )
-        target = single_member(self.target, folder)
-        settings = FitSettings(self.order, self.steps, self.smoothing, self.keep_boundary)
-        starts = self.mesh.members(folder)
-        return tuple(FittedMember(start.name, start.level, start, target, settings) for start in starts)
+        return single_member(self.target, folder)
+
+
+class FitSource(TargetSource):
+    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`."""
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each mesh to start from."""
+        target, starts = self.target_member(folder), self.mesh.members(folder)
+        return tuple(
+            FittedMember(start.name, start.level, start, target, self.settings, time=start.time) for start in starts
+        )
+
+
+class RefineSource(TargetSource):
+    """Finer versions of one mesh, with edges split where that brings it nearer to a surface: see `refine`.
+
+    Attributes:
+        triangles: Numbers of triangles to reach.
+    """
+
+    triangles: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=MOST_TRIANGLES)], ...],
+        Field(min_length=1, strict=False),
+        at_most(MOST_ENTRIES),
+    ]
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member per triangle count, coarse to fine."""
+        target, start = self.target_member(folder), single_member(self.mesh, folder)
+        return tuple(
+            FittedMember(str(count), rank, start, target, self.settings, count)
+            for rank, count in enumerate(sorted(set(self.triangles)))
+        )
 
 
 @dataclass(frozen=True)
 class FittedMember(Member):
-    """A mesh with its vertices moved.
+    """A mesh with its vertices moved, and refined if a number of triangles is given.
 
     Attributes:
         start: Member of the mesh to start from.
         target: Member of the surface to come nearer to.
         settings: Settings of the fit.
+        triangles: Number of triangles to reach; None to keep those of the start.
     """
 
     start: Member
     target: Member
     settings: FitSettings
+    triangles: int | None = None
 
     def load(self) -> Surface:
         """Fit the mesh, or take it over from an earlier call in this process."""
@@ -109,11 +154,15 @@ class FittedMember(Member):
         similarity = Similarity.to_unit_ball(target)
         try:
             # The result must not depend on the worker, so one thread it is.
-            fitted = fitted_mesh(similarity.apply(start), similarity.apply(target), self.settings, Execution())
+            pair, settings, execution = (similarity.apply(start), similarity.apply(target)), self.settings, Execution()
+            if self.triangles is None:
+                fitted = fitted_mesh(*pair, settings, execution)
+            else:
+                fitted = refined_mesh(*pair, self.triangles, settings, execution)
         except InputError as error:
             raise MeshError(f"{self.start.name} cannot be fitted to {self.target.name}: {error}") from error
         vertices = np.asarray(fitted.vertices) / similarity.scale + np.asarray(similarity.origin)
-        return Mesh(vertices, start.triangles)
+        return Mesh(vertices, fitted.triangles)
 
     def fingerprint(self) -> Fingerprint:
         """Return the fingerprints of both members, the settings, and the versions of the libraries."""
@@ -123,14 +172,18 @@ class FittedMember(Member):
             "target": dict(self.target.fingerprint()),
             "settings": [settings.order, settings.steps, settings.smoothing, settings.keep_boundary],
             "version": _VERSION,
+            **({} if self.triangles is None else {"triangles": self.triangles}),
             **{library: installed_version(library) for library in ("finufft", "scipy")},
         }
 
     def expected_size(self) -> ExpectedSize:
         """Return the size of the mesh, and the memory that the fit takes."""
         start, target = self.start.expected_size(), self.target.expected_size()
-        own_bytes = _LATTICE_BYTES + _TRIANGLE_BYTES * start.triangles + _TARGET_BYTES * target.triangles
-        return ExpectedSize(start.triangles, max(start.projected_bytes, target.projected_bytes, own_bytes))
+        count = self.triangles or start.triangles
+        # Scores of edges come from a mesh of four times the triangles.
+        largest = count if self.triangles is None else 2 * count
+        own_bytes = _LATTICE_BYTES + _TRIANGLE_BYTES * largest + _TARGET_BYTES * target.triangles
+        return ExpectedSize(count, max(start.projected_bytes, target.projected_bytes, own_bytes))
 
 
 @dataclass(frozen=True)

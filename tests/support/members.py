@@ -27,6 +27,14 @@ KINDS: dict[str, dict[str, Any]] = {
         "target": {"source": "sphere", "radius": 1.1},
         "steps": 3,
     },
+    "refine": {
+        "source": "refine",
+        "mesh": {"source": "icosphere", "levels": [0]},
+        "target": {"source": "sphere", "radius": 1.1},
+        "steps": 3,
+        "triangles": [40, 24],
+    },
+    "flow": {"source": "flow", "mesh": BALL, "times": [2.0, 0.5], "period": 4.0, "strength": 1.0},
     "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
 }
 

@@ -38,7 +38,7 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     variables = {name: ("mesh", values) for name, values in columns.items()}
-    return describe(xr.Dataset(variables, coords={"mesh": _labels(rows)}))
+    return describe(xr.Dataset(variables, coords=_meshes(rows)))
 
 
 def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
@@ -127,11 +127,16 @@ def _variables(values: Mapping[str, NDArray[Any]], *dimensions: str) -> dict[str
 
 
 def _coordinates(rows: Sequence[Row], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:
-    return {"mesh": _labels(rows), "order": ("order", np.array(orders, dtype=np.float64))}
+    return {**_meshes(rows), "order": ("order", np.array(orders, dtype=np.float64))}
 
 
-def _labels(rows: Sequence[Row]) -> tuple[str, NDArray[np.generic]]:
-    return "mesh", _strings([row.label for row in rows])
+def _meshes(rows: Sequence[Row]) -> dict[str, tuple[str, NDArray[np.generic]]]:
+    """Return labels, and times where any mesh has one."""
+    labels = {"mesh": ("mesh", _strings([row.label for row in rows]))}
+    times = [row.member.time for row in rows]
+    if all(time is None for time in times):
+        return labels
+    return {**labels, "time": ("mesh", np.array([np.nan if time is None else time for time in times]))}
 
 
 def _strings(values: Sequence[str]) -> NDArray[np.generic]:

@@ -214,11 +214,14 @@ def _digest(workspace: Workspace) -> str:
         [row.label, row.family, *((record.key, record.status, record.reason) if record else ("", "", ""))]
         for row, record in zip(workspace.rows, workspace.records, strict=True)
     ]
+    times = [row.member.time for row in workspace.rows]
     inputs = {
         "version": TABLES_VERSION,
         "rows": rows,
         "orders": plan.study.orders,
         "pairs": plan.study.pairs,
         "reference": plan.reference,
+        # Left out where there are none, as in stores that know no times.
+        **({} if all(time is None for time in times) else {"times": times}),
     }
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()

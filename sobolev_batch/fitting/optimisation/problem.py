@@ -100,6 +100,12 @@ class FitProblem:
         energies = difference.real**2 + difference.imag**2
         return np.array([float(np.sum(factors * energies)) for factors in self._factors(orders)])
 
+    def weighting(self, vertices: Reals, shares: Sequence[tuple[float, float]]) -> Weighting:
+        """Return orders with their shares, each relative to the squared distance with vertices at some positions."""
+        orders = tuple(order for order, _ in shares)
+        squares = np.maximum(self.squares(vertices, orders), np.finfo(np.float64).tiny)
+        return Weighting(orders, tuple(share / one for (_, share), one in zip(shares, squares, strict=True)))
+
     def relative(self, vertices: Reals, order: float) -> float:
         """Return the distance with vertices at some positions over the norm of the target."""
         energies = self.target.real**2 + self.target.imag**2

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.optimisation.descent import End, descend
-from sobolev_batch.fitting.optimisation.problem import FitProblem, Weighting
+from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.smoothing import Smoothing
 from sobolev_batch.spectral.shells import single_order
 
@@ -119,9 +119,7 @@ class Run:
 
     def _after(self, stage: Stage, vertices: Reals) -> Reals:
         """Return the vertices after a stage: descents with ever finer fields, and smoother steps where needed."""
-        orders = tuple(order for order, _ in stage.shares)
-        squares = np.maximum(self.problem.squares(vertices, orders), np.finfo(np.float64).tiny)
-        weighting = Weighting(orders, tuple(share / one for (_, share), one in zip(stage.shares, squares, strict=True)))
+        weighting = self.problem.weighting(vertices, stage.shares)
         smoothing = Smoothing.of(self.problem.mesh, self.free, stage.smoothing)
         unit, retreats = self.problem.mesh.edge_length_range[0], 0
         left = min(stage.steps, self.steps - self.taken)

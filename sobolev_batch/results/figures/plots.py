@@ -29,6 +29,7 @@ from sobolev_batch.results.figures.style import (
 )
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.groups import (
     chosen_orders,
     complete_meshes,
@@ -88,6 +89,49 @@ def plot_convergence(store: AnyStore, order: float | None = None, ax: Axes | Non
     axes.set_title(f"order {order:g}")
     axes.set_xlabel("mean edge length in the study's unit")
     axes.set_ylabel("relative Sobolev distance")
+    axes.grid(visible=True, which="major", alpha=0.3)
+    return axes
+
+
+def plot_evolution(
+    store: AnyStore, order: float | None = None, ax: Axes | None = None, *, truth: str | None = None
+) -> Axes:
+    """Plot the distances of moving meshes from the true surface over time, one line for each family.
+
+    The vertical axis is logarithmic; bars show errors, and a dotted line marks the first time at which a new mesh pays.
+
+    Args:
+        store: Path, URL or opened DataTree of a store whose meshes have times.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
+        truth: Family of the true surface at the same times; default the study's reference.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: See `evolution`.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_evolution("memory://wound-up.zarr")  # the study of the example of `evolution`
+    >>> ax.get_xlabel()
+    'time'
+    """
+    tree = as_tree(store)
+    found = evolution(tree, _order_of(tree, order), truth=truth).isel(order=0)
+    axes, styles = ax or new_axes(_CONVERGENCE_INCHES), family_styles(tree)
+    for family in found["family"].values.tolist():
+        rows = found.sel(family=family).dropna("time", subset=["distance"])
+        color, marker = styles[family]
+        values, errors = rows["distance"].values, rows["error"].values
+        axes.semilogy(rows["time"], values, f"{marker}-", color=color, label=escaped(family), markersize=4)
+        axes.errorbar(rows["time"], values, yerr=error_bars(values, errors), fmt="none", ecolor=color, elinewidth=0.8)
+        if np.isfinite(moment := rows["remesh_time"].item()):
+            axes.axvline(moment, color=color, linestyle=":", linewidth=1)
+    add_legend(axes)
+    axes.set_title(f"order {found['order'].item():g}")
+    axes.set_xlabel("time")
+    axes.set_ylabel("Sobolev distance")
     axes.grid(visible=True, which="major", alpha=0.3)
     return axes
 
@@ -237,7 +281,7 @@ def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """Write the plots of an open store into a folder, with a panel for each order or family.
 
     The files are convergence.png, transform.png, spectrum.png and energy.png, which has one panel; where the study asks
-    for the distances of all pairs, matrix.png and map.png too.
+    for the distances of all pairs, matrix.png and map.png too, and where meshes have times, over-time.png.
 
     Returns:
         Paths of the pictures.
@@ -248,6 +292,8 @@ def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """
     orders = chosen_orders(finished_group(tree, "convergence"), None)
     figures = {"convergence.png": convergence_figure(tree, orders)}
+    if "time" in tree["meshes"].coords:
+        figures["over-time.png"] = panels(orders, _CONVERGENCE_INCHES, partial(plot_evolution, tree))
     if families := list(_complete_members(tree)):
         figures["transform.png"] = panels(families, _TRANSFORM_INCHES, partial(plot_transform, tree))
     if has_pairs(tree):

@@ -27,6 +27,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "mesh": described("label of the mesh"),
     "other": described("label of the other mesh"),
     "order": described("Sobolev order s", NUMBER),
+    "time": described("time of the mesh", description="in the unit of the study's times"),
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
     **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
     "inner_product": described("Sobolev inner product", LENGTH),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import pickle
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -164,6 +165,10 @@ def _check_values(member: Member, report: _Report) -> None:
     report.require(
         type(member.level) is int and member.level >= -1,
         f"{label} has the level {member.level!r}, expected an integer from -1",
+    )
+    report.require(
+        member.time is None or (isinstance(member.time, int | float) and math.isfinite(member.time)),
+        f"{label} has the time {member.time!r}, expected a number or None",
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from dataclasses import dataclass
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -18,9 +19,10 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.fingerprints import file_digest
 from sobolev_batch.surfaces.sources.globs import expand
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, label_problem, quoted
-from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, at_most
+from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, Times, at_most
 
 _MOST_PATHS = 100_000
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 class FileSource(Source):
@@ -32,21 +34,26 @@ class FileSource(Source):
             none outside the folder that it names: see `globs.expand`.
         distribution: Installed Python distribution. Paths are then those of files that it recorded at its
             installation, without wildcards. It is not imported.
+        times: Times of the meshes if they are states of one that moves: a list with one for each file, in the order of
+            the numbers in their names, or "names" for the last number in the name of each file.
     """
 
     paths: Annotated[
         tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(_MOST_PATHS)
     ]
     distribution: Annotated[str, Field(min_length=1)] | None = None
+    times: Times | Literal["names"] | None = None
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member per file, sorted by path, and named by the file's stem where that is unique."""
+        """Return one member per file, sorted by path or time, and named by the file's stem where that is unique."""
         if self.distribution is not None:
             paths = sorted({_recorded_file(self.distribution, path) for path in self.paths})
         else:
             paths = sorted({match for path in self.paths for match in _matches(folder, path)})
+        times = dict.fromkeys(paths) if self.times is None else _times(paths, self.times)
+        names = dict(zip(paths, _names(paths), strict=True))
         # Absolute, since a worker may have been started in another folder.
-        return tuple(FileMember(name, -1, path.absolute()) for name, path in zip(_names(paths), paths, strict=True))
+        return tuple(FileMember(names[path], -1, path.absolute(), time=time) for path, time in times.items())
 
 
 @dataclass(frozen=True)
@@ -94,6 +101,34 @@ def _matches(folder: Path, path: str) -> list[Path]:
         return expand(folder, path)
     except StudyError as error:
         raise StudyError(f"paths: {error}") from error
+
+
+def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> dict[Path, float]:
+    """Return the time of each file, in the order of times."""
+    if given == "names":
+        times = {path: _last_number(path) for path in paths}
+    elif len(given) == len(paths):
+        times = dict(zip(sorted(paths, key=_natural_key), given, strict=True))
+    else:
+        raise StudyError(f"times: {len(given)} times are given for {len(paths)} files; give one for each")
+    repeated = [time for time, count in Counter(times.values()).items() if count > 1]
+    if repeated:
+        raise StudyError(f"times: several files have the time {repeated[0]:g}; each state needs a time of its own")
+    return dict(sorted(times.items(), key=lambda item: item[1]))
+
+
+def _last_number(path: Path) -> float:
+    numbers = _NUMBER.findall(mesh_stem(path))
+    if not numbers:
+        raise StudyError(f"times: the name of the file {quoted(path.name)} has no number; list the times instead")
+    return float(numbers[-1])
+
+
+def _natural_key(path: Path) -> list[tuple[str, float]]:
+    """Return a key that sorts paths by the numbers in them: 2 before 10."""
+    parts = _NUMBER.split(path.as_posix())
+    numbers = [*map(float, _NUMBER.findall(path.as_posix())), 0.0]
+    return list(zip(parts, numbers, strict=True))
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -11,14 +11,15 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -111,8 +112,9 @@ class Member(ABC):
     Attributes:
         name: Label of the surface in the store, unique within its source.
         level: Refinement level, or rank from coarse to fine; -1 where the source has no such order.
+        time: Time of the surface, in a unit of the user's choice; None where the source has no time.
 
-    >>> from dataclasses import dataclass
+    >>> from dataclasses import dataclass, field
     >>> import sobolev_batch as sb
     >>> @dataclass(frozen=True)
     ... class TorusMember(sb.Member):
@@ -132,6 +134,7 @@ class Member(ABC):
 
     name: str
     level: int
+    time: float | None = field(default=None, kw_only=True)
 
     @abstractmethod
     def load(self) -> Surface:
@@ -204,6 +207,22 @@ def at_most(count: int) -> BeforeValidator:
         return value
 
     return BeforeValidator(check)
+
+
+def _require_distinct(times: tuple[float, ...]) -> tuple[float, ...]:
+    repeated = sorted(time for time, count in Counter(times).items() if count > 1)
+    if repeated:
+        raise ValueError(f"each time can be there once, found {repeated[0]:g} again")
+    return times
+
+
+# One or several different times, for sources of surfaces that move.
+Times = Annotated[
+    tuple[Annotated[float, Field(allow_inf_nan=False, strict=False)], ...],
+    Field(min_length=1, strict=False),
+    at_most(MOST_ENTRIES),
+    AfterValidator(_require_distinct),
+]
 
 
 def parse_source(table: Mapping[str, Any]) -> Source:

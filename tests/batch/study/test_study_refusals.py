@@ -159,7 +159,7 @@ def test_sources_are_looked_up_and_never_imported(name: str) -> None:
     message = refusal(changed("family.0.source", name))
     assert "family 'ico': no source is named " in message
     assert name[:8].strip() in message
-    assert "known are decimate, ellipsoid, ellipsoid-levels, files, fit, icosphere" in message
+    assert "known are decimate, ellipsoid, ellipsoid-levels, files, fit, flow, icosphere" in message
     assert set(sys.modules) == loaded
 
 

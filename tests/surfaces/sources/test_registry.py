@@ -57,8 +57,8 @@ def test_all_sources_are_registered() -> None:
     with pytest.raises(StudyError) as caught:
         parse_source({"source": "nothing"})
     assert str(caught.value) == (
-        "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, fit, icosphere, "
-        "remesh, sphere, spherical-levels, torus, torus-grid"
+        "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, fit, flow, "
+        "icosphere, refine, remesh, sphere, spherical-levels, torus, torus-grid"
     )
 
 
@@ -236,7 +236,7 @@ def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
-    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 15
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 19
 
 
 @pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])

@@ -1,0 +1,188 @@
+"""Finer meshes: their edges are split where that brings them nearest to a target, and their vertices move."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.fitting.derivative.transform import require_mesh
+from sobolev_batch.fitting.fit import Fit, concluded, measured
+from sobolev_batch.fitting.optimisation.descent import End
+from sobolev_batch.fitting.optimisation.stages import (
+    DEFAULT_ORDER,
+    DEFAULT_SMOOTHING,
+    DEFAULT_STEPS,
+    FitProgress,
+    FitSettings,
+    Run,
+)
+from sobolev_batch.fitting.subdivision import Edges
+from sobolev_batch.fitting.task import FitTask, welded
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.inputs import Operand
+from sobolev_batch.spectral.transform.settings import Execution
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+
+# A finer mesh has at most so many times the triangles of the one before.
+_GROWTH = 2.0
+# The last factor may be a little larger, instead of a round for few triangles.
+_LAST_GROWTH = 1.15
+# Steps after each round but the last.
+_STEPS_BETWEEN = 40
+MOST_TRIANGLES = 1_000_000
+
+
+def refine(
+    mesh: Mesh,
+    target: Operand,
+    order: float = DEFAULT_ORDER,
+    *,
+    triangles: int,
+    lattice: Lattice | None = None,
+    steps: int = DEFAULT_STEPS,
+    smoothing: float = DEFAULT_SMOOTHING,
+    keep_boundary: bool = False,
+    threads: int | None = None,
+    notify: Callable[[FitProgress], None] | None = None,
+) -> Fit:
+    """Split edges of a mesh where that lowers its Sobolev distance from a target most, and move its vertices.
+
+    The mesh is fitted, the number of its triangles at most doubled, and so on. An edge is split where the squared
+    distance would change most if its middle moved by a fraction of its length: where the derivative with respect to a
+    vertex there, times the length, is largest. An interrupt (Ctrl-C) ends with the best mesh so far.
+
+    Args:
+        mesh: Mesh to start from. Vertices at one place become one.
+        target: Surface in the same unit of length, or its field; see `fit`.
+        order: Order s < -1/2 of the distance.
+        triangles: Number of triangles to reach, up to 1,000,000. The result may have a few less, as splits come in
+            groups.
+        lattice: Lattice of the frequencies to look at; chosen by the mean edge of each mesh if not given. A field
+            brings its own.
+        steps: Largest number of steps after the last split, and up to 40 after each before.
+        smoothing: Weight λ of the mesh's Laplacian in steps.
+        keep_boundary: Leave vertices of open boundaries where they are. Their edges may be split.
+        threads: Threads of the NUFFT; one per core by default.
+        notify: Called after each step.
+
+    Returns:
+        The finer mesh with the closeness of the start and of itself. It is never farther away than the start by more
+        than the reported errors.
+
+    Raises:
+        OrderError: The order is not below -1/2.
+        LatticeError: The mesh or target does not fit into the lattice.
+        InputError: The mesh has as many triangles already, or `fit` would refuse mesh, target or settings.
+
+    >>> import sobolev_batch as sb
+    >>> refined = sb.refine(sb.icosphere(0), sb.Ellipsoid((1.5, 1.0, 1.0)), -4.0, triangles=80, steps=20)
+    >>> len(refined.mesh.triangles) <= 80, refined.after.distance < refined.before.distance / 10
+    (True, True)
+    """
+    settings = FitSettings(order, steps, smoothing, keep_boundary)
+    refinement = _Refinement(target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1), triangles)
+    task = refinement.begun(mesh)
+    before = measured(task)
+    return concluded(mesh, before, *refinement.carried_out(task, notify))
+
+
+def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
+    """Return the mesh that `refine` finds, without measures of its closeness.
+
+    Raises:
+        LatticeError: The mesh does not fit into the lattice of a field.
+        InputError: See `refine`.
+    """
+    refinement = _Refinement(target, None, settings, execution, triangles)
+    task, fitted, _ = refinement.carried_out(refinement.begun(mesh))
+    return task.own(fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class _Refinement:
+    """Rounds of fits and splits.
+
+    Attributes:
+        target: Target, as it was given.
+        lattice: Lattice, if one was given.
+        settings: Settings of the last fit.
+        execution: Threads.
+        triangles: Number of triangles to reach.
+    """
+
+    target: Operand
+    lattice: Lattice | None
+    settings: FitSettings
+    execution: Execution
+    triangles: int
+
+    def begun(self, mesh: Mesh) -> FitTask:
+        """Return the first task.
+
+        Raises:
+            InputError: See `refine`.
+        """
+        require_mesh(mesh)
+        count, goal = len(mesh.triangles), self.triangles
+        if isinstance(goal, bool) or not isinstance(goal, int) or not 1 <= goal <= MOST_TRIANGLES:
+            raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
+        if count >= goal:
+            raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")
+        return self._task(welded(mesh)[0])
+
+    def carried_out(
+        self, task: FitTask, notify: Callable[[FitProgress], None] | None = None
+    ) -> tuple[FitTask, Mesh, Run]:
+        """Return the last task, the prepared mesh at its end and its run, with the steps of all rounds."""
+        between = replace(self.settings, steps=min(_STEPS_BETWEEN, self.settings.steps))
+        rounds = math.ceil(math.log(self.triangles / len(task.start.triangles), _GROWTH))
+        total, taken, goal = rounds * between.steps + self.settings.steps, 0, self.triangles
+
+        def counted(progress: FitProgress) -> None:
+            if notify is not None:
+                notify(FitProgress(taken + progress.step, total, progress.relative))
+
+        while True:
+            count = len(task.start.triangles)
+            is_last = count >= goal
+            fitted, run = (task if is_last else replace(task, settings=between)).run(counted)
+            taken += run.taken
+            run.taken = taken
+            if is_last or run.end is End.INTERRUPTED:
+                return task, fitted, run
+            wanted = goal if goal <= _LAST_GROWTH * _GROWTH * count else round(_GROWTH * count)
+            try:
+                finer = self._split(task, fitted, wanted)
+                task = self._task(finer)
+            except KeyboardInterrupt:
+                run.end = End.INTERRUPTED
+                return task, fitted, run
+            # Splits come in groups, so a few triangles may be out of reach.
+            if wanted == goal or len(finer.triangles) == count:
+                goal = len(finer.triangles)
+
+    def _task(self, mesh: Mesh) -> FitTask:
+        return FitTask.of(mesh, self.target, self.lattice, self.settings, self.execution)
+
+    def _split(self, task: FitTask, fitted: Mesh, triangles: int) -> Mesh:
+        """Return the fitted mesh, at the place that was given, with the edges split where that helps most."""
+        mesh = task.own(fitted)
+        edges = Edges.of(mesh)
+        scores = edges.lengths * np.linalg.norm(self._derivatives(edges), axis=1)
+        if self.settings.keep_boundary:
+            scores[edges.on_boundary] = 0.0
+        return edges.split(edges.best(scores, triangles))
+
+    def _derivatives(self, edges: Edges) -> NDArray[np.float64]:
+        """Return the derivative with respect to a vertex at the middle of each edge, (e, 3)."""
+        task = self._task(edges.split(np.ones(len(edges.ends), dtype=bool)))
+        vertices = np.asarray(task.start.vertices)
+        weighting = task.problem.weighting(vertices, self.settings.shares)
+        _, gradient = task.problem.objective(vertices, weighting)[0](vertices)
+        return np.asarray(gradient[task.place][len(edges.mesh.vertices) :])

@@ -1,0 +1,110 @@
+"""Subdivision of a mesh at some of its edges, without vertices inside of edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+
+Reals = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Marks = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges of a mesh.
+
+    Attributes:
+        mesh: The mesh.
+        ends: Vertices of each edge (e, 2), the smaller first.
+        sides: Edges of each triangle (m, 3), from its first vertex to its second and so on.
+    """
+
+    mesh: Mesh
+    ends: Indices
+    sides: Indices
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> Self:
+        """Return the edges of a mesh."""
+        sides = np.sort(np.asarray(mesh.triangles)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        ends, edges = np.unique(sides, axis=0, return_inverse=True)
+        return cls(mesh, ends, edges.reshape(-1, 3))
+
+    @property
+    def on_boundary(self) -> Marks:
+        """Return True for each edge of one triangle only."""
+        return np.asarray(np.bincount(self.sides.ravel(), minlength=len(self.ends)) == 1)
+
+    @cached_property
+    def lengths(self) -> Reals:
+        """Lengths (e,), in units of length."""
+        vertices = np.asarray(self.mesh.vertices)
+        return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
+
+    def best(self, scores: Reals, triangles: int) -> Marks:
+        """Mark the edges of the largest scores, as many as lead to at most so many triangles.
+
+        Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner.
+
+        Source: M. C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques"
+        (1984), doi:10.1002/nme.1620200412.
+        """
+        order = np.argsort(-scores, kind="stable")
+        fewest, most = 0, len(order)
+        while fewest < most:
+            middle = (fewest + most + 1) // 2
+            if self._count(self._completed(order[:middle])) <= triangles:
+                fewest = middle
+            else:
+                most = middle - 1
+        return self._completed(order[:fewest])
+
+    def split(self, marks: Marks) -> Mesh:
+        """Return the mesh with a new vertex at the middle of each marked edge.
+
+        New vertices follow those of the mesh, in the order of edges. A triangle becomes two, three or four; of two
+        ways to cut three, it takes the shorter diagonal.
+        """
+        count = len(self.mesh.vertices)
+        middles = np.full(len(self.ends), -1, dtype=np.int64)
+        middles[marks] = count + np.arange(np.count_nonzero(marks))
+        old = np.asarray(self.mesh.vertices)
+        vertices = np.concatenate([old, old[self.ends[marks]].mean(axis=1)])
+        triangles, on_sides = np.asarray(self.mesh.triangles, dtype=np.int64), middles[self.sides]
+        # Turned so that the first side is marked, and of three sides with two marks the last one is not.
+        first = np.argmax((on_sides >= 0) & (np.roll(on_sides, 1, axis=1) < 0), axis=1)
+        columns = (first[:, None] + np.arange(3)) % 3
+        (a, b, c), (ab, bc, ca) = (np.take_along_axis(one, columns, axis=1).T for one in (triangles, on_sides))
+        number = np.count_nonzero(on_sides >= 0, axis=1)
+        near = np.linalg.norm(vertices[a] - vertices[bc], axis=1) <= np.linalg.norm(vertices[ab] - vertices[c], axis=1)
+        pieces = (
+            (number == 0, [(a, b, c)]),
+            (number == 1, [(a, ab, c), (ab, b, c)]),
+            ((number == 2) & near, [(ab, b, bc), (a, ab, bc), (a, bc, c)]),
+            ((number == 2) & ~near, [(ab, b, bc), (a, ab, c), (ab, bc, c)]),
+            (number == 3, [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]),
+        )
+        cut = [np.stack(corners, axis=1)[chosen] for chosen, pieces_of in pieces for corners in pieces_of]
+        return Mesh(vertices, np.concatenate(cut))
+
+    def _completed(self, edges: Indices) -> Marks:
+        """Mark edges, and the longest edge of every triangle that has a marked one."""
+        longest = np.take_along_axis(self.sides, self.lengths[self.sides].argmax(axis=1)[:, None], axis=1)[:, 0]
+        marks = np.zeros(len(self.ends), dtype=bool)
+        added = edges
+        while len(added):
+            marks[added] = True
+            touched = longest[marks[self.sides].any(axis=1)]
+            added = touched[~marks[touched]]
+        return marks
+
+    def _count(self, marks: Marks) -> int:
+        """Return the number of triangles after a split."""
+        return len(self.sides) + int(np.count_nonzero(marks[self.sides]))

@@ -1,0 +1,176 @@
+"""Distances over time, for families of meshes that move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.results.tables.formatting import concise
+from sobolev_batch.results.tables.groups import chosen_orders, finished_group, reference_of
+from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
+from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
+from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.surfaces.sources.names import quoted
+
+# A mesh that is so many times as far away as at its first time is worth a new one.
+REMESHING_FACTOR = 2.0
+_NOTE = """\
+Digits in brackets are the error in units of the last digit. A new mesh of as many
+triangles would be as near as the first one: it pays once the distance has certainly
+grown to {factor:g} times that of the first time."""
+
+
+def evolution(
+    store: AnyStore, order: Orders | None = None, *, truth: str | None = None, factor: float = REMESHING_FACTOR
+) -> xr.Dataset:
+    """Return the distances of moving meshes from the true surface over time, and when a new mesh pays.
+
+    Args:
+        store: Path, URL or opened DataTree of a store whose meshes have times.
+        order: One order s < -1/2 of the store, or several; default all.
+        truth: Family of the true surface at the same times, if it moves; default the study's reference.
+        factor: Growth of the distance at which a new mesh pays, larger than 1.
+
+    Returns:
+        Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
+        length, and `growth`, the distance over that of the family's first time. Over `family` and `order` it has
+        `remesh_time`, the first time at which the distance has certainly grown by the factor. NaN where a family has
+        no mesh of a time, and where no time is late enough.
+
+    Raises:
+        InputError: The store has no tables yet, no mesh with a time, no such order or family, or the factor is not
+            larger than 1.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> ball = {"source": "icosphere", "levels": [2]}
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "wound-up"},
+    ...     "lattice": {"xi_max": 2.0, "M": 20},
+    ...     "norm": {"orders": [-4.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "carried", "source": "flow", "times": [0, 1, 2], "mesh": ball}],
+    ... })
+    >>> _ = sb.run(study, "memory://wound-up.zarr")
+    >>> found = sb.evolution("memory://wound-up.zarr", -4.0)
+    >>> bool((found["growth"].sel(family="carried").diff("time") > 0).all())
+    True
+    """
+    if not factor > 1:
+        raise InputError(f"the factor must be larger than 1, found {factor!r}")
+    tree = as_tree(store)
+    convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
+    orders = chosen_orders(convergence, order)
+    labels = _labels_by_time(meshes)
+    if not labels:
+        raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
+    if truth is None:
+        labels.pop(reference_of(tree), None)
+    elif truth not in labels:
+        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
+    true_labels = {} if truth is None else labels.pop(truth)
+    times = sorted({time for family in labels.values() for time in family})
+    shape = (len(labels), len(times), len(orders))
+    distances, errors = np.full(shape, np.nan), np.full(shape, np.nan)
+    for i, family in enumerate(labels.values()):
+        for time, label in family.items():
+            found = convergence.sel(mesh=label, order=orders)
+            if truth is not None:
+                found = _distance(tree, label, true_labels.get(time), orders, found)
+            place = i, times.index(time)
+            distances[place], errors[place] = found["distance"].values, found["error"].values
+    return _dataset(list(labels), times, orders, distances, errors, factor)
+
+
+def format_evolution(
+    tree: xr.DataTree,
+    style: Format = "text",
+    orders: Sequence[float] | None = None,
+    *,
+    truth: str | None = None,
+    factor: float = REMESHING_FACTOR,
+) -> str:
+    """Return the distances of moving meshes as text; see `evolution`."""
+    found = evolution(tree, orders, truth=truth, factor=factor)
+    if style in ("csv", "json"):
+        frame: pd.DataFrame = found[["distance", "error", "growth"]].to_dataframe().dropna(how="all").reset_index()
+        return machine_table(frame[["order", "family", "time", "distance", "error", "growth"]], style)
+    families = found["family"].values.tolist()
+    sections = []
+    for order in found["order"].values.tolist():
+        rows = found.sel(order=order)
+        cells = [
+            [f"{time:g}", *(_cell(rows.sel(family=family, time=time)) for family in families)]
+            for time in rows["time"].values.tolist()
+        ]
+        caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time"
+        moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
+        separator = "\n" if style == "latex" else "\n\n"
+        table = printed_table(cells, ["time", *families], style)
+        sections.append(separator.join([prose(caption, style), table, prose("\n".join(moments), style)]))
+    return "\n\n".join([*sections, prose(_NOTE.format(factor=factor), style)])
+
+
+def _labels_by_time(meshes: xr.Dataset) -> dict[str, dict[float, str]]:
+    """Return the label of each family's mesh at each time."""
+    labels: dict[str, dict[float, str]] = {}
+    if "time" not in meshes.coords:
+        return labels
+    for label, family, time in zip(*(meshes[name].values.tolist() for name in ("mesh", "family", "time")), strict=True):
+        if not np.isnan(time):
+            labels.setdefault(family, {})[time] = label
+    return labels
+
+
+def _distance(
+    tree: xr.DataTree, label: str, true_label: str | None, orders: list[float], unknown: xr.Dataset
+) -> xr.Dataset:
+    """Return the distance of two meshes of a store, NaN where one of them is missing."""
+    if true_label is None or np.isnan(unknown["distance"].values).any():
+        return unknown * np.nan
+    return StoreAccessor(tree).distance(label, true_label, orders)
+
+
+def _dataset(
+    families: list[str],
+    times: list[float],
+    orders: list[float],
+    distances: np.ndarray,
+    errors: np.ndarray,
+    factor: float,
+) -> xr.Dataset:
+    dims = ("family", "time", "order")
+    found = xr.Dataset(
+        {"distance": (dims, distances, VARIABLES["distance"]), "error": (dims, errors, VARIABLES["error"])},
+        coords={
+            "family": ("family", families, described("family of meshes")),
+            "time": ("time", times, VARIABLES["time"]),
+            "order": ("order", orders, VARIABLES["order"]),
+        },
+    )
+    first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
+    growth = found["distance"] / first["distance"]
+    late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
+    remesh_time = found["time"].where(late).min("time")
+    return found.assign(
+        growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
+        remesh_time=remesh_time.transpose("family", "order").assign_attrs(
+            described("first time at which a new mesh pays", factor=f"{factor:g}")
+        ),
+    )
+
+
+def _cell(found: xr.Dataset) -> str:
+    text = concise(found["distance"].item(), found["error"].item())
+    return f"{text}  {found['growth'].item():5.2f} ×" if text else ""
+
+
+def _moment(found: xr.Dataset, factor: float) -> str:
+    moment = found["remesh_time"].item()
+    return f"a new mesh pays from {moment:g} on" if np.isfinite(moment) else f"it stays below {factor:g} times"

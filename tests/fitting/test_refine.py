@@ -1,0 +1,121 @@
+"""Refinement: more triangles where they help, nearer than other meshes of as many."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.fitting import refine as module
+from tests.support.members import loaded, members
+
+# A ball with a sharp bump at its top: most triangles belong there.
+BALL = sb.icosphere(5)
+BUMP = 1 + 0.5 * np.exp(-200 * (1 - np.asarray(BALL.vertices)[:, 2:]))
+TARGET = sb.Mesh(np.asarray(BALL.vertices) * BUMP, BALL.triangles)
+
+
+def test_edges_are_split_where_the_surface_is_not_met() -> None:
+    start = sb.icosphere(3)
+    refined = sb.refine(start, TARGET, -2.0, triangles=1400, steps=10).mesh
+    added = np.asarray(refined.vertices)[len(start.vertices) :]
+    at_bump = added[:, 2] > 0.9 * np.linalg.norm(added, axis=1)
+    # The bump has a twentieth of the directions.
+    assert at_bump.mean() > 0.5
+
+
+def test_the_mesh_is_nearer_than_an_even_one() -> None:
+    start = sb.icosphere(1)
+    refined = sb.refine(start, TARGET, -2.0, triangles=320, steps=40)
+    assert 314 < len(refined.mesh.triangles) <= 320
+    even = sb.fit(sb.icosphere(2), TARGET, -2.0, steps=80)
+    assert refined.after.distance < 0.8 * even.after.distance
+    assert refined.before.distance == pytest.approx(sb.distance(start, TARGET, -2.0, rtol=0.02)["distance"].item())
+    assert refined.steps > 40
+
+
+def test_the_target_can_be_a_field_alone() -> None:
+    field = sb.fourier_transform(TARGET, sb.Lattice(4.0, 48))
+    refined = sb.refine(sb.icosphere(1), field, -4.0, triangles=160, steps=20)
+    assert 154 < len(refined.mesh.triangles) <= 160
+    assert refined.after.distance < refined.before.distance / 5
+
+
+def test_progress_counts_all_rounds() -> None:
+    seen: list[sb.FitProgress] = []
+    found = sb.refine(sb.icosphere(0), sb.Ellipsoid((1.3, 1, 1)), -4.0, triangles=80, steps=5, notify=seen.append)
+    assert [progress.step for progress in seen] == list(range(1, found.steps + 1))
+    assert {progress.steps for progress in seen} == {15}
+
+
+def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(progress: sb.FitProgress) -> None:
+        if progress.step == 7:
+            raise KeyboardInterrupt
+
+    start, target = sb.icosphere(0), sb.Ellipsoid((1.3, 1, 1))
+    found = sb.refine(start, target, -4.0, triangles=80, steps=5, notify=interrupt)
+    assert found.end == "it was interrupted"
+    assert 20 < len(found.mesh.triangles) < 80
+    assert found.after.distance < found.before.distance
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module._Refinement, "_derivatives", interrupted)
+    found = sb.refine(start, target, -4.0, triangles=80, steps=5)
+    assert found.end == "it was interrupted"
+    assert len(found.mesh.triangles) == 20
+
+
+def test_vertices_at_one_place_become_one_and_boundaries_stay() -> None:
+    sheet = sb.icosphere(1)
+    upper = np.asarray(sheet.triangles)[np.asarray(sheet.vertices)[sheet.triangles][..., 2].mean(axis=1) > -0.3]
+    soup = sb.Mesh(np.asarray(sheet.vertices)[upper].reshape(-1, 3), np.arange(3 * len(upper)).reshape(-1, 3))
+    target = sb.Mesh(1.1 * np.asarray(sheet.vertices), upper)
+    found = sb.refine(soup, target, -4.0, triangles=2 * len(upper), steps=5, keep_boundary=True).mesh
+    assert len(found.vertices) < 3 * len(found.triangles) / 4
+    edges = module.Edges.of(sb.Mesh(sheet.vertices, upper))
+    kept = np.asarray(sheet.vertices)[np.unique(edges.ends[edges.on_boundary])]
+    distances = np.linalg.norm(np.asarray(found.vertices)[:, None] - kept, axis=2).min(axis=0)
+    assert distances.max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (20, "the mesh has 20 triangles already: ask for more than that, found 20"),
+        (5, "the mesh has 20 triangles already"),
+        (0, "triangles must be a whole number up to 1,000,000, found 0"),
+        (40.0, "triangles must be a whole number up to 1,000,000, found 40.0"),
+        (True, "found True"),
+        (10**7, "found 10000000"),
+    ],
+)
+def test_goals_that_cannot_be_reached_are_refused(goal: Any, message: str) -> None:
+    with pytest.raises(sb.InputError, match=message):
+        sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=goal)
+
+
+def test_a_member_is_the_refinement_in_the_unit_ball_of_its_target() -> None:
+    table: dict[str, Any] = {
+        "source": "refine",
+        "mesh": {"source": "ellipsoid-levels", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1]},
+        "target": {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]},
+        "steps": 5,
+        "triangles": [200, 120],
+    }
+    coarse, fine = members(table)
+    assert [(member.name, member.level) for member in (coarse, fine)] == [("120", 0), ("200", 1)]
+    start = loaded(members(table["mesh"])[0])
+    scaled = sb.Mesh((np.asarray(start.vertices) - [100, 0, 0]) / 30, start.triangles)
+    expected = sb.refine(scaled, sb.Sphere(), triangles=120, steps=5, threads=1).mesh
+    found = loaded(coarse)
+    assert np.array_equal(found.triangles, expected.triangles)
+    np.testing.assert_allclose((found.vertices - [100, 0, 0]) / 30, expected.vertices, rtol=0, atol=1e-9)
+    assert 110 < len(found.triangles) <= 120 < len(loaded(fine).triangles)
+    (too_many,) = members({**table, "triangles": [60]})
+    with pytest.raises(sb.MeshError, match="cannot be fitted to sphere: the mesh has 80 triangles already"):
+        too_many.load()
