@@ -20,7 +20,7 @@ def open_mesh() -> sb.Mesh:
 
 def normals(mesh: sb.Mesh) -> np.ndarray:
     a, b, c = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].transpose(1, 0, 2)
-    return np.cross(b - a, c - a)
+    return np.asarray(np.cross(b - a, c - a))
 
 
 def smallest_angles(mesh: sb.Mesh) -> np.ndarray:

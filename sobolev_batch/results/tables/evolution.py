@@ -12,7 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
 from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.results.tables.formatting import concise
-from sobolev_batch.results.tables.groups import chosen_orders, finished_group, reference_of
+from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
 from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.spectral.shells import Orders
@@ -75,14 +75,18 @@ def evolution(
     elif truth not in labels:
         raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
     true_labels = {} if truth is None else labels.pop(truth)
+    complete = set(complete_meshes(tree))
     times = sorted({time for family in labels.values() for time in family})
     shape = (len(labels), len(times), len(orders))
     distances, errors = np.full(shape, np.nan), np.full(shape, np.nan)
     for i, family in enumerate(labels.values()):
         for time, label in family.items():
-            found = convergence.sel(mesh=label, order=orders)
-            if truth is not None:
-                found = _distance(tree, label, true_labels.get(time), orders, found)
+            if truth is None:
+                found = convergence.sel(mesh=label, order=orders)
+            elif {label, true_labels.get(time)} <= complete:
+                found = StoreAccessor(tree).distance(label, true_labels[time], orders)
+            else:
+                continue
             place = i, times.index(time)
             distances[place], errors[place] = found["distance"].values, found["error"].values
     return _dataset(list(labels), times, orders, distances, errors, factor)
@@ -126,15 +130,6 @@ def _labels_by_time(meshes: xr.Dataset) -> dict[str, dict[float, str]]:
         if not np.isnan(time):
             labels.setdefault(family, {})[time] = label
     return labels
-
-
-def _distance(
-    tree: xr.DataTree, label: str, true_label: str | None, orders: list[float], unknown: xr.Dataset
-) -> xr.Dataset:
-    """Return the distance of two meshes of a store, NaN where one of them is missing."""
-    if true_label is None or np.isnan(unknown["distance"].values).any():
-        return unknown * np.nan
-    return StoreAccessor(tree).distance(label, true_label, orders)
 
 
 def _dataset(

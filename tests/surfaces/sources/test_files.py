@@ -222,3 +222,28 @@ def test_a_distribution_must_be_installed(tmp_path: Path, name: str) -> None:
     # An empty name may be refused as a parameter already.
     with pytest.raises((StudyError, ValidationError), match=r"install|distribution"):
         members({"source": "files", "distribution": name, "paths": ["a.off"]}, tmp_path)
+
+
+def _frames(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).write_bytes(off([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+
+
+def test_times_come_from_names_or_from_a_list(tmp_path: Path) -> None:
+    _frames(tmp_path, "s1_t10.off", "s1_t2.5.off", "s1_t0.off")
+    table = {"source": "files", "paths": ["*.off"]}
+    found = [(member.name, member.time) for member in members({**table, "times": "names"}, tmp_path)]
+    assert found == [("s1_t0", 0.0), ("s1_t2.5", 2.5), ("s1_t10", 10.0)]
+    found = [(member.name, member.time) for member in members({**table, "times": [3, 1.5, 2]}, tmp_path)]
+    assert found == [("s1_t2.5", 1.5), ("s1_t10", 2.0), ("s1_t0", 3.0)]
+    assert all(member.time is None for member in members(table, tmp_path))
+
+
+def test_times_that_do_not_belong_to_files_are_refused(tmp_path: Path) -> None:
+    _frames(tmp_path, "a1.off", "b1.off", "c.off")
+    with pytest.raises(StudyError, match="times: 2 times are given for 3 files; give one for each"):
+        members({"source": "files", "paths": ["*.off"], "times": [1, 2]}, tmp_path)
+    with pytest.raises(StudyError, match=r"the name of the file 'c\.off' has no number; list the times instead"):
+        members({"source": "files", "paths": ["*.off"], "times": "names"}, tmp_path)
+    with pytest.raises(StudyError, match="several files have the time 1"):
+        members({"source": "files", "paths": ["[ab]1.off"], "times": "names"}, tmp_path)

@@ -1,0 +1,171 @@
+"""Distances over time, of meshes that a flow carries and of files."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.results.tables.evolution import format_evolution
+from tests.support.commands import call
+from tests.support.members import loaded, members
+from tests.support.mesh_files import off
+from tests.support.studies import variable
+
+SHAPE: dict[str, Any] = {"source": "ellipsoid-levels", "axes": [1.0, 0.8, 0.6]}
+LATTICE = sb.Lattice(3.0, 40)
+
+
+def carried(level: int, times: list[float]) -> dict[str, Any]:
+    return {"source": "flow", "mesh": {**SHAPE, "levels": [level]}, "times": times}
+
+
+@pytest.fixture(scope="module")
+def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two meshes that a flow carries, against the true surface: a fine one that it carries along."""
+    folder = tmp_path_factory.mktemp("moving")
+    study = sb.Study.from_table(
+        {
+            "study": {"name": "moving"},
+            "lattice": {"xi_max": LATTICE.xi_max, "M": LATTICE.M},
+            "scaling": {"mode": "none"},
+            "norm": {"orders": [-2.0, -4.0], "pairs": "reference"},
+            "reference": {"source": "ellipsoid", "axes": [1.0, 0.8, 0.6]},
+            "family": [
+                {"name": "coarse", **carried(1, [0.0, 0.4, 0.8])},
+                {"name": "late", **carried(2, [0.4, 0.8, 1.2])},
+                {"name": "true", **carried(4, [0.0, 0.4, 0.8])},
+                {"name": "still", **SHAPE, "levels": [1]},
+            ],
+        }
+    )
+    sb.run(study, folder / "moving.zarr", client)
+    return folder / "moving.zarr"
+
+
+def test_distances_are_those_to_the_reference(store: Path) -> None:
+    found = sb.evolution(store, -2.0)
+    assert found["family"].values.tolist() == ["coarse", "late", "true"]
+    assert found["time"].values.tolist() == [0.0, 0.4, 0.8, 1.2]
+    table = sb.table(store, -2.0).set_index("mesh")
+    for label, family, time in (("coarse/0.4", "coarse", 0.4), ("late/1.2", "late", 1.2)):
+        there = found.sel(family=family, time=time, order=-2.0)
+        assert there["distance"].item() == table["distance"][label]
+        assert there["error"].item() == table["error"][label]
+    # A family begins at its own first time.
+    assert found["growth"].sel(family="late", order=-2.0).values[1] == 1.0
+    assert np.isnan(found["growth"].sel(family="late", order=-2.0).values[0])
+
+
+def test_the_true_surface_may_move(store: Path) -> None:
+    found = sb.evolution(store, [-4.0, -2.0], truth="true")
+    assert found["family"].values.tolist() == ["coarse", "late"]
+    for family, level in (("coarse", 1), ("late", 2)):
+        mesh, true = (loaded(members(carried(one, [0.8]))[0]) for one in (level, 4))
+        expected = sb.distance(mesh, true, [-4.0, -2.0], lattice=LATTICE)
+        there = found.sel(family=family, time=0.8)
+        difference = np.abs(there["distance"].values - expected["distance"].values)
+        assert (difference <= there["error"].values + expected["error"].values).all()
+    # Nobody knows where the true surface was at this time.
+    assert np.isnan(found["distance"].sel(time=1.2).values).all()
+
+
+def test_a_new_mesh_pays_once_the_distance_has_certainly_grown(store: Path) -> None:
+    found = sb.evolution(store, -4.0, truth="true")
+    growth = found["growth"].sel(family="coarse", order=-4.0).values
+    assert 1 < growth[1] < growth[2]
+    for factor, moment in ((0.9 * growth[1], 0.4), (0.9 * growth[2], 0.8), (1.1 * growth[2], np.nan)):
+        times = sb.evolution(store, -4.0, truth="true", factor=factor)["remesh_time"]
+        assert np.array_equal(times.sel(family="coarse").values, [moment], equal_nan=True)
+
+
+def test_text_and_data(store: Path) -> None:
+    tree = sb.open_store(store)
+    text = format_evolution(tree, "text", [-4.0], truth="true", factor=1.01).splitlines()
+    assert text[0] == "Sobolev distance of order -4 to true over time"
+    assert text[2].split() == ["time", "coarse", "late"]
+    assert text[4].split()[0] == "0"
+    assert text[4].split()[2:] == ["1.00", "×"]
+    assert "coarse: a new mesh pays from 0.4 on" in text
+    assert max(map(len, text)) <= 100
+    frame = pd.read_csv(io.StringIO(format_evolution(tree, "csv")))
+    assert list(frame) == ["order", "family", "time", "distance", "error", "growth"]
+    assert len(frame) == 2 * 9
+    assert json.loads(format_evolution(tree, "json", [-2.0]))[0]["growth"] == 1.0
+    assert "toprule" in format_evolution(tree, "latex")
+
+
+def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
+    done = call("table", str(store), "--over-time", "--truth", "true", "--order", "-4", folder=tmp_path)
+    assert "over time" in done.stdout
+    call("plot", str(store), "--output", str(tmp_path / "plots"), folder=tmp_path)
+    assert (tmp_path / "plots/over-time.png").stat().st_size > 5000
+    wrong = call("table", str(store), "--matrix", "--over-time", folder=tmp_path)
+    assert "ask for one of them" in wrong.stderr
+    wrong = call("table", str(store), "--truth", "true", folder=tmp_path)
+    assert "--truth belongs to --over-time" in wrong.stderr
+
+
+def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
+    axes = sb.plot_evolution(store, -4.0, truth="true")
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late"]
+    assert axes.get_title() == "order -4"
+
+
+def test_times_are_coordinates_of_all_tables(store: Path) -> None:
+    tree = sb.open_store(store)
+    for group in ("meshes", "norms", "convergence", "distances"):
+        times = variable(tree, group, "time").sel(mesh=["coarse/0.8", "true/0.0", "still/1"])
+        assert np.array_equal(times.values, [0.8, 0.0, np.nan], equal_nan=True)
+
+
+def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) -> None:
+    for number in (2, 10, 1):
+        ball = sb.icosphere(1)
+        (tmp_path / f"frame_{number}.off").write_bytes(off(ball.vertices * (1 + number / 50), ball.triangles.tolist()))
+
+    def study(**times: Any) -> sb.Study:
+        return sb.Study.from_table(
+            {
+                "study": {"name": "frames"},
+                "lattice": {"xi_max": 2.0, "M": 24},
+                "norm": {"orders": [-4.0]},
+                "reference": {"source": "sphere"},
+                "family": [{"name": "frames", "source": "files", "paths": ["*.off"], **times}],
+            },
+            folder=tmp_path,
+        )
+
+    store = tmp_path / "frames.zarr"
+    sb.run(study(), store, client)
+    with pytest.raises(sb.InputError, match="no mesh of the store has a time"):
+        sb.evolution(store)
+    assert sb.run(study(times="names"), store, client).computed == ()
+    assert sb.evolution(store)["time"].values.tolist() == [1.0, 2.0, 10.0]
+    assert sb.run(study(times=[0.1, 0.2, 0.5]), store, client).computed == ()
+    found = sb.evolution(store, -4.0)
+    assert found["time"].values.tolist() == [0.1, 0.2, 0.5]
+    table = sb.table(store).set_index("mesh")["distance"]
+    assert found["distance"].values.ravel().tolist() == [table[f"frames/frame_{number}"] for number in (1, 2, 10)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"factor": 1.0}, "the factor must be larger than 1, found 1.0"),
+        ({"truth": "still"}, "no family 'still' has times, only coarse, late, true"),
+        ({"order": -3.0}, "the store has no order -3"),
+    ],
+)
+def test_wrong_questions(store: Path, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(sb.InputError, match=message):
+        sb.evolution(store, **arguments)
