@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,7 +28,10 @@ from sobolev_batch.spectral.metrics.inputs import Operand
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
-# A finer mesh has at most so many times the triangles of the one before.
+# While the goal is so many times as large, all edges are split. A choice of triangles came no nearer then: fits pull
+# vertices to where they are needed, and even splits leave better triangles.
+_EVEN_ABOVE = 4
+# Then a finer mesh has at most so many times the triangles of the one before.
 _GROWTH = 2.0
 # The last factor may be a little larger, instead of a round for few triangles.
 _LAST_GROWTH = 1.15
@@ -53,9 +55,10 @@ def refine(
 ) -> Fit:
     """Split edges of a mesh where that lowers its Sobolev distance from a target most, and move its vertices.
 
-    The mesh is fitted, the number of its triangles at most doubled, and so on. An edge is split where the squared
-    distance would change most if its middle moved by a fraction of its length: where the derivative with respect to a
-    vertex there, times the length, is largest. An interrupt (Ctrl-C) ends with the best mesh so far.
+    The mesh is fitted, the number of its triangles at most doubled, and so on. Triangles are split where the squared
+    distance would change most if the middles of their edges moved by a fraction of the length: where the derivative
+    with respect to a vertex there, times the length, is largest. While the goal is at least four times as large, all
+    triangles are split. An interrupt (Ctrl-C) ends with the best mesh so far.
 
     Args:
         mesh: Mesh to start from. Vertices at one place become one.
@@ -141,31 +144,40 @@ class _Refinement:
     ) -> tuple[FitTask, Mesh, Run]:
         """Return the last task, the prepared mesh at its end and its run, with the steps of all rounds."""
         between = replace(self.settings, steps=min(_STEPS_BETWEEN, self.settings.steps))
-        rounds = math.ceil(math.log(self.triangles / len(task.start.triangles), _GROWTH))
-        total, taken, goal = rounds * between.steps + self.settings.steps, 0, self.triangles
+        goals, taken = self._goals(len(task.start.triangles)), 0
+        total = between.steps * len(goals) + self.settings.steps
 
         def counted(progress: FitProgress) -> None:
             if notify is not None:
                 notify(FitProgress(taken + progress.step, total, progress.relative))
 
-        while True:
-            count = len(task.start.triangles)
-            is_last = count >= goal
-            fitted, run = (task if is_last else replace(task, settings=between)).run(counted)
+        for goal in goals:
+            fitted, run = replace(task, settings=between).run(counted)
             taken += run.taken
             run.taken = taken
-            if is_last or run.end is End.INTERRUPTED:
-                return task, fitted, run
-            wanted = goal if goal <= _LAST_GROWTH * _GROWTH * count else round(_GROWTH * count)
-            try:
-                finer = self._split(task, fitted, wanted)
-                task = self._task(finer)
-            except KeyboardInterrupt:
-                run.end = End.INTERRUPTED
-                return task, fitted, run
-            # Splits come in groups, so a few triangles may be out of reach.
-            if wanted == goal or len(finer.triangles) == count:
-                goal = len(finer.triangles)
+            if run.end is not End.INTERRUPTED:
+                try:
+                    task = self._task(self._split(task, fitted, goal))
+                    continue
+                except KeyboardInterrupt:
+                    run.end = End.INTERRUPTED
+            return task, fitted, run
+        fitted, run = task.run(counted)
+        run.taken += taken
+        return task, fitted, run
+
+    def _goals(self, count: int) -> list[int]:
+        """Return the number of triangles after each split of a mesh of so many triangles."""
+        goals = []
+        while count < self.triangles:
+            if count * _EVEN_ABOVE <= self.triangles:
+                count *= 4
+            elif count * _GROWTH * _LAST_GROWTH >= self.triangles:
+                count = self.triangles
+            else:
+                count = round(_GROWTH * count)
+            goals.append(count)
+        return goals
 
     def _task(self, mesh: Mesh) -> FitTask:
         return FitTask.of(mesh, self.target, self.lattice, self.settings, self.execution)
@@ -174,10 +186,12 @@ class _Refinement:
         """Return the fitted mesh, at the place that was given, with the edges split where that helps most."""
         mesh = task.own(fitted)
         edges = Edges.of(mesh)
+        if triangles >= 4 * len(mesh.triangles):
+            return edges.split(np.ones(len(edges.ends), dtype=bool))
         scores = edges.lengths * np.linalg.norm(self._derivatives(edges), axis=1)
         if self.settings.keep_boundary:
             scores[edges.on_boundary] = 0.0
-        return edges.split(edges.best(scores, triangles))
+        return edges.split(edges.best(scores[edges.sides].sum(axis=1), triangles))
 
     def _derivatives(self, edges: Edges) -> NDArray[np.float64]:
         """Return the derivative with respect to a vertex at the middle of each edge, (e, 3)."""

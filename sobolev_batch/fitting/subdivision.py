@@ -49,12 +49,16 @@ class Edges:
         return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
 
     def best(self, scores: Reals, triangles: int) -> Marks:
-        """Mark the edges of the largest scores, as many as lead to at most so many triangles.
+        """Mark the edges of the triangles with the largest scores, as many as lead to at most so many triangles.
 
         Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner.
 
         Source: M. C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques"
         (1984), doi:10.1002/nme.1620200412.
+
+        Args:
+            scores: Score of each triangle (m,).
+            triangles: Number of triangles to stay at or below.
         """
         order = np.argsort(-scores, kind="stable")
         fewest, most = 0, len(order)
@@ -94,11 +98,11 @@ class Edges:
         cut = [np.stack(corners, axis=1)[chosen] for chosen, pieces_of in pieces for corners in pieces_of]
         return Mesh(vertices, np.concatenate(cut))
 
-    def _completed(self, edges: Indices) -> Marks:
-        """Mark edges, and the longest edge of every triangle that has a marked one."""
+    def _completed(self, chosen: Indices) -> Marks:
+        """Mark the edges of triangles, and the longest edge of every triangle that has a marked one."""
         longest = np.take_along_axis(self.sides, self.lengths[self.sides].argmax(axis=1)[:, None], axis=1)[:, 0]
         marks = np.zeros(len(self.ends), dtype=bool)
-        added = edges
+        added = self.sides[chosen].ravel()
         while len(added):
             marks[added] = True
             touched = longest[marks[self.sides].any(axis=1)]
