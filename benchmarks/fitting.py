@@ -20,13 +20,17 @@ _CORTEX_FITS = (
 
 
 def fits(effort: Effort) -> Iterator[Row]:
-    """Item 11: value and derivative against the value alone, and fits of the cortex and of an ellipsoid."""
+    """Item 11: value and derivative against the value alone, and fits of the cortex and of an ellipsoid.
+
+    The cortex is refined too, and compared with quadric decimation to as many triangles.
+    """
     for level, intervals in ((2, 16), (2, 24)) if effort.quick else ((5, 64), (6, 64), (3, 128)):
         yield _derivative(level, intervals, effort)
     for triangles, order, ratios, most_seconds in _CORTEX_FITS:
         start, target = pair_of_cortex(effort, triangles)
         what = f"{len(start.triangles):,} against {len(target.triangles):,} triangles, fitted at order {order:g}"
         yield from _fit(what, start, target, order, ratios, most_seconds, effort)
+    yield from _refinement(effort)
     ellipsoid = sb.Ellipsoid((1.0, 0.8, 0.6))
     level = 1 if effort.quick else 3
     yield from _fit(
@@ -68,3 +72,18 @@ def _fit(
     if np.isfinite(after_worst):
         text = f"{what}: Hausdorff distance, against the start"
         yield Row("11", text, f"{after_worst:.3g}", f"{before_worst:.3g}", after_worst / before_worst, at_most(1.5))
+
+
+def _refinement(effort: Effort) -> Iterator[Row]:
+    (start, target), (decimated, _) = (pair_of_cortex(effort, triangles) for triangles in (320, 1280))
+    triangles = 2 * len(start.triangles) if effort.quick else len(decimated.triangles)
+    found: list[sb.Fit] = []
+    seconds = elapsed_seconds(lambda: found.append(sb.refine(start, target, -2.0, triangles=triangles)))
+    what = f"{len(start.triangles):,} triangles refined to {triangles:,} at order -2"
+    for order in (-2.0, -4.0):
+        ours, theirs = (
+            sb.distance(mesh, target, order, rtol=1e-2)["distance"].item() for mesh in (found[0].mesh, decimated)
+        )
+        text = f"{what}: distance at order {order:g}, against decimation to as many"
+        yield Row("11", text, f"{ours:.3g}", f"{theirs:.3g}", ours / theirs)
+    yield Row("11", f"{what}: seconds, {found[0].steps} steps", as_seconds(seconds), "", seconds)

@@ -339,6 +339,19 @@ def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(balls: Path) -> None:
     assert fitted.area == pytest.approx(4 * 3.14159265 * 31.0**2, rel=0.01)
 
 
+def test_fit_refines_to_a_number_of_triangles(balls: Path) -> None:
+    arguments = ("start.ply", "target.ply", "-o", "fitted.ply", "--refine-to", "500", "--order", "-4", "--steps", "5")
+    done = call("fit", *arguments, folder=balls)
+    assert done.returncode == 0, done.stderr
+    found = re.match(r"(\d+) triangles; \d+ steps; all steps are taken\n", done.stdout)
+    assert found is not None
+    assert 480 < int(found[1]) <= 500
+    fitted = trimesh.load_mesh(balls / "fitted.ply")
+    assert len(fitted.faces) == int(found[1])
+    assert fitted.is_watertight
+    assert fitted.bounds.mean(axis=0) == pytest.approx([100.0, 0, 0], abs=0.1)
+
+
 def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
     # So fine that a step takes longer than this process to hear of one.
     ball = icosphere(5)
@@ -375,6 +388,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
         (("start.ply", "target.ply", "-o", "f.ply", "--order", "-0.4"), "only for orders below -1/2, found -0.4"),
         (("start.ply", "target.ply", "-o", "f.ply", "--steps", "0"), "steps must be a whole number from 1 on"),
         (("lost.ply", "target.ply", "-o", "f.ply"), "lost.ply"),
+        (("start.ply", "target.ply", "-o", "f.ply", "--refine-to", "320"), "320 triangles already: ask for more than"),
     ],
 )
 def test_a_fit_that_cannot_be_is_refused_in_one_line(balls: Path, arguments: tuple[str, ...], message: str) -> None:
