@@ -27,7 +27,7 @@ PAGES = {
     **{
         f"docs/{name}.md": f"{name}.html"
         for name in (
-            *("tutorial", "studies", "surfaces", "fitting", "moving", "queries", "store", "numerics"),
+            *("tutorial", "studies", "surfaces", "fitting", "reconstruction", "moving", "queries", "store", "numerics"),
             *("clusters", "scale", "reliability", "stability", "design"),
         )
     },

@@ -1,4 +1,4 @@
-"""The examples of docs/fitting.md and docs/moving.md run as printed, and do what the pages say."""
+"""The examples of docs/fitting.md, reconstruction.md and moving.md run as printed, and do what the pages say."""
 
 from __future__ import annotations
 
@@ -31,6 +31,15 @@ def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.Mo
     # Inscribed, the mesh lacks area everywhere: the distance falls outwards.
     outwards = (results["found"]["gradient"].sel(order=-4.0).values * start.vertices).sum(axis=1)
     assert (outwards < 0).all()
+
+
+def test_the_page_of_reconstruction_runs_and_finds_the_shape() -> None:
+    results = run_blocks("docs/reconstruction.md")
+    assert results["found"].after.distance < results["found"].before.distance / 50
+    shape, mesh = results["shape"], results["found"].mesh
+    # The ears are there: their tips are where no point of the ball was.
+    tips = np.asarray(shape.vertices)[np.linalg.norm(shape.vertices, axis=1) > 0.95]
+    assert np.linalg.norm(np.asarray(mesh.vertices)[:, None] - tips, axis=2).min(axis=0).max() < 0.12
 
 
 def test_the_page_about_surfaces_that_move_runs(
