@@ -113,7 +113,16 @@ def plot_evolution(
         InputError: See `evolution`.
 
     >>> import sobolev_batch as sb
-    >>> ax = sb.plot_evolution("memory://wound-up.zarr")  # the study of the example of `evolution`
+    >>> ball = {"source": "icosphere", "levels": [2]}
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "carried"},
+    ...     "lattice": {"xi_max": 2.0, "M": 20},
+    ...     "norm": {"orders": [-4.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "carried", "source": "flow", "times": [0, 1, 2], "mesh": ball}],
+    ... })
+    >>> _ = sb.run(study, "memory://carried.zarr")
+    >>> ax = sb.plot_evolution("memory://carried.zarr")
     >>> ax.get_xlabel()
     'time'
     """
