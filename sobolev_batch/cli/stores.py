@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -120,8 +119,12 @@ def table_command(
         raise click.UsageError("--matrix and --over-time are two tables: ask for one of them")
     if truth is not None and not over_time:
         raise click.UsageError("--truth belongs to --over-time")
-    form = partial(format_evolution, truth=truth, factor=factor) if over_time else format_table
-    click.echo((format_matrix if matrix else form)(open_store(store), style, orders or None))
+    tree, chosen = open_store(store), orders or None
+    if over_time:
+        click.echo(format_evolution(tree, style, chosen, truth=truth, factor=factor))
+    else:
+        form = format_matrix if matrix else format_table
+        click.echo(form(tree, style, chosen))
 
 
 @cli.command("plot")

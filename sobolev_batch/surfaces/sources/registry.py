@@ -114,7 +114,7 @@ class Member(ABC):
         level: Refinement level, or rank from coarse to fine; -1 where the source has no such order.
         time: Time of the surface, in a unit of the user's choice; None where the source has no time.
 
-    >>> from dataclasses import dataclass, field
+    >>> from dataclasses import dataclass
     >>> import sobolev_batch as sb
     >>> @dataclass(frozen=True)
     ... class TorusMember(sb.Member):
