@@ -12,6 +12,7 @@ from benchmarks.devices import on_a_gpu
 from benchmarks.fitting import fits
 from benchmarks.low_orders import low_orders
 from benchmarks.memory import peaks
+from benchmarks.reconstruction import reconstructions
 from benchmarks.scale import tiny_meshes
 from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
@@ -30,6 +31,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "9": on_a_gpu,
     "10": low_orders,
     "11": fits,
+    "12": reconstructions,
     "growth": growth,
     "scale": tiny_meshes,
 }
@@ -47,7 +49,7 @@ def main() -> None:
     facts = [
         *machine_facts(),
         f"times are medians of {effort.repeats} turns each, taken alternately",
-        "items 1 to 4: ratios of times are other / ours; items 5 to 7, 9 and 11: ours / other; item 10: processor "
+        "items 1 to 4: ratios of times are other / ours; items 5 to 7, 9, 11 and 12: ours / other; item 10: processor "
         "seconds, and other / ours against sums; "
         "distances: relative difference",
     ]

@@ -1,11 +1,12 @@
-"""Parameters of the public interface: sizes of memory, and names that were spelt differently before."""
+"""Parameters of the public interface: whole numbers, sizes of memory, and names that were spelt differently before."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from numbers import Integral
+from typing import ParamSpec, TypeGuard, TypeVar
 
 from pydantic import ByteSize, TypeAdapter, ValidationError
 
@@ -15,6 +16,16 @@ P = ParamSpec("P")
 Result = TypeVar("Result")
 
 _BYTE_SIZE = TypeAdapter(ByteSize)
+
+
+def is_whole_number(value: object) -> TypeGuard[int]:
+    """Return whether a value is an integer of Python or NumPy, and no truth value.
+
+    >>> import numpy as np
+    >>> is_whole_number(np.int64(3)), is_whole_number(True), is_whole_number(3.0)
+    (True, False, False)
+    """
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def byte_count(memory: float | str) -> int:

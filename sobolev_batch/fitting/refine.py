@@ -23,6 +23,7 @@ from sobolev_batch.fitting.optimisation.stages import (
 )
 from sobolev_batch.fitting.subdivision import Edges
 from sobolev_batch.fitting.task import FitTask, welded
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand
 from sobolev_batch.spectral.transform.settings import Execution
@@ -133,7 +134,7 @@ class _Refinement:
         """
         require_mesh(mesh)
         count, goal = len(mesh.triangles), self.triangles
-        if isinstance(goal, bool) or not isinstance(goal, int) or not 1 <= goal <= MOST_TRIANGLES:
+        if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
             raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
         if count >= goal:
             raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")

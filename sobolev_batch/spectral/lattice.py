@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from sobolev_batch.errors import LatticeError
+from sobolev_batch.parameters import is_whole_number
 
 # Beyond this a field takes more than 34 GB even in single precision.
 LARGEST_M = 2048
@@ -175,8 +176,10 @@ class Lattice(FrequencyLattice):
                 f"xi_max must lie between {_LOWEST_XI_MAX:g} and {1 / _LOWEST_XI_MAX:g}, found {self.xi_max:g}; "
                 "choose another unit of length"
             )
-        if isinstance(self.M, bool) or not isinstance(self.M, int) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
+        if not is_whole_number(self.M) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
             raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
+        # Not NumPy's, whose products may overflow.
+        object.__setattr__(self, "M", int(self.M))
 
     @property
     def spacing(self) -> float:

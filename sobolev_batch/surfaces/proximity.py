@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 DEFAULT_POINTS = 10_000
@@ -62,7 +63,7 @@ def proximity(a: Mesh, b: Mesh, *, points: int = DEFAULT_POINTS, seed: int = 0) 
     >>> f"{distances.hausdorff:.6f} {distances.chamfer:.6f}"
     '0.250000 0.500000'
     """
-    if isinstance(points, bool) or not isinstance(points, int) or not 1 < points <= MOST_POINTS:
+    if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
     try:
         import pyvista

@@ -12,6 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.optimisation.descent import End, descend
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.smoothing import Smoothing
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.shells import single_order
 
 Reals = NDArray[np.float64]
@@ -51,8 +52,9 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "order", single_order(self.order))
-        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
+        if not is_whole_number(self.steps) or self.steps < 1:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
+        object.__setattr__(self, "steps", int(self.steps))
         is_number = isinstance(self.smoothing, int | float) and not isinstance(self.smoothing, bool)
         if not is_number or not 0 <= self.smoothing < np.inf:
             raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
@@ -113,7 +114,7 @@ def _edges(bands: int | Sequence[float] | None, lattice: Lattice) -> Reals:
         octaves = max(1, int(np.log2(lattice.M / 4)) + 1)
         inner = lattice.xi_max / 2.0 ** np.arange(octaves - 1, -1, -1)
         return np.array([0.0, *inner, lattice.highest_frequency])
-    if isinstance(bands, int) and not isinstance(bands, bool):
+    if is_whole_number(bands):
         if bands < 1:
             raise InputError(f"there must be at least one band, found {bands}")
         return np.linspace(0.0, lattice.highest_frequency, bands + 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import trimesh
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # 20 * 4^12 is 335 million triangles, some 24 GB of indices and corners: a finer level is a typing error.
@@ -27,7 +28,7 @@ def icosphere(level: int) -> Mesh:
     >>> sb.icosphere(2)
     Mesh(162 vertices, 320 triangles)
     """
-    if isinstance(level, bool) or not isinstance(level, int) or not 0 <= level <= FINEST_LEVEL:
+    if not is_whole_number(level) or not 0 <= level <= FINEST_LEVEL:
         raise InputError(f"an icosphere's level must be an integer from 0 to {FINEST_LEVEL}, found {level!r}")
-    sphere = trimesh.creation.icosphere(subdivisions=level, radius=1.0)
+    sphere = trimesh.creation.icosphere(subdivisions=int(level), radius=1.0)
     return Mesh(sphere.vertices, sphere.faces)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.surfaces.shapes.interval import Interval
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth
@@ -105,14 +106,15 @@ class Torus(Smooth):
         Raises:
             InputError: The counts are not integers of at least 3, or make more than a billion triangles.
         """
-        counts = around, across
-        if not all(isinstance(n, int) and not isinstance(n, bool) and n >= 3 for n in counts):
+        if not all(is_whole_number(n) and n >= 3 for n in (around, across)):
             raise InputError(f"a grid of a torus needs at least 3 cells each way, found {around!r} and {across!r}")
+        # Not NumPy's, whose products may overflow.
+        around, across = int(around), int(across)
         if 2 * around * across > MOST_TRIANGLES:
             raise InputError(f"a grid of a torus has at most {MOST_TRIANGLES} triangles, found {2 * around * across}")
-        angles = (2 * math.pi / n * np.arange(n) for n in counts)
+        angles = (2 * math.pi / n * np.arange(n) for n in (around, across))
         vertices = self.positions(*np.meshgrid(*angles, indexing="ij")).reshape(3, -1).T
-        corner = np.arange(around * across).reshape(counts)
+        corner = np.arange(around * across).reshape(around, across)
         ahead, above = np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=1)
         opposite = np.roll(ahead, -1, axis=1)
         cells = np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1)

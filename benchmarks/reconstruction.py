@@ -1,0 +1,186 @@
+"""What a Fourier field knows of its surface: a ball and an egg are fitted to it.
+
+``python -m benchmarks.reconstruction FILE ... --pictures FOLDER`` does the same with own meshes, and draws each fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import sobolev_batch as sb
+from benchmarks.table import Row, as_seconds, format_table
+from benchmarks.timing import Effort, elapsed_seconds
+from sobolev_batch.results.meshes.render import render
+from sobolev_batch.results.meshes.views import MeshView
+
+_MEASURED_AT = (-2.0, -4.0)
+# Steps after which a fit is drawn.
+_STAGES = (5, 20, 60, 150)
+# Of pictures, which are seen from the front and above.
+_RIGHT = np.array([1.4, 1.25, 0.0]) / np.hypot(1.4, 1.25)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A fit to the field of a target.
+
+    Attributes:
+        what: target and start, in words.
+        target: makes the mesh whose field is known.
+        start: makes the mesh that is fitted.
+        orders: of the fits.
+    """
+
+    what: str
+    target: Callable[[], sb.Mesh]
+    start: Callable[[], sb.Mesh]
+    orders: tuple[float, ...] = (-2.0,)
+
+    def stages(self, order: float, steps: Sequence[int], effort: Effort) -> list[sb.Fit]:
+        """The fits with so many steps each."""
+        lattice = sb.Lattice(4.0, 24) if effort.quick else sb.Lattice(8.0, 96)
+        field = sb.fourier_transform(self.target(), lattice)
+        return [sb.fit(self.start(), field, order, steps=some) for some in steps]
+
+
+def reconstructions(effort: Effort) -> Iterator[Row]:
+    """Item 12: fits of a ball and an egg to fields of a head with two ears, of a thin ellipsoid and of a torus."""
+    ball, egg = partial(_ball, effort), partial(_egg, effort)
+    ears = partial(head_with_ears, 3 if effort.quick else 6)
+    targets = (
+        Reconstruction("a head with two ears, from a ball", ears, ball, (-2.0,) if effort.quick else (-4, -3, -2, -1)),
+        Reconstruction("a head with two ears, from an egg", ears, egg),
+        Reconstruction("an ellipsoid with a semi-axis of 0.03, from a ball", partial(_thin, effort), ball),
+        Reconstruction("a torus, from a ball", lambda: sb.Torus(0.7, 0.3).mesh(96, 48), ball),
+    )
+    for reconstruction in targets[: 1 if effort.quick else None]:
+        for order in reconstruction.orders:
+            yield from _rows(reconstruction, order, effort)
+
+
+def head_with_ears(level: int) -> sb.Mesh:
+    """A ball with two ears, a nose and a tail, in the unit ball; its triangles are those of an icosphere."""
+    ball = sb.icosphere(level)
+    bumps = (
+        (0.55, 40.0, (0.35, 0.25, 1.0)),
+        (0.55, 40.0, (0.35, -0.25, 1.0)),
+        (0.3, 8.0, (1.0, 0.0, 0.5)),
+        (0.15, 60.0, (-1.0, 0.0, -0.2)),
+    )
+    radii = 0.55 + sum(
+        height * np.exp(-sharpness * (1 - ball.vertices @ (np.array(place) / np.linalg.norm(place))))
+        for height, sharpness, place in bumps
+    )
+    head = sb.Mesh(ball.vertices * np.asarray(radii)[:, None], ball.triangles)
+    return sb.Similarity.to_unit_ball(head).apply(head)
+
+
+def _ball(effort: Effort) -> sb.Mesh:
+    ball = sb.icosphere(2 if effort.quick else 4)
+    return ball.moved(0.6, (0.0, 0.0, 0.0))
+
+
+def _egg(effort: Effort) -> sb.Mesh:
+    return sb.Ellipsoid((0.9, 0.6, 0.6)).mesh(2 if effort.quick else 4)
+
+
+def _thin(effort: Effort) -> sb.Mesh:
+    return sb.Ellipsoid((1.0, 1.0, 0.03)).mesh(3 if effort.quick else 6)
+
+
+def _rows(reconstruction: Reconstruction, order: float, effort: Effort) -> Iterator[Row]:
+    found: list[sb.Fit] = []
+    steps = [5 if effort.quick else _STAGES[-1]]
+    seconds = elapsed_seconds(lambda: found.extend(reconstruction.stages(order, steps, effort)))
+    (fit,), target, start = found, reconstruction.target(), reconstruction.start()
+    what = f"{reconstruction.what}, fitted at order {order:g}"
+    for measured in _MEASURED_AT:
+        norm = sb.norm(target, measured, rtol=0.05)["norm"].item()
+        before, after = (
+            sb.distance(mesh, target, measured, rtol=0.05)["distance"].item() / norm for mesh in (start, fit.mesh)
+        )
+        text = f"{what}: relative distance at order {measured:g}, against the start"
+        yield Row("12", text, f"{after:.3g}", f"{before:.3g}", after / before)
+    near, far = sb.proximity(fit.mesh, target), sb.proximity(start, target)
+    for name, after, before in (("Hausdorff", near.hausdorff, far.hausdorff), ("Chamfer", near.chamfer, far.chamfer)):
+        yield Row("12", f"{what}: {name} distance, against the start", f"{after:.3g}", f"{before:.3g}", after / before)
+    angle, even = fit.after.smallest_angle, fit.before.smallest_angle
+    yield Row("12", f"{what}: smallest angle in degrees", f"{angle:.3g}", f"{even:.3g}", angle / even)
+    yield Row("12", f"{what}: seconds, {fit.steps} steps", as_seconds(seconds))
+
+
+def main() -> None:
+    """Fit a ball and an egg to meshes in files, print a table and draw stages."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.reconstruction", description=__doc__)
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="meshes; a head with two ears without any")
+    parser.add_argument("--orders", nargs="+", type=float, default=[-4.0, -2.0], metavar="S", help="[-4 -2]")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each fit there, stage by stage")
+    parser.add_argument("--quick", action="store_true", help="small sizes that only show that everything works")
+    options = parser.parse_args()
+    effort = Effort(1, options.quick, large=False)
+    targets = {path.stem: partial(_unit, path) for path in options.files} or {
+        "ears": partial(head_with_ears, 3 if effort.quick else 6)
+    }
+    rows: list[Row] = []
+    for name, target in targets.items():
+        for start_name, start in (("ball", partial(_ball, effort)), ("egg", partial(_egg, effort))):
+            reconstruction = Reconstruction(f"{name}, start: {start_name}", target, start)
+            for order in options.orders:
+                if options.pictures:
+                    path = options.pictures / f"{name}-{start_name}{order:g}.png"
+                    _draw(reconstruction, order, effort, path)
+                for row in _rows(reconstruction, order, effort):
+                    print("  ".join(filter(None, row.cells())), file=sys.stderr, flush=True)
+                    rows.append(row)
+    print(format_table(rows))
+
+
+def _unit(path: Path) -> sb.Mesh:
+    mesh = sb.read_mesh(path)
+    return sb.Similarity.to_unit_ball(mesh).apply(mesh)
+
+
+def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Path) -> None:
+    steps = _STAGES[:1] if effort.quick else _STAGES
+    meshes = {
+        "start": reconstruction.start(),
+        **{
+            f"{some} steps": fit.mesh
+            for some, fit in zip(steps, reconstruction.stages(order, steps, effort), strict=True)
+        },
+        "target": reconstruction.target(),
+    }
+    (pictures,) = render([_row(list(meshes.values()))], 1, side=500 * len(meshes))
+    height, width = pictures.shape[1:3]
+    figure = Figure(figsize=(width / 200, height / 200 + 0.5))
+    axes = figure.add_axes((0.0, 0.0, 1.0, height / (height + 100)), frameon=False, xticks=[], yticks=[])
+    axes.imshow(pictures[0])
+    for i, (name, mesh) in enumerate(meshes.items()):
+        place = ((i + 0.5) / len(meshes), 1.0)
+        text = f"{name}\n{len(mesh.triangles):,} triangles"
+        axes.annotate(text, place, xycoords="axes fraction", ha="center", va="bottom", fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def _row(meshes: Sequence[sb.Mesh]) -> MeshView:
+    """Meshes of the unit ball side by side, all grey: their witness function is given as zero."""
+    places = [2.1 * i * _RIGHT for i in range(len(meshes))]
+    vertices = np.concatenate([mesh.vertices + place for mesh, place in zip(meshes, places, strict=True)])
+    before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    triangles = np.concatenate(
+        [mesh.triangles + number for mesh, number in zip(meshes, before[:-1], strict=True)], dtype=np.int32
+    )
+    return MeshView("", vertices, triangles, np.zeros((1, len(vertices))), (-2.0,), len(triangles))
+
+
+if __name__ == "__main__":
+    main()
