@@ -35,6 +35,7 @@ from sobolev_batch.results.tables.groups import (
     complete_meshes,
     families_of,
     finished_group,
+    has_times,
     reference_of,
 )
 from sobolev_batch.results.tables.matrix import Matrix
@@ -301,8 +302,8 @@ def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
     """
     orders = chosen_orders(finished_group(tree, "convergence"), None)
     figures = {"convergence.png": convergence_figure(tree, orders)}
-    if "time" in tree["meshes"].coords:
-        figures["over-time.png"] = panels(orders, _CONVERGENCE_INCHES, partial(plot_evolution, tree))
+    if has_times(tree):
+        figures["over-time.png"] = evolution_figure(tree, orders)
     if families := list(_complete_members(tree)):
         figures["transform.png"] = panels(families, _TRANSFORM_INCHES, partial(plot_transform, tree))
     if has_pairs(tree):
@@ -315,6 +316,11 @@ def write_plots(tree: xr.DataTree, folder: str | Path) -> tuple[Path, ...]:
 def convergence_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
     """Return `plot_convergence` for each order."""
     return panels(orders, _CONVERGENCE_INCHES, partial(plot_convergence, tree))
+
+
+def evolution_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:
+    """Return `plot_evolution` for each order."""
+    return panels(orders, _CONVERGENCE_INCHES, partial(plot_evolution, tree))
 
 
 def matrix_figure(tree: xr.DataTree, orders: Sequence[float]) -> Figure:

@@ -17,6 +17,7 @@ from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.plots import (
     convergence_figure,
+    evolution_figure,
     has_pairs,
     map_figure,
     matrix_figure,
@@ -31,7 +32,7 @@ from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.report.charts import chart_data
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.groups import finished_group
+from sobolev_batch.results.tables.groups import finished_group, has_times
 
 _PAGE = "page"
 # Orders that printed pictures show; more would make the page heavy.
@@ -159,12 +160,15 @@ def _pictures(tree: xr.DataTree, spectra: Spectra | None, views: Views) -> dict[
         "convergence": one_for_each_order(
             "Relative distance over mean edge length", lambda orders: convergence_figure(tree, orders)
         ),
+        "evolution": [],
         "matrix": [],
         "map": [],
         "spectrum": [],
         "energy": [],
         "witness": _witness_pictures(views),
     }
+    if has_times(tree):
+        pictures["evolution"] = one_for_each_order("Distance over time", lambda orders: evolution_figure(tree, orders))
     if has_pairs(tree):
         pictures["matrix"] = one_for_each_order("Distances of all pairs", lambda orders: matrix_figure(tree, orders))
         pictures["map"] = one_for_each_order("Map of the meshes", lambda orders: map_figure(tree, orders))

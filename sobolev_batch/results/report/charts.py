@@ -15,8 +15,9 @@ from sobolev_batch.results.figures.spectra import Spectra
 from sobolev_batch.results.meshes.views import MeshView, Views
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.formatting import minus
-from sobolev_batch.results.tables.groups import complete_meshes, families_of, finished_group, reference_of
+from sobolev_batch.results.tables.groups import complete_meshes, families_of, finished_group, has_times, reference_of
 from sobolev_batch.results.tables.matrix import Matrix
 
 Json = dict[str, Any]
@@ -33,6 +34,7 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits:
         "families": list(dict.fromkeys(families_of(tree).values())),
         "reference": reference_of(tree),
         "convergence": _convergence(tree, orders, limits.points // len(orders)),
+        "evolution": _evolution(tree, limits.points // len(orders)),
         "matrix": _matrices(tree, orders, limits),
         "spectrum": None if spectra is None else _spectra(spectra),
         "energy": None if spectra is None else _energy(spectra, families_of(tree)),
@@ -63,6 +65,28 @@ def _family(family: str, rows: Any) -> Json:
         "values": _numbers(rows["relative"]),
         "errors": _numbers(rows["relative_error"]),
     }
+
+
+def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
+    """Return for each order and family that moves the distances over time; None if there is none, or too many times."""
+    if not has_times(tree):
+        return None
+    found = evolution(tree)
+    if found.sizes["family"] * found.sizes["time"] > most:
+        return None
+    return [
+        [
+            {
+                "family": family,
+                "times": line["time"].values.tolist(),
+                "values": _numbers(line["distance"].values),
+                "errors": _numbers(line["error"].values, digits=2),
+            }
+            for family in found["family"].values.tolist()
+            for line in [found.sel(order=order, family=family).dropna("time", subset=["distance"])]
+        ]
+        for order in found["order"].values
+    ]
 
 
 def _matrices(tree: xr.DataTree, orders: list[float], limits: ReportLimits) -> Json | None:

@@ -54,6 +54,11 @@ def families_of(tree: xr.DataTree) -> dict[str, str]:
     return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
 
 
+def has_times(tree: xr.DataTree) -> bool:
+    """Return True if any mesh of the store has a time."""
+    return "time" in finished_group(tree, "meshes", load=False).coords
+
+
 def complete_meshes(tree: xr.DataTree) -> list[str]:
     """Return the labels of all meshes that are computed, the reference among them."""
     meshes = finished_group(tree, "meshes", load=False)

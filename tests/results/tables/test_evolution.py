@@ -14,6 +14,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.results.tables.evolution import format_evolution
+from tests.support.browser import browser
 from tests.support.commands import call
 from tests.support.members import loaded, members
 from tests.support.mesh_files import off
@@ -156,6 +157,24 @@ def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) ->
     assert found["time"].values.tolist() == [0.1, 0.2, 0.5]
     table = sb.table(store).set_index("mesh")["distance"]
     assert found["distance"].values.ravel().tolist() == [table[f"frames/frame_{number}"] for number in (1, 2, 10)]
+
+
+def test_a_report_draws_them(store: Path, tmp_path: Path) -> None:
+    page = sb.report(store, tmp_path / "moving.html")
+    found = sb.evolution(store)
+    with browser(tmp_path / "profile") as reader:
+        reader.open(page)
+        assert reader.tell("document.getElementById('chart-evolution').data.map(line => line.name)") == [
+            "coarse",
+            "late",
+            "true",
+        ]
+        late = found.sel(family="late", order=-2.0).dropna("time", subset=["distance"])
+        assert reader.tell("document.getElementById('chart-evolution').data[1].x") == [0.4, 0.8, 1.2]
+        assert reader.tell("document.getElementById('chart-evolution').data[1].y") == pytest.approx(
+            late["distance"].values, rel=1e-3
+        )
+        assert reader.complaints() == []
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,21 @@
     });
   };
 
+  const evolution = () => {
+    const traces = data.evolution[state.order].map(({ family, times, values, errors }) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), x: times, y: values, error_y: bars(values, errors),
+      line: { color: series(family), width: 1.8 },
+      marker: { color: series(family), symbol: symbol(family), size: 6 },
+      text: values.map((value, i) =>
+        `${plain(family)}<br>time ${times[i]}<br>distance ${number(value)} ± ${errors[i] ?? "?"}`),
+      hoverinfo: "text",
+    }));
+    draw("evolution", traces, {
+      xaxis: { type: "linear", title: { text: "time" } },
+      yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "distance" } },
+    });
+  };
+
   const matrix = () => {
     const { labels } = data.matrix;
     const { values, errors, clustered } = data.matrix.orders[state.order];
@@ -221,7 +236,7 @@
     }, space);
   };
 
-  const drawings = [convergence, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
+  const drawings = [convergence, data.evolution && evolution, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
     data.witness.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
