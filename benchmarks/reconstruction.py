@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="meshes; a head with two ears without any")
     parser.add_argument("--orders", nargs="+", type=float, default=[-4.0, -2.0], metavar="S", help="[-4 -2]")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each fit there, stage by stage")
+    parser.add_argument("--up", choices=["x", "y", "z"], default="z", help="axis of the meshes that points up [z]")
     parser.add_argument("--quick", action="store_true", help="small sizes that only show that everything works")
     options = parser.parse_args()
     effort = Effort(1, options.quick, large=False)
@@ -136,7 +137,7 @@ def main() -> None:
             for order in options.orders:
                 if options.pictures:
                     path = options.pictures / f"{name}-{start_name}{order:g}.png"
-                    _draw(reconstruction, order, effort, path)
+                    _draw(reconstruction, order, effort, path, options.up)
                 for row in _rows(reconstruction, order, effort):
                     print("  ".join(filter(None, row.cells())), file=sys.stderr, flush=True)
                     rows.append(row)
@@ -148,7 +149,7 @@ def _unit(path: Path) -> sb.Mesh:
     return sb.Similarity.to_unit_ball(mesh).apply(mesh)
 
 
-def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Path) -> None:
+def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Path, up: str) -> None:
     steps = _STAGES[:1] if effort.quick else _STAGES
     meshes = {
         "start": reconstruction.start(),
@@ -158,7 +159,7 @@ def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Pa
         },
         "target": reconstruction.target(),
     }
-    (pictures,) = render([_row(list(meshes.values()))], 1, side=500 * len(meshes))
+    (pictures,) = render([_row(list(meshes.values()), up)], 1, side=500 * len(meshes))
     height, width = pictures.shape[1:3]
     figure = Figure(figsize=(width / 200, height / 200 + 0.5))
     axes = figure.add_axes((0.0, 0.0, 1.0, height / (height + 100)), frameon=False, xticks=[], yticks=[])
@@ -171,10 +172,12 @@ def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Pa
     figure.savefig(path, dpi=110)
 
 
-def _row(meshes: Sequence[sb.Mesh]) -> MeshView:
+def _row(meshes: Sequence[sb.Mesh], up: str) -> MeshView:
     """Meshes of the unit ball side by side, all grey: their witness function is given as zero."""
     places = [2.1 * i * _RIGHT for i in range(len(meshes))]
-    vertices = np.concatenate([mesh.vertices + place for mesh, place in zip(meshes, places, strict=True)])
+    # A cyclic permutation of the axes mirrors nothing.
+    upright = [np.roll(mesh.vertices, "zyx".index(up), axis=1) for mesh in meshes]
+    vertices = np.concatenate([points + place for points, place in zip(upright, places, strict=True)])
     before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     triangles = np.concatenate(
         [mesh.triangles + number for mesh, number in zip(meshes, before[:-1], strict=True)], dtype=np.int32

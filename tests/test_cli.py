@@ -7,13 +7,18 @@ import os
 import pty
 import re
 import select
+import shlex
 import signal
 import subprocess
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 
+import sobolev_batch as sb
 from sobolev_batch import icosphere
 from tests.support.commands import COMMAND, STUDY, call, command
 from tests.support.drawing import obstacle
@@ -339,6 +344,63 @@ def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(balls: Path) -> None:
     assert fitted.area == pytest.approx(4 * 3.14159265 * 31.0**2, rel=0.01)
 
 
+def test_the_options_of_fit_reach_it(balls: Path) -> None:
+    ball = icosphere(2)
+    upper = ball.vertices[ball.triangles][:, :, 2].mean(axis=1) > 0.1
+    half = sb.Mesh(ball.vertices, ball.triangles[upper])
+    sb.write_mesh(half, balls / "half.ply")
+    sb.write_mesh(icosphere(4), balls / "ball.ply")
+    similarity = sb.Similarity.to_unit_ball(icosphere(4))
+    assert similarity.scale == pytest.approx(1, rel=1e-12)
+    sets: list[tuple[list[str], dict[str, Any]]] = [
+        (["--keep-boundary"], {"keep_boundary": True}),
+        (["--smoothing", "8"], {"smoothing": 8.0}),
+        (["--order", "-4"], {"order": -4.0}),
+        ([], {}),
+    ]
+    found = []
+    for options, settings in sets:
+        done = call("fit", "half.ply", "ball.ply", "-o", "out.ply", "--steps", "3", *options, folder=balls)
+        assert done.returncode == 0, done.stderr
+        expected = sb.fit(half, icosphere(4), **{"order": -2.0, **settings}, steps=3)
+        found.append(np.asarray(sb.read_mesh(balls / "out.ply").vertices))
+        np.testing.assert_allclose(found[-1], expected.mesh.vertices, rtol=0, atol=1e-3)
+        assert all(f"note: {remark}" in done.stdout for remark in expected.remarks)
+    assert min(np.abs(one - other).max() for one, other in combinations(found, 2)) > 4e-3
+
+
+def test_fit_keeps_the_unit_if_asked(balls: Path) -> None:
+    arguments = ("start.ply", "target.ply", "-o", "f.ply", "--steps", "1")
+    scaled, own = (call("fit", *arguments, *more, folder=balls).stdout for more in ((), ("--no-scaling",)))
+    numbers = [re.search(r"before: distance (\S+)", text) for text in (scaled, own)]
+    assert numbers[0] is not None
+    assert numbers[1] is not None
+    # The square root of a length of some 30 units, and more.
+    assert float(numbers[1][1]) > 5 * float(numbers[0][1])
+
+
+def test_fit_says_that_a_file_has_too_few_digits(balls: Path) -> None:
+    for name in ("start", "target"):
+        mesh = sb.read_mesh(balls / f"{name}.ply")
+        sb.write_mesh(mesh.moved(1.0, (-5e6, -4e5, 0.0)), balls / f"{name}.ply")
+    for suffix, is_enough in (("stl", False), ("ply", True)):
+        arguments = ("start.ply", "target.ply", "-o", f"far.{suffix}", "--steps", "1")
+        done = call("fit", *arguments, folder=balls)
+        assert done.returncode == 0, done.stderr
+        assert ("have too few digits: vertices are off by up to 0.2" in done.stdout) != is_enough
+
+
+def test_fit_leaves_an_old_file_until_the_new_one_is_whole(balls: Path) -> None:
+    before = (balls / "start.ply").read_bytes()
+    arguments = ["fit", "start.ply", "target.ply", "-o", "start.ply", "--refine-to", "20000", "--steps", "1"]
+    program = f"ulimit -f 300; exec {shlex.join([*COMMAND, *arguments])}"
+    done = subprocess.run(["bash", "-c", program], cwd=balls, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "start.ply: the mesh cannot be written there: File too large" in done.stderr
+    assert (balls / "start.ply").read_bytes() == before
+    assert sorted(path.name for path in balls.iterdir()) == ["start.ply", "target.ply"]
+
+
 def test_fit_refines_to_a_number_of_triangles(balls: Path) -> None:
     arguments = ("start.ply", "target.ply", "-o", "fitted.ply", "--refine-to", "500", "--order", "-4", "--steps", "5")
     done = call("fit", *arguments, folder=balls)
@@ -352,7 +414,8 @@ def test_fit_refines_to_a_number_of_triangles(balls: Path) -> None:
     assert fitted.bounds.mean(axis=0) == pytest.approx([100.0, 0, 0], abs=0.1)
 
 
-def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
+@pytest.mark.parametrize("request_to_end", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_fit_writes_the_best_so_far(balls: Path, request_to_end: signal.Signals) -> None:
     # So fine that a step takes longer than this process to hear of one.
     ball = icosphere(5)
     trimesh.Trimesh(30 * ball.vertices + [100.0, 0, 0], ball.triangles, process=False).export(balls / "start.ply")
@@ -366,7 +429,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
     # The bar moves with the first step.
     while b"1%" not in shown and process.poll() is None:
         shown += os.read(main, 4096)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(request_to_end)
     while select.select([main], [], [], 0.1)[0] or process.poll() is None:
         try:
             if not os.read(main, 4096):
@@ -388,10 +451,16 @@ def test_an_interrupted_fit_writes_the_best_so_far(balls: Path) -> None:
         (("start.ply", "target.ply", "-o", "f.ply", "--order", "-0.4"), "only for orders below -1/2, found -0.4"),
         (("start.ply", "target.ply", "-o", "f.ply", "--steps", "0"), "steps must be a whole number from 1 on"),
         (("lost.ply", "target.ply", "-o", "f.ply"), "lost.ply"),
+        (("start.ply", "target.ply", "-o", "./target.ply"), "this is the target, which would be lost"),
+        (("start.ply", "target.ply", "-o", "folder.ply"), "something that is no file is there already"),
+        (("start.ply", "target.ply", "-o", f"{'x' * 300}.ply"), "cannot be written there: File name too long"),
+        (("small.ply", "target.ply", "-o", "f.ply"), "the start is 0.06 units wide and the target 62"),
         (("start.ply", "target.ply", "-o", "f.ply", "--refine-to", "320"), "320 triangles already: ask for more than"),
     ],
 )
 def test_a_fit_that_cannot_be_is_refused_in_one_line(balls: Path, arguments: tuple[str, ...], message: str) -> None:
+    (balls / "folder.ply").mkdir()
+    sb.write_mesh(sb.read_mesh(balls / "start.ply").moved(1e-3, (0.0, 0.0, 0.0)), balls / "small.ply")
     done = call("fit", *arguments, folder=balls)
     assert done.returncode in (1, 2)
     assert message in done.stderr

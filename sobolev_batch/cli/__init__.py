@@ -14,10 +14,14 @@ from sobolev_batch.errors import InputError, SobolevBatchError
 
 __all__ = ["cli", "main"]
 
+# What to know about commands that were asked to end.
+_REMARKS = {"run": "; the same command continues from the store"}
+
 
 def main() -> None:
     """Run the command line; the process ends with its exit status."""
     debug = "--debug" in sys.argv
+    command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
     # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
     raise_when_asked()
     try:
@@ -27,11 +31,11 @@ def main() -> None:
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         ignore_requests()
-        click.echo("interrupted; the same command continues from the store", err=True)
+        click.echo(f"interrupted{_REMARKS.get(command, '')}", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except Terminated:
         ignore_requests()
-        click.echo("terminated; the same command continues from the store", err=True)
+        click.echo(f"terminated{_REMARKS.get(command, '')}", err=True)
         sys.exit(EXIT_TERMINATED)
     except Exception as error:
         if debug:

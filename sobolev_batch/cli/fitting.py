@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -12,14 +13,20 @@ import click
 import numpy as np
 
 from sobolev_batch.cli.group import cli
+from sobolev_batch.cli.interruption import terminations_as_interrupts
+from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.fitting.closeness import Closeness
 from sobolev_batch.fitting.fit import fit
 from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress
 from sobolev_batch.fitting.refine import refine
+from sobolev_batch.fitting.task import require_comparable
 from sobolev_batch.surfaces.formats.readers import read_mesh
-from sobolev_batch.surfaces.formats.writers import require_writable_format, write_mesh
+from sobolev_batch.surfaces.formats.writers import require_writable, write_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
+
+# In radii of the target; distances have about as many digits.
+_MOST_ROUNDING = 1e-6
 
 
 @cli.command("fit")
@@ -41,7 +48,8 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
     type=float,
     default=DEFAULT_SMOOTHING,
     show_default=True,
-    help="Smoothness of steps; more keeps triangles and worst points better, and the distance falls less.",
+    help="Smoothness of steps; more keeps triangles and worst points better, and the distance falls less. A far START "
+    "takes at least 4.",
 )
 @click.option(
     *("--refine-to", "triangles"),
@@ -65,13 +73,17 @@ def fit_command(
     """Move the vertices of START to bring it nearer to TARGET, and write the mesh.
 
     Both are mesh files in the same unit. The triangles stay as they are, unless you refine them. Ctrl-C ends with the
-    best mesh so far.
+    best mesh so far, and so does SIGTERM.
     """
-    require_writable_format(output)
+    require_writable(output)
+    if output.exists() and output.samefile(target):
+        raise InputError(f"{output}: this is the target, which would be lost; name another file")
     own, goal = read_mesh(start), read_mesh(target)
+    # Refused in the files' own unit.
+    require_comparable(own, goal)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(goal)
     method = fit if triangles is None else partial(refine, triangles=triangles)
-    with _Steps() as shown:
+    with _Steps() as shown, terminations_as_interrupts():
         fitted = method(
             similarity.apply(own),
             similarity.apply(goal),
@@ -82,12 +94,30 @@ def fit_command(
             notify=shown,
         )
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
-    write_mesh(Mesh(vertices, fitted.mesh.triangles), output)
+    result = Mesh(vertices, fitted.mesh.triangles)
+    write_mesh(result, output)
     click.echo(f"{len(fitted.mesh.triangles):,} triangles; {fitted.steps} steps; {fitted.end}")
     click.echo(f"before: {_text(fitted.before, similarity.scale)}")
     click.echo(f"after:  {_text(fitted.after, similarity.scale)}")
-    for remark in fitted.remarks:
+    for remark in (*fitted.remarks, *_lost_digits(result, output, similarity)):
         click.echo(f"note: {remark}")
+
+
+def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str]:
+    """Yield a remark if the file of a mesh, or the mesh's own unit, lacks digits for its vertices."""
+    try:
+        written = read_mesh(path)
+    except MeshError as error:
+        yield f"the file cannot be read back: {error}"
+        return
+    moved = float(np.finfo(np.float64).eps * np.abs(mesh.vertices).max())
+    if len(written.triangles) == len(mesh.triangles):
+        moved += float(np.abs(np.subtract(written.corners(), mesh.corners())).max())
+    if similarity.scale * moved > _MOST_ROUNDING:
+        yield (
+            f"so far from the origin, numbers in {path.name} have too few digits: vertices are off by up to "
+            f"{moved:.1g}, and the distance is not that of the file; move the meshes to the origin, or write a .ply"
+        )
 
 
 class _Steps:
@@ -116,6 +146,8 @@ class _Steps:
 
 def _text(closeness: Closeness, scale: float) -> str:
     """Return the numbers on one line, lengths in the files' unit."""
+    if not np.isfinite(closeness.distance):
+        return "not measured"
     parts = [f"distance {closeness.distance:.4e} ± {closeness.error:.0e}"]
     if np.isfinite(closeness.hausdorff):
         parts.append(f"Hausdorff at least {closeness.hausdorff / scale:.3g}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -44,6 +46,16 @@ def raise_when_asked() -> None:
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_SECONDS)
 
     sys.unraisablehook = insist
+
+
+@contextmanager
+def terminations_as_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt at SIGTERM as well, for work that ends with what it has."""
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def ignore_requests() -> None:

@@ -101,9 +101,7 @@ def release_command(store: Location, force: bool) -> None:
 @click.option(
     "--factor",
     type=click.FloatRange(min=1.0, min_open=True),
-    default=REMESHING_FACTOR,
-    show_default=True,
-    help="Growth of the distance at which a new mesh pays, for --over-time.",
+    help=f"Growth of the distance at which a new mesh pays, for --over-time. [default: {REMESHING_FACTOR:g}]",
 )
 def table_command(
     store: Location,
@@ -112,16 +110,17 @@ def table_command(
     matrix: bool,
     over_time: bool,
     truth: str | None,
-    factor: float,
+    factor: float | None,
 ) -> None:
     """Print the tables or distance matrices of STORE."""
     if matrix and over_time:
         raise click.UsageError("--matrix and --over-time are two tables: ask for one of them")
-    if truth is not None and not over_time:
-        raise click.UsageError("--truth belongs to --over-time")
+    for name, is_given in (("--truth", truth is not None), ("--factor", factor is not None)):
+        if is_given and not over_time:
+            raise click.UsageError(f"{name} belongs to --over-time")
     tree, chosen = open_store(store), orders or None
     if over_time:
-        click.echo(format_evolution(tree, style, chosen, truth=truth, factor=factor))
+        click.echo(format_evolution(tree, style, chosen, truth=truth, factor=factor or REMESHING_FACTOR))
     else:
         form = format_matrix if matrix else format_table
         click.echo(form(tree, style, chosen))

@@ -43,6 +43,11 @@ class Closeness:
     smallest_angle: float = np.nan
 
     @classmethod
+    def unknown(cls) -> Self:
+        """Return the closeness of a mesh that was not measured."""
+        return cls(np.nan, np.nan)
+
+    @classmethod
     def of(cls, mesh: Mesh, target: Operand, order: float, lattice: Lattice) -> Self:
         """Measure how close a mesh is to a surface, or to a field on a lattice.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
+from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.stages import (
     DEFAULT_ORDER,
     DEFAULT_SMOOTHING,
@@ -22,7 +22,7 @@ from sobolev_batch.fitting.optimisation.stages import (
 from sobolev_batch.fitting.task import FitTask
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand
-from sobolev_batch.spectral.transform.settings import Execution
+from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Growth of the Hausdorff distance that a user should know.
@@ -71,19 +71,20 @@ def fit(
 ) -> Fit:
     """Move the vertices of a mesh to lower its Sobolev distance from a target.
 
-    Triangles stay as they are, and none is turned over. An interrupt (Ctrl-C) ends the fit with the best mesh so far.
+    Triangles stay as they are, and no step turns one over. An interrupt (Ctrl-C) ends the fit with the best mesh so
+    far.
 
     Args:
         mesh: Mesh to start from. Vertices at one place move together.
         target: Surface in the same unit of length, or its field from `fourier_transform` or a store. Distances depend
             on the unit: bring both to the unit ball with a `Similarity` unless you have reasons.
-        order: Order s < -1/2 of the distance. At orders up to -1.5, a tenth of the squared distance at half the order
-            is added, relative to the start, so that the mesh keeps its detail.
+        order: Order s < -1/2 of the distance. At orders of -1.5 and below, the squared distance at half the order is
+            lowered too, with a tenth of the weight, so that the mesh keeps its detail.
         lattice: Lattice of the frequencies that the fit looks at; chosen by the mean edge if not given. A field brings
             its own.
         steps: Largest number of steps.
         smoothing: Weight λ of the mesh's Laplacian in steps. A larger one keeps triangles and worst points better, and
-            the distance falls less.
+            the distance falls less. A start that is far away takes at least 4.
         keep_boundary: Leave vertices of open boundaries where they are.
         threads: Threads of the NUFFT; one per core by default.
         notify: Called after each step.
@@ -104,14 +105,14 @@ def fit(
     True
     """
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    task = FitTask.of(mesh, target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1))
+    task = FitTask.of(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
     before = measured(task)
     fitted, run = task.run(notify)
     return concluded(mesh, before, task, fitted, run)
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `fit` finds, without measures of its closeness; the start if it would be farther away.
+    """Return the mesh that `fit` finds, without measures of its closeness.
 
     Raises:
         LatticeError: The mesh does not fit into the lattice of a field.
@@ -119,10 +120,7 @@ def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: E
     """
     task = FitTask.of(mesh, target, None, settings, execution)
     fitted, _ = task.run()
-    before, after = (
-        task.problem.squares(np.asarray(one.vertices), [settings.order])[0] for one in (task.start, fitted)
-    )
-    return task.own(fitted) if after <= before else mesh
+    return task.own(fitted)
 
 
 def measured(task: FitTask) -> Closeness:
@@ -151,13 +149,20 @@ def concluded(start: Mesh, before: Closeness, task: FitTask, fitted: Mesh, run: 
         fitted: Prepared mesh at its end.
         run: Its run.
     """
-    mesh, after, remarks = task.own(fitted), task.closeness(fitted), []
-    if after.distance - after.error > before.distance + before.error:
+    mesh, remarks, end = task.own(fitted), [], run.end
+    try:
+        after = task.closeness(fitted)
+    except KeyboardInterrupt:
+        after, end = Closeness.unknown(), End.INTERRUPTED
+        remarks.append("it was interrupted before the mesh was measured")
+    if after.distance - np.nan_to_num(after.error) > before.distance + np.nan_to_num(before.error):
         remarks.append("no nearer mesh was found: this is the start")
         mesh, after = start, before
+    if after.error >= after.distance > 0:
+        remarks.append("the distance is not larger than its error: ask for a more negative order")
     if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
         remarks.append(
-            f"the Hausdorff distance grew from {before.hausdorff:.2g} to {after.hausdorff:.2g}: the worst point lies "
+            f"the Hausdorff distance grew {after.hausdorff / before.hausdorff:.2g} times: the worst point lies "
             "farther away than before; take a larger smoothing or a less negative order"
         )
-    return Fit(mesh, task.settings.order, before, after, run.taken, run.end.value, tuple(remarks))
+    return Fit(mesh, task.settings.order, before, after, run.taken, end.value, tuple(remarks))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -26,7 +25,7 @@ from sobolev_batch.fitting.task import FitTask, welded
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand
-from sobolev_batch.spectral.transform.settings import Execution
+from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # While the goal is so many times as large, all edges are split. A choice of triangles came no nearer then: fits pull
@@ -90,10 +89,15 @@ def refine(
     (True, True)
     """
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    refinement = _Refinement(target, lattice, settings, Execution(threads=threads or os.cpu_count() or 1), triangles)
+    refinement = _Refinement(target, lattice, settings, Execution(threads=thread_count(threads)), triangles)
     task = refinement.begun(mesh)
     before = measured(task)
-    return concluded(mesh, before, *refinement.carried_out(task, notify))
+    found = concluded(mesh, before, *refinement.carried_out(task, notify))
+    count = len(found.mesh.triangles)
+    if count >= triangles or found.end == End.INTERRUPTED.value:
+        return found
+    remark = f"it has {count:,} triangles instead of {triangles:,}, as splits come in groups"
+    return replace(found, remarks=(*found.remarks, remark))
 
 
 def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
@@ -145,7 +149,7 @@ class _Refinement:
     ) -> tuple[FitTask, Mesh, Run]:
         """Return the last task, the prepared mesh at its end and its run, with the steps of all rounds."""
         between = replace(self.settings, steps=min(_STEPS_BETWEEN, self.settings.steps))
-        goals, taken = self._goals(len(task.start.triangles)), 0
+        goals, taken = _goals(len(task.start.triangles), self.triangles), 0
         total = between.steps * len(goals) + self.settings.steps
 
         def counted(progress: FitProgress) -> None:
@@ -166,19 +170,6 @@ class _Refinement:
         fitted, run = task.run(counted)
         run.taken += taken
         return task, fitted, run
-
-    def _goals(self, count: int) -> list[int]:
-        """Return the number of triangles after each split of a mesh of so many triangles."""
-        goals = []
-        while count < self.triangles:
-            if count * _EVEN_ABOVE <= self.triangles:
-                count *= 4
-            elif count * _GROWTH * _LAST_GROWTH >= self.triangles:
-                count = self.triangles
-            else:
-                count = round(_GROWTH * count)
-            goals.append(count)
-        return goals
 
     def _task(self, mesh: Mesh) -> FitTask:
         return FitTask.of(mesh, self.target, self.lattice, self.settings, self.execution)
@@ -201,3 +192,28 @@ class _Refinement:
         weighting = task.problem.weighting(vertices, self.settings.shares)
         _, gradient = task.problem.objective(vertices, weighting)[0](vertices)
         return np.asarray(gradient[task.place][len(edges.mesh.vertices) :])
+
+
+def largest_while_refining(count: int, triangles: int) -> int:
+    """Return the largest number of triangles while a mesh is refined: scores come from a mesh of four times as many.
+
+    Args:
+        count: Number of triangles of the start.
+        triangles: Number of triangles to reach.
+    """
+    *before, last = [count, *_goals(count, triangles)]
+    return max([last, *(4 * one for one in before)])
+
+
+def _goals(count: int, triangles: int) -> list[int]:
+    """Return the number of triangles after each split of a mesh of so many triangles."""
+    goals = []
+    while count < triangles:
+        if count * _EVEN_ABOVE <= triangles:
+            count *= 4
+        elif count * _GROWTH * _LAST_GROWTH >= triangles:
+            count = triangles
+        else:
+            count = round(_GROWTH * count)
+        goals.append(count)
+    return goals

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Self
@@ -14,7 +14,7 @@ from pydantic import Field, SerializeAsAny, field_validator
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting.fit import fitted_mesh
 from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
-from sobolev_batch.fitting.refine import MOST_TRIANGLES, refined_mesh
+from sobolev_batch.fitting.refine import MOST_TRIANGLES, largest_while_refining, refined_mesh
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
@@ -32,7 +32,7 @@ from sobolev_batch.surfaces.sources.registry import (
 )
 
 # Raise it whenever a fit of the same mesh gives another one.
-_VERSION = 1
+_VERSION = 2
 # Measured peak of a fit: its lattice, and for each triangle of the mesh and of the target.
 _LATTICE_BYTES, _TRIANGLE_BYTES, _TARGET_BYTES = 3e8, 2e3, 400.0
 _KEPT = 8
@@ -70,7 +70,8 @@ class TargetSource(NestedSource, ABC):
 
     def with_reference(self, reference: Source) -> Self:
         """Return the source with the study's reference as its target, unless it has one of its own."""
-        return self if self.target is not None else self.model_copy(update={"target": reference})
+        source = super().with_reference(reference)
+        return source if source.target is not None else source.model_copy(update={"target": reference})
 
     @property
     def settings(self) -> FitSettings:
@@ -85,8 +86,8 @@ class TargetSource(NestedSource, ABC):
         """
         if self.target is None:
             raise StudyError(
-                "there is nothing to fit to, since the study's reference is a member of a family: name a target, such "
-                'as target = { source = "files", paths = ["a.ply"] }'
+                "there is nothing to fit to: in a reference, and where the reference is a member of a family, name a "
+                'target, such as target = { source = "files", paths = ["a.ply"] }'
             )
         return single_member(self.target, folder)
 
@@ -166,11 +167,10 @@ class FittedMember(Member):
 
     def fingerprint(self) -> Fingerprint:
         """Return the fingerprints of both members, the settings, and the versions of the libraries."""
-        settings = self.settings
         return {
             "fit": dict(self.start.fingerprint()),
             "target": dict(self.target.fingerprint()),
-            "settings": [settings.order, settings.steps, settings.smoothing, settings.keep_boundary],
+            "settings": asdict(self.settings),
             "version": _VERSION,
             **({} if self.triangles is None else {"triangles": self.triangles}),
             **{library: installed_version(library) for library in ("finufft", "scipy")},
@@ -180,8 +180,7 @@ class FittedMember(Member):
         """Return the size of the mesh, and the memory that the fit takes."""
         start, target = self.start.expected_size(), self.target.expected_size()
         count = self.triangles or start.triangles
-        # Scores of edges come from a mesh of four times the triangles.
-        largest = count if self.triangles is None else 2 * count
+        largest = count if self.triangles is None else largest_while_refining(start.triangles, count)
         own_bytes = _LATTICE_BYTES + _TRIANGLE_BYTES * largest + _TARGET_BYTES * target.triangles
         return ExpectedSize(count, max(start.projected_bytes, target.projected_bytes, own_bytes))
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
 from sobolev_batch.fitting.derivative.transform import require_mesh
+from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run, stages_of
 from sobolev_batch.fitting.subdivision import Edges
@@ -62,7 +63,7 @@ class FitTask:
             LatticeError: The mesh or target does not fit into the lattice.
             InputError: See `fit`.
         """
-        _require_comparable(mesh, target)
+        require_comparable(mesh, target)
         start, place = welded(mesh)
         move = Similarity()
         if isinstance(target, xr.DataArray):
@@ -82,21 +83,34 @@ class FitTask:
         return _free_vertices(self.start, keep_boundary=self.settings.keep_boundary)
 
     def run(self, notify: Callable[[FitProgress], None] | None = None) -> tuple[Mesh, Run]:
-        """Carry the fit out, and return the prepared mesh at its end."""
+        """Carry the fit out, and return the prepared mesh at its end, or the start if that is nearer."""
         run = Run(self.problem, self.free, self.settings.steps, notify)
-        return Mesh(run.carried_out(stages_of(self.problem, self.settings)), self.start.triangles), run
+        begun = np.asarray(self.start.vertices)
+        try:
+            vertices = run.carried_out(stages_of(self.problem, self.settings))
+            before, after = (self.problem.squares(one, [self.settings.order])[0] for one in (begun, vertices))
+        except KeyboardInterrupt:
+            run.end = End.INTERRUPTED
+            return Mesh(run.vertices, self.start.triangles), run
+        if after > before:
+            vertices, run.end = begun, End.FARTHER
+        return Mesh(vertices, self.start.triangles), run
 
     def closeness(self, mesh: Mesh) -> Closeness:
         """Measure how close a prepared mesh is to the target."""
         return Closeness.of(mesh, self.target, self.settings.order, self.problem.lattice)
 
     def own(self, mesh: Mesh) -> Mesh:
-        """Return a prepared mesh with the vertices and triangles of the given one, at its place."""
+        """Return a mesh with the vertices and triangles of the given one, at its place.
+
+        Args:
+            mesh: Prepared start with its vertices moved.
+        """
         vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
         return Mesh(vertices, self.mesh.triangles)
 
 
-def _require_comparable(mesh: Mesh, target: Operand) -> None:
+def require_comparable(mesh: Mesh, target: Operand) -> None:
     """Refuse a mesh and target with which there is nothing to fit.
 
     Raises:

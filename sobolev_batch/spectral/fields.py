@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -20,7 +19,7 @@ from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
-from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -99,7 +98,7 @@ def fourier_transform(
     12.5664
     """
     settings = TransformSettings(eps, dtype, Quadrature(quadrature))
-    execution = Execution(backend_named(backend), threads or os.cpu_count() or 1)
+    execution = Execution(backend_named(backend), thread_count(threads))
     field = compute_field(surface, lattice, settings, check_orders(order), execution)
     attributes = {
         "long_name": "Fourier transform of the area measure",

@@ -66,9 +66,15 @@ def check_orders(order: Orders) -> tuple[float, ...]:
     """Return one or several orders as a tuple of floats.
 
     Raises:
-        OrderError: No order is given, or one does not lie between -100 and -1/2.
+        OrderError: No order is given, or one is no number between -100 and -1/2.
     """
-    orders = tuple(float(s) for s in np.atleast_1d(np.asarray(order, dtype=np.float64)))
+    try:
+        given = np.atleast_1d(np.asarray(order))
+    except ValueError:
+        given = np.empty((0, 0))
+    if given.dtype.kind not in "iuf" or given.ndim > 1:
+        raise OrderError(f"an order is a number, such as -2.0, or a list of numbers; found {order!r}")
+    orders = tuple(float(s) for s in given)
     if not orders:
         raise OrderError("at least one order is needed")
     for s in orders:

@@ -153,6 +153,22 @@ def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, 
         np.testing.assert_allclose(parts, found["error"])
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_measured_part_of_its_error_covers_that_of_a_coarse_eps(seed: int) -> None:
+    lattice = sb.Lattice(3.0, 30)
+    coarse, fine = (sb.gradient(wrinkled(seed), SPHERE, -4.0, lattice=lattice, eps=eps) for eps in (1e-2, 1e-9))
+    difference = float(np.linalg.norm(coarse["gradient"] - fine["gradient"]))
+    assert 0 < difference < coarse["discretisation"].item() / 2
+
+
+def test_a_lattice_of_a_few_samples_leaves_most_beyond_it() -> None:
+    found = sb.gradient(sb.icosphere(1), SPHERE, -2.0, lattice=sb.Lattice(0.1, 2))
+    assert found["error"] > np.linalg.norm(found["gradient"])
+    near = sb.distance(sb.icosphere(1), SPHERE, -2.0, lattice=sb.Lattice(0.1, 2))
+    true = sb.distance(sb.icosphere(1), SPHERE, -2.0, rtol=1e-2)["distance"].item()
+    assert abs(near["distance"].item() - true) < near["error"].item()
+
+
 def test_a_field_of_unknown_quality_gives_a_gradient_without_an_error() -> None:
     field = sb.fourier_transform(SPHERE, SMALL).drop_attrs()
     found = sb.gradient(sb.icosphere(1), field, -2.0)

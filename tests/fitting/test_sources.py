@@ -78,6 +78,14 @@ def test_the_settings_are_part_of_the_fingerprint() -> None:
     assert len(found) == len(changes) + 1
 
 
+def test_the_reference_is_handed_down_to_nested_sources() -> None:
+    nested = parse_source({"source": "fit", "mesh": {**FIT, "steps": 1}, "steps": 1})
+    found = nested.with_reference(parse_source(SPHERE)).members(Path())
+    assert [member.name for member in found] == ["1", "2"]
+    with pytest.raises(sb.StudyError, match="there is nothing to fit to"):
+        nested.members(Path())
+
+
 def test_a_target_of_its_own_stays() -> None:
     own = {"source": "sphere", "radius": 29.0, "center": [100.0, 0.0, 0.0]}
     with_own, without = parse_source({**FIT, "target": own}), parse_source(FIT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, Self
@@ -18,11 +17,18 @@ from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
-from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
+from sobolev_batch.spectral.metrics.inputs import (
+    Operand,
+    check_surface,
+    common_lattice,
+    field_of,
+    field_values,
+    quality_of,
+)
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums
-from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -32,9 +38,9 @@ Reals = NDArray[np.float64]
 _REFINEMENT = 30.0
 # The derivative's tail was measured to be at most this many times what the tail of the squared distance suggests.
 _TRUNCATION_CAUTION = 3.0
-# Images change derivatives by more than what the change at half the period suggests: up to 1.6 times were measured
-# beyond the caution for distances.
-_ALIASING_CAUTION = 3 * ALIASING_CAUTION
+# Images change derivatives by more than what the change at half the period suggests: up to 5 times were measured
+# beyond the caution for distances, where surfaces fill three quarters of the period.
+_ALIASING_CAUTION = 8 * ALIASING_CAUTION
 # Steps to find the largest change of the transform by a movement, which comes out too small by this factor at most.
 _POWER_STEPS, _POWER_CAUTION = 4, 1.5
 # Movement of vertices in a difference, relative to the mean edge.
@@ -93,10 +99,10 @@ def gradient(
     orders = check_orders(order)
     settings = TransformSettings(eps)
     finer = TransformSettings(max(settings.eps / _REFINEMENT, FINEST_EPS["complex128"]))
-    execution = Execution(backend_named(backend), threads or os.cpu_count() or 1)
+    execution = Execution(backend_named(backend), thread_count(threads))
     own = common_lattice((target,), lattice)
     pair = [_Difference.of(mesh, target, own, orders, one, execution) for one in (settings, finer)]
-    gradients, coarser = (one.gradients(one.factors) for one in pair)
+    coarser, gradients = (one.gradients(one.factors) for one in pair)
     fine = pair[-1]
     parts = fine.errors(gradients)
     parts["discretisation"] = parts["discretisation"] + _norms(gradients - coarser)
@@ -150,7 +156,7 @@ class _Difference:
     @cached_property
     def values(self) -> Complexes:
         """Difference on the half lattice."""
-        return self.placed.transform() - np.asarray(self.field.transpose(*AXES).to_numpy(), dtype=np.complex128)
+        return self.placed.transform() - field_values(self.field)
 
     @cached_property
     def factors(self) -> Reals:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.fitting.derivative.transform import MeshTransform, require_mesh
+from sobolev_batch.errors import InputError
+from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh, require_mesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
-from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, field_values
 from sobolev_batch.spectral.shells import SobolevWeights, single_order
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
@@ -84,8 +84,8 @@ class SquaredDistance:
         orders = (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)
         own = Lattice.of(field)
-        values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
-        execution = Execution(backend_named(backend), threads or os.cpu_count() or 1)
+        values = field_values(field)
+        execution = Execution(backend_named(backend), thread_count(threads))
         transform = MeshTransform.of(mesh, own, TransformSettings(eps), execution)
         transform.at(np.asarray(mesh.vertices))
         return cls(transform, values, factors_of(SobolevWeights(own, orders))[0])
@@ -97,16 +97,22 @@ class SquaredDistance:
             InputError: The vertices are not finite, or not as many as the mesh has.
             LatticeError: The mesh extends beyond the lattice's half period.
         """
-        positions = np.asarray(vertices, dtype=np.float64)
-        placed = self.transform.at(positions.reshape(-1, 3) if positions.ndim == 1 else positions)
+        placed = self._placed(vertices)
         difference = placed.transform() - self.target
         gradient = 2 * placed.derivative(self.factors * difference)
-        return self._square(difference), gradient.reshape(positions.shape)
+        return self._square(difference), gradient.reshape(np.shape(vertices))
 
     def value(self, vertices: ArrayLike) -> float:
         """Return the squared distance alone, which takes a third of the time; see `__call__`."""
-        positions = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
-        return self._square(self.transform.at(positions).transform() - self.target)
+        return self._square(self._placed(vertices).transform() - self.target)
+
+    def _placed(self, vertices: ArrayLike) -> PlacedMesh:
+        """Return the mesh with vertices at some positions, (n, 3) or (3n,)."""
+        positions = np.asarray(vertices)
+        if positions.dtype.kind not in "iuf":
+            raise InputError(f"positions of vertices must be real numbers, found {positions.dtype}")
+        is_flat = positions.shape == (3 * self.transform.count,)
+        return self.transform.at((positions.reshape(-1, 3) if is_flat else positions).astype(np.float64, copy=False))
 
     def _square(self, difference: Complexes) -> float:
         return float(np.sum(self.factors * (difference.real**2 + difference.imag**2)))

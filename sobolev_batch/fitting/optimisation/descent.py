@@ -32,10 +32,16 @@ class End(Enum):
 
     STEPS = "all steps are taken"
     CONVERGED = "the distance hardly falls any more"
+    STUCK = "no nearer mesh was found along the last direction"
     ERROR = "the distance is down to the error of its fields"
+    FARTHER = "no nearer mesh was found"
     TURNED = "a step would turn triangles over"
     LEFT = "a step would leave the lattice's period"
     INTERRUPTED = "it was interrupted"
+
+
+# By the status of scipy's L-BFGS-B; any other is that of a failed line search.
+_END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +50,13 @@ class Descent:
 
     Attributes:
         vertices: Positions (n, 3), in units of length.
-        squared: Squared distance there.
+        objective: Weighted squared distances there, with the penalty of shapes.
         steps: Number of steps.
         end: Why it ended.
     """
 
     vertices: Reals
-    squared: float
+    objective: float
     steps: int
     end: End
 
@@ -64,25 +70,28 @@ def descend(
     unit: float,
     notify: Notify,
 ) -> Descent:
-    """Lower a squared distance by L-BFGS.
+    """Lower a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
 
     Args:
-        objective: Squared distance.
+        objective: Squared distance, or a weighted sum of several.
         vertices: Positions (n, 3) to start from.
         smoothing: Smoothing of the steps.
         steps: Largest number of steps.
         floor: Squared distance below which nothing is left to gain.
         unit: Length of a long step, such as that of an edge.
-        notify: Called with the positions and the squared distance after each step.
+        notify: Called with the positions and the objective after each step.
+
+    Returns:
+        The last positions that were accepted. A step that leaves the lattice's period ends the descent before it.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.
     """
     path = _Path(objective, vertices, smoothing, floor, unit, notify)
-    if path.squared <= floor:
-        return Descent(vertices, path.squared, 0, End.ERROR)
+    if path.value <= floor:
+        return Descent(vertices, path.value, 0, End.ERROR)
     try:
-        minimize(
+        result = minimize(
             path.scaled,
             np.zeros(3 * len(smoothing.free)),
             jac=True,
@@ -92,9 +101,9 @@ def descend(
         )
     except LatticeError:
         path.end = End.LEFT
-    if path.end is End.CONVERGED and path.steps >= steps:
-        path.end = End.STEPS
-    return Descent(path.vertices, path.squared, path.steps, path.end)
+    else:
+        path.end = path.end or _END_OF_STATUS.get(result.status, End.STUCK)
+    return Descent(path.vertices, path.value, path.steps, path.end)
 
 
 class _Path:
@@ -111,9 +120,9 @@ class _Path:
     ) -> None:
         self.objective, self.smoothing, self.floor, self.unit, self.notify = objective, smoothing, floor, unit, notify
         self.start = self.vertices = vertices
-        self.first = self.squared = objective.value(vertices)
+        self.first = self.value = objective.value(vertices)
         self.steps = 0
-        self.end = End.CONVERGED
+        self.end: End | None = None
         self._history = [self.first]
         self._normals = _normals(vertices, objective.transform.triangles)
         self._penalty = ShapePenalty.of(vertices, objective.transform.triangles)
@@ -134,17 +143,19 @@ class _Path:
         """Keep a step if it turns no triangle over, and end the descent where nothing more is to be gained."""
         vertices = self.positions(intermediate_result.x)
         normals = _normals(vertices, self.objective.transform.triangles)
-        if np.any(np.einsum("ij,ij->i", normals, self._normals) < 0):
+        # A triangle that lost its area could go on to any side.
+        had_area = np.any(self._normals != 0, axis=1)
+        if np.any(np.einsum("ij,ij->i", normals, self._normals)[had_area] <= 0):
             self._stop(End.TURNED)
         self.vertices, self._normals = vertices, normals
-        self.squared = float(intermediate_result.fun) * self.first
+        self.value = float(intermediate_result.fun) * self.first
         self.steps += 1
-        self._history.append(self.squared)
-        self.notify(vertices, self.squared)
-        if self.squared <= self.floor:
+        self._history.append(self.value)
+        self.notify(vertices, self.value)
+        if self.value <= self.floor:
             self._stop(End.ERROR)
         before = self._history[-_PATIENCE - 1] if len(self._history) > _PATIENCE else np.inf
-        if self.squared > (1 - _LEAST_PROGRESS) ** 2 * before:
+        if self.value > (1 - _LEAST_PROGRESS) ** 2 * before:
             self._stop(End.CONVERGED)
 
     def _stop(self, end: End) -> Any:

@@ -20,8 +20,8 @@ from sobolev_batch.spectral.errors.budget import Support
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, field_for
-from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.metrics.inputs import quality_of
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.inputs import field_values, quality_of
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.extent import Extent
@@ -74,8 +74,7 @@ class FitProblem:
     @classmethod
     def of_field(cls, mesh: Mesh, field: xr.DataArray, execution: Execution) -> Self:
         """Return the problem for a target of which only a field is known."""
-        values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
-        return cls(mesh, Lattice.of(field), values, quality_of(field), execution)
+        return cls(mesh, Lattice.of(field), field_values(field), quality_of(field), execution)
 
     @classmethod
     def of_surface(

@@ -78,8 +78,12 @@ class _Quality:
 
 def smallest_angle(mesh: Mesh) -> float:
     """Return the smallest angle of all triangles, in degrees; zero with a triangle without an area."""
-    a, b, c = np.moveaxis(np.sort(mesh.edge_lengths, axis=1), 1, 0)
-    # The angle opposite to the shortest side, by the law of cosines.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cosines = np.nan_to_num((b**2 + c**2 - a**2) / (2 * b * c), nan=1.0, posinf=1.0)
-    return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
+    corners = [mesh.vertices[corner] for corner in mesh.triangles.T]
+    angles = []
+    for corner in range(3):
+        this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
+        one, other = following - this, previous - this
+        # Small angles keep their digits, unlike those by the law of cosines.
+        sines = np.linalg.norm(np.cross(one, other), axis=1)
+        angles.append(np.arctan2(sines, np.einsum("ij,ij->i", one, other)))
+    return float(np.degrees(np.min(angles)))

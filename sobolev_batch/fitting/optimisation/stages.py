@@ -14,6 +14,7 @@ from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.smoothing import Smoothing
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.shells import single_order
+from sobolev_batch.surfaces.shapes.surface import is_finite_number
 
 Reals = NDArray[np.float64]
 
@@ -55,9 +56,11 @@ class FitSettings:
         if not is_whole_number(self.steps) or self.steps < 1:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
         object.__setattr__(self, "steps", int(self.steps))
-        is_number = isinstance(self.smoothing, int | float) and not isinstance(self.smoothing, bool)
-        if not is_number or not 0 <= self.smoothing < np.inf:
+        if not is_finite_number(self.smoothing) or self.smoothing < 0:
             raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")
+        object.__setattr__(self, "smoothing", float(self.smoothing))
+        if not isinstance(self.keep_boundary, bool):
+            raise InputError(f"keep_boundary must be True or False, found {self.keep_boundary!r}")
 
     @property
     def coarse_order(self) -> float:
@@ -78,7 +81,8 @@ class FitProgress:
     Attributes:
         step: Number of steps so far.
         steps: Largest number of steps.
-        relative: Present objective over that at the start of the stage, as a ratio of distances.
+        relative: Square root of what the descent lowers, which is about 1 at the start of each stage: a weighted sum
+            of squared distances, and a small penalty for triangles that lose their shape.
 
     >>> import sobolev_batch as sb
     >>> sb.FitProgress(step=3, steps=150, relative=0.5).relative
@@ -92,7 +96,13 @@ class FitProgress:
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a fit: orders with the share of each in the objective, smoothing, and a largest number of steps."""
+    """A part of a fit.
+
+    Attributes:
+        shares: Orders with the share of each in the objective.
+        smoothing: Weight of the Laplacian in steps.
+        steps: Largest number of steps.
+    """
 
     shares: tuple[tuple[float, float], ...]
     smoothing: float
@@ -100,7 +110,13 @@ class Stage:
 
 
 class Run:
-    """A fit that is under way."""
+    """A fit that is under way.
+
+    Attributes:
+        vertices: Positions (n, 3) after the last step, in units of length.
+        taken: Number of steps so far.
+        end: Why the last descent ended.
+    """
 
     def __init__(
         self, problem: FitProblem, free: NDArray[np.int64], steps: int, notify: Callable[[FitProgress], None] | None
@@ -108,16 +124,16 @@ class Run:
         self.problem, self.free, self.steps, self.notify = problem, free, steps, notify
         self.taken = 0
         self.end = End.CONVERGED
-        self._vertices = np.asarray(problem.mesh.vertices)
+        self.vertices = np.asarray(problem.mesh.vertices)
 
     def carried_out(self, stages: list[Stage]) -> Reals:
         """Return the vertices after all stages, or after the last step before an interrupt."""
         try:
             for stage in stages:
-                self._vertices = self._after(stage, self._vertices)
+                self.vertices = self._after(stage, self.vertices)
         except KeyboardInterrupt:
             self.end = End.INTERRUPTED
-        return self._vertices
+        return self.vertices
 
     def _after(self, stage: Stage, vertices: Reals) -> Reals:
         """Return the vertices after a stage: descents with ever finer fields, and smoother steps where needed."""
@@ -137,11 +153,11 @@ class Run:
                 break
         return vertices
 
-    def _counted(self, vertices: Reals, squared: float) -> None:
-        self._vertices = vertices
+    def _counted(self, vertices: Reals, objective: float) -> None:
+        self.vertices = vertices
         self.taken += 1
         if self.notify is not None:
-            self.notify(FitProgress(self.taken, self.steps, float(np.sqrt(squared))))
+            self.notify(FitProgress(self.taken, self.steps, float(np.sqrt(objective))))
 
 
 def stages_of(problem: FitProblem, settings: FitSettings) -> list[Stage]:

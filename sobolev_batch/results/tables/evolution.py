@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -21,8 +22,8 @@ from sobolev_batch.surfaces.sources.names import quoted
 # A mesh that is so many times as far away as at its first time is worth a new one.
 REMESHING_FACTOR = 2.0
 _NOTE = """\
-Digits in brackets are the error in units of the last digit. A new mesh of as many
-triangles would be as near as the first one: it pays once the distance has certainly
+Digits in brackets are the error in units of the last digit. If a new mesh of as many
+triangles would be as near as the first one, it pays once the distance has certainly
 grown to {factor:g} times that of the first time."""
 
 
@@ -39,9 +40,10 @@ def evolution(
 
     Returns:
         Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
-        length, and `growth`, the distance over that of the family's first time. Over `family` and `order` it has
-        `remesh_time`, the first time at which the distance has certainly grown by the factor. NaN where a family has
-        no mesh of a time, and where no time is late enough.
+        length, and `growth`, the distance over that of the family's first time with a distance, NaN if that is not
+        larger than its error. Over `family` and
+        `order` it has `remesh_time`, the first time at which the distance has certainly grown by the factor; later it
+        may fall again. NaN where a family has no mesh of a time, and where no time is late enough.
 
     Raises:
         InputError: The store has no tables yet, no mesh with a time, no such order or family, or the factor is not
@@ -66,7 +68,7 @@ def evolution(
         raise InputError(f"the factor must be larger than 1, found {factor!r}")
     tree = as_tree(store)
     convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
-    orders = chosen_orders(convergence, order)
+    orders = list(dict.fromkeys(chosen_orders(convergence, order)))
     labels = _labels_by_time(meshes)
     if not labels:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
@@ -75,6 +77,9 @@ def evolution(
     elif truth not in labels:
         raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
     true_labels = {} if truth is None else labels.pop(truth)
+    for name, by_time in labels.items():
+        if truth is not None and not any(_at(true_labels, time) for time in by_time):
+            raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")
     complete = set(complete_meshes(tree))
     times = sorted({time for family in labels.values() for time in family})
     shape = (len(labels), len(times), len(orders))
@@ -83,8 +88,8 @@ def evolution(
         for time, label in family.items():
             if truth is None:
                 found = convergence.sel(mesh=label, order=orders)
-            elif {label, true_labels.get(time)} <= complete:
-                found = StoreAccessor(tree).distance(label, true_labels[time], orders)
+            elif {label, true_label := _at(true_labels, time)} <= complete:
+                found = StoreAccessor(tree).distance(label, str(true_label), orders)
             else:
                 continue
             place = i, times.index(time)
@@ -110,7 +115,7 @@ def format_evolution(
     for order in found["order"].values.tolist():
         rows = found.sel(order=order)
         cells = [
-            [f"{time:g}", *(_cell(rows.sel(family=family, time=time)) for family in families)]
+            [_time(time), *(_cell(rows.sel(family=family, time=time)) for family in families)]
             for time in rows["time"].values.tolist()
         ]
         caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time"
@@ -132,6 +137,11 @@ def _labels_by_time(meshes: xr.Dataset) -> dict[str, dict[float, str]]:
     return labels
 
 
+def _at(labels: Mapping[float, str], time: float) -> str | None:
+    """Return the label at a time, which may have been computed in another way: 0.3 is 0.1 + 0.2."""
+    return next((label for other, label in labels.items() if math.isclose(other, time, rel_tol=1e-9)), None)
+
+
 def _dataset(
     families: list[str],
     times: list[float],
@@ -150,9 +160,11 @@ def _dataset(
         },
     )
     first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
-    growth = found["distance"] / first["distance"]
+    # Nothing is known of the growth of a distance that may be zero.
+    growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
     late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
     remesh_time = found["time"].where(late).min("time")
+    late &= growth.notnull()
     return found.assign(
         growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
         remesh_time=remesh_time.transpose("family", "order").assign_attrs(
@@ -163,9 +175,20 @@ def _dataset(
 
 def _cell(found: xr.Dataset) -> str:
     text = concise(found["distance"].item(), found["error"].item())
-    return f"{text}  {found['growth'].item():5.2f} ×" if text else ""
+    growth = found["growth"].item()
+    return f"{text}  {growth:5.2f} ×" if np.isfinite(growth) else text
 
 
 def _moment(found: xr.Dataset, factor: float) -> str:
+    if not found["distance"].notnull().any():
+        return "no distance is known"
+    if not found["growth"].notnull().any():
+        return "its first distance is not larger than its error, so nothing is known of its growth"
     moment = found["remesh_time"].item()
-    return f"a new mesh pays from {moment:g} on" if np.isfinite(moment) else f"it stays below {factor:g} times"
+    if np.isfinite(moment):
+        return f"a new mesh first pays at time {_time(moment)}"
+    return f"the distance has at no time certainly grown to {factor:g} times the first"
+
+
+def _time(time: float) -> str:
+    return f"{time:.12g}"

@@ -25,6 +25,8 @@ def machine_table(frame: pd.DataFrame, style: Format) -> str:
 
 def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format) -> str:
     """Return cells as a table whose columns are aligned to the right, but for the first."""
+    if style == "markdown":
+        rows, headers = [[_escaped(cell) for cell in row] for row in rows], [_escaped(text) for text in headers]
     return str(
         tabulate(
             rows,
@@ -34,6 +36,11 @@ def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: 
             colalign=("left", *["right"] * (len(headers) - 1)),
         )
     )
+
+
+def _escaped(cell: str) -> str:
+    """Return a cell of Markdown whose bars divide nothing."""
+    return cell.replace("|", "\\|")
 
 
 def prose(text: str, style: Format) -> str:

@@ -178,6 +178,8 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
     """
     lattice = weights.lattice
     inner, outer = sums.outer
+    # A lattice of very few samples has none in the outer windows.
+    outer = np.where((outer == 0) & (sums.totals > 0).any(axis=0), 2 * support.areas, outer)
     ceiling = np.maximum(2 * support.areas, outer)
     middles = [(low + high) / 2 for low, high in _WINDOWS]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

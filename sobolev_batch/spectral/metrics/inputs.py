@@ -47,6 +47,18 @@ def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr
     return fourier_transform(a, lattice, order=orders)
 
 
+def field_values(field: xr.DataArray) -> Complexes:
+    """Return all samples of a field, complex128 on the half lattice.
+
+    Raises:
+        InputError: Some are not finite.
+    """
+    values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
+    if not np.isfinite(values).all():
+        raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
+    return values
+
+
 def pair_of(
     a: Operand, b: Operand, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:

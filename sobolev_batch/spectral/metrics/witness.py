@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,7 @@ from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_o
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.settings import TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import require_points_inside
 
 # Fraction of a given memory for blocks of fields; the rest is for the NUFFT.
@@ -144,7 +143,7 @@ class Evaluation:
         coefficients = np.empty((len(self.weights.orders), *block.shape), dtype=dtype)
         for row, weight in zip(coefficients, self.weights.per_shell, strict=True):
             np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-        threads = self.threads or os.cpu_count() or 1
+        threads = thread_count(self.threads)
         batching = Batching(NufftSpec(block.shape, self.settings.eps, dtype, threads=threads))
         if self.allowed_bytes is not None:
             count = self.coordinates.shape[1]

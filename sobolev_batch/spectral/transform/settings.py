@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import get_args
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
@@ -18,6 +20,8 @@ DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
 # The limits of FINUFFT: below them 2.5 warns, and 2.6 refuses.
 FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
+# OpenMP crashes with very many.
+_MOST_THREADS = 1024
 
 
 @dataclass(frozen=True, init=False)
@@ -65,6 +69,19 @@ class TransformSettings:
     def lowest_degree(self, surface: Surface, lattice: FrequencyLattice) -> int:
         """Return the lowest degree among the rules of a surface: see `QuadraturePlan.lowest_degree`."""
         return self.plan(surface, lattice).lowest_degree
+
+
+def thread_count(threads: int | None) -> int:
+    """Return a number of threads, by default one per core.
+
+    Raises:
+        InputError: It is no whole number from 1 to 1,024.
+    """
+    if threads is None:
+        return os.cpu_count() or 1
+    if not is_whole_number(threads) or not 1 <= threads <= _MOST_THREADS:
+        raise InputError(f"threads must be a whole number from 1 to {_MOST_THREADS:,}, found {threads!r}")
+    return int(threads)
 
 
 @dataclass(frozen=True)

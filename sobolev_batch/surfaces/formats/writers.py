@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
+from uuid import uuid4
 
 import numpy as np
 import trimesh
@@ -24,10 +28,10 @@ def write_mesh(mesh: Mesh, path: str | Path) -> None:
 
     Args:
         mesh: Mesh to write.
-        path: File to write; it replaces one of the same name.
+        path: File to write; it replaces one of the same name once it is whole.
 
     Raises:
-        InputError: The suffix is none of these.
+        InputError: The suffix is none of these, or the path is a folder or a device.
         MeshError: The file cannot be written.
 
     >>> import tempfile
@@ -38,26 +42,49 @@ def write_mesh(mesh: Mesh, path: str | Path) -> None:
     ...     sb.read_mesh(Path(folder) / "ball.obj")
     Mesh(42 vertices, 80 triangles)
     """
-    path = require_writable_format(path)
+    path = require_writable(path)
     data = _FORMATS[path.suffix.lower()](mesh)
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise MeshError(f"{path}: the mesh cannot be written there: {error.strerror or error}") from error
+    # The old file stays until the new one is whole: a disk may be full.
+    with _new_file_beside(path) as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+        os.replace(file.name, os.path.realpath(path))
 
 
-def require_writable_format(path: str | Path) -> Path:
-    """Return a path whose suffix names a format that can be written, in a folder that exists.
+def require_writable(path: str | Path) -> Path:
+    """Return a path whose suffix names a format that can be written, in a folder that files can be made in.
 
     Raises:
-        InputError: It is none.
+        InputError: It is none, or something else than a file is there.
+        MeshError: No file can be made in its folder.
     """
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: meshes are written as {', '.join(_FORMATS)}; found the suffix {path.suffix!r}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+    with _new_file_beside(path):
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: something that is no file is there already; name another file")
     return path
+
+
+@contextmanager
+def _new_file_beside(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file that may take the place of another one; it is gone at the end unless it has.
+
+    Raises:
+        MeshError: It cannot be made or written.
+    """
+    place = path.parent / f".{uuid4().hex}{path.suffix}"
+    try:
+        with place.open("xb") as file:
+            yield file
+    except OSError as error:
+        raise MeshError(f"{path}: the mesh cannot be written there: {error.strerror or error}") from error
+    finally:
+        place.unlink(missing_ok=True)
 
 
 def _ply(mesh: Mesh) -> bytes:

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
@@ -19,10 +19,20 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.fingerprints import file_digest
 from sobolev_batch.surfaces.sources.globs import expand
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, label_problem, quoted
-from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, Times, at_most
+from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, at_most, checked_times
 
 _MOST_PATHS = 100_000
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
+
+
+def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None:
+    if value is None:
+        return None
+    if isinstance(value, str):
+        if value == "names":
+            return "names"
+        raise ValueError('must be a list of numbers, or "names" for the numbers in the names of the files')
+    return checked_times(value, _MOST_PATHS)
 
 
 class FileSource(Source):
@@ -42,7 +52,7 @@ class FileSource(Source):
         tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(_MOST_PATHS)
     ]
     distribution: Annotated[str, Field(min_length=1)] | None = None
-    times: Times | Literal["names"] | None = None
+    times: Annotated[tuple[float, ...] | Literal["names"] | None, BeforeValidator(_checked_times)] = None
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per file, sorted by path or time, and named by the file's stem where that is unique."""

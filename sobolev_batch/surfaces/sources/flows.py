@@ -27,8 +27,8 @@ class FlowSource(NestedSource):
     """A mesh at several times, with its vertices carried along by a flow on the spheres around the origin.
 
     The flow winds the sphere up while it turns, and back: after one period each vertex is where it began. It is the
-    second case of Nair and Lauritzen with a background rotation, without divergence. Vertices follow it exactly;
-    triangles stay flat.
+    fourth case of Nair and Lauritzen: the second with a background rotation, without divergence. Vertices follow it
+    exactly; triangles stay flat.
 
     Source: R. Nair, P. Lauritzen, "A class of deformational flow test cases for linear transport problems on the
     sphere" (2010), doi:10.1016/j.jcp.2010.08.014.
@@ -37,7 +37,7 @@ class FlowSource(NestedSource):
         mesh: Table of a source with one member, the mesh at time 0.
         times: Times, in the unit of the period.
         period: Time after which all is as it was.
-        strength: Strength k of the deformation, as an angle per unit of time.
+        strength: Strength k of the deformation, in radians per unit of time.
     """
 
     times: Times
@@ -87,7 +87,13 @@ class CarriedMember(Member):
 
 
 def carried(points: Reals, time: float, period: float, strength: float) -> Reals:
-    """Return where the flow of `FlowSource` carries points (n, 3) from time 0 on.
+    """Return where the flow of `FlowSource` carries points from time 0 on, (n, 3).
+
+    Args:
+        points: Points at time 0, (n, 3).
+        time: Time at which they are asked for.
+        period: Period T.
+        strength: Strength k, in radians per unit of time.
 
     On the unit sphere, in a frame that turns once around z in a period T, the velocity at x is
     2k cos(πt/T) y (x × e_y), where y is the point's own coordinate. It keeps y, so each circle around the y axis turns

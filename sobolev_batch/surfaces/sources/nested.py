@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, SerializeAsAny, field_validator
 
@@ -40,6 +40,10 @@ class NestedSource(Source):
     def libraries(self) -> tuple[str, ...]:
         """Distributions that the other source needs."""
         return self.mesh.libraries
+
+    def with_reference(self, reference: Source) -> Self:
+        """Return the source with the study's reference handed to the other source."""
+        return self.model_copy(update={"mesh": self.mesh.with_reference(reference)})
 
     @field_validator("mesh", mode="before")
     @classmethod
@@ -121,7 +125,7 @@ def load_mesh(member: Member) -> Mesh:
     """
     mesh = member.load()
     if not isinstance(mesh, Mesh):
-        raise MeshError(f"{member.name} is a closed form; coarser meshes need a source of one mesh")
+        raise MeshError(f"{member.name} is a closed form; its triangles are needed, so take a source of meshes")
     return mesh
 
 

@@ -19,10 +19,10 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import quoted
 
 # Levels, or triangle counts of one mesh, that one source takes.
@@ -209,7 +209,20 @@ def at_most(count: int) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def _require_distinct(times: tuple[float, ...]) -> tuple[float, ...]:
+def checked_times(value: object, most: int = MOST_ENTRIES) -> tuple[float, ...]:
+    """Return a list of times as floats.
+
+    Raises:
+        ValueError: It is no list of up to so many different finite numbers.
+    """
+    if not isinstance(value, list | tuple) or not value:
+        raise ValueError("must be a list of numbers, such as [0.0, 0.5, 1.0]")
+    if len(value) > most:
+        raise ValueError(f"at most {most} entries are allowed, found {len(value)}")
+    wrong = next((time for time in value if not is_finite_number(time)), None)
+    if wrong is not None:
+        raise ValueError(f"each time must be a finite number, found {quoted(wrong)} among them")
+    times = tuple(map(float, value))
     repeated = sorted(time for time, count in Counter(times).items() if count > 1)
     if repeated:
         raise ValueError(f"each time can be there once, found {repeated[0]:g} again")
@@ -217,12 +230,7 @@ def _require_distinct(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 # One or several different times, for sources of surfaces that move.
-Times = Annotated[
-    tuple[Annotated[float, Field(allow_inf_nan=False, strict=False)], ...],
-    Field(min_length=1, strict=False),
-    at_most(MOST_ENTRIES),
-    AfterValidator(_require_distinct),
-]
+Times = Annotated[tuple[float, ...], BeforeValidator(checked_times)]
 
 
 def parse_source(table: Mapping[str, Any]) -> Source:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
@@ -94,13 +95,76 @@ def test_text_and_data(store: Path) -> None:
     assert text[2].split() == ["time", "coarse", "late"]
     assert text[4].split()[0] == "0"
     assert text[4].split()[2:] == ["1.00", "×"]
-    assert "coarse: a new mesh pays from 0.4 on" in text
+    assert "coarse: a new mesh first pays at time 0.4" in text
+    still = format_evolution(tree, "text", [-4.0], truth="true", factor=1e6)
+    assert "coarse: the distance has at no time certainly grown to 1e+06 times the first" in still
     assert max(map(len, text)) <= 100
     frame = pd.read_csv(io.StringIO(format_evolution(tree, "csv")))
     assert list(frame) == ["order", "family", "time", "distance", "error", "growth"]
     assert len(frame) == 2 * 9
     assert json.loads(format_evolution(tree, "json", [-2.0]))[0]["growth"] == 1.0
     assert "toprule" in format_evolution(tree, "latex")
+
+
+def test_errors_decide_when_growth_is_certain(store: Path) -> None:
+    tree = sb.open_store(store).load()
+    growth = sb.evolution(tree, -4.0)["growth"].sel(family="coarse", order=-4.0, time=0.8).item()
+    factor = 1 + (growth - 1) / 2
+    convergence = tree["convergence"].to_dataset()
+    sure = sb.evolution(tree, -4.0, factor=factor)["remesh_time"].sel(family="coarse", order=-4.0).item()
+    assert np.isfinite(sure)
+    for label in ("coarse/0.0", f"coarse/{sure}"):
+        errors = convergence["error"].copy()
+        # Either error alone may explain the growth.
+        first = convergence["distance"].sel(mesh="coarse/0.0", order=-4.0).item()
+        errors.loc[{"mesh": label, "order": -4.0}] = (growth - 1) * first
+        doubtful = tree.copy()
+        doubtful["convergence"] = xr.DataTree(convergence.assign(error=errors))
+        found = sb.evolution(doubtful, -4.0, factor=factor)["remesh_time"].sel(family="coarse", order=-4.0).item()
+        assert not found <= sure, label
+
+
+def test_a_first_distance_below_its_error_has_no_growth(store: Path) -> None:
+    tree = sb.open_store(store).load()
+    convergence = tree["convergence"].to_dataset()
+    errors = convergence["error"].copy()
+    errors.loc[{"mesh": "coarse/0.0", "order": -4.0}] = 1.0
+    tree["convergence"] = xr.DataTree(convergence.assign(error=errors))
+    found = sb.evolution(tree, -4.0).sel(family="coarse", order=-4.0)
+    assert found["growth"].isnull().all()
+    assert np.isnan(found["remesh_time"])
+    text = format_evolution(tree, "text", [-4.0])
+    assert "coarse: its first distance is not larger than its error, so nothing is known of its growth" in text
+    assert "nan" not in text
+
+
+def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Path) -> None:
+    ball = {"source": "icosphere", "levels": [0]}
+    study: dict[str, Any] = {
+        "study": {"name": "rounded"},
+        "lattice": {"xi_max": 2.0, "M": 16},
+        "norm": {"orders": [-4.0]},
+        "reference": {"source": "sphere"},
+        "family": [
+            {"name": "carried", "source": "flow", "mesh": ball, "times": [0.1 + 0.2, 1000000.1, 1000000.2]},
+            {"name": "true", "source": "flow", "mesh": {**ball, "levels": [2]}, "times": [0.3]},
+            {"name": "elsewhere", "source": "flow", "mesh": ball, "times": [7.0]},
+        ],
+    }
+    store = tmp_path / "rounded.zarr"
+    sb.run(sb.Study.from_table(study), store, client)
+    with pytest.raises(sb.InputError, match="the families 'elsewhere' and 'true' have no time in common"):
+        sb.evolution(store, truth="true")
+    assert np.isfinite(sb.evolution(store)["distance"]).sum() == 5
+    del study["family"][2]
+    store = tmp_path / "in-common.zarr"
+    sb.run(sb.Study.from_table(study), store, client)
+    found = sb.evolution(store, [-4.0, -4.0], truth="true")
+    assert np.isfinite(found["distance"].sel(time=0.1 + 0.2)).all()
+    assert found.sizes["order"] == 1
+    text = format_evolution(sb.open_store(store))
+    assert "1000000.1 " in text
+    assert "1000000.2 " in text
 
 
 def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
@@ -112,6 +176,8 @@ def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
     assert "ask for one of them" in wrong.stderr
     wrong = call("table", str(store), "--truth", "true", folder=tmp_path)
     assert "--truth belongs to --over-time" in wrong.stderr
+    wrong = call("table", str(store), "--factor", "3", folder=tmp_path)
+    assert "--factor belongs to --over-time" in wrong.stderr
 
 
 def test_the_plot_has_a_line_for_each_family(store: Path) -> None:

@@ -61,7 +61,7 @@ def test_spheres_cannot_be_reduced(kind: str) -> None:
     if kind == "remesh":
         pytest.importorskip("pyacvd", reason="remeshing needs the extra `studies`")
     (member,) = members({"source": kind, "mesh": {"source": "sphere"}, "triangles": [80]})
-    with pytest.raises(MeshError, match="sphere is a closed form; coarser meshes need a source of one mesh"):
+    with pytest.raises(MeshError, match="sphere is a closed form; its triangles are needed"):
         member.load()
 
 

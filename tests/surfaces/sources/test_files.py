@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import MeshError, StudyError
+from sobolev_batch import MeshError, Study, StudyError
 from sobolev_batch.surfaces.sources.fingerprints import file_digest
 from tests.support.members import listed, loaded, members
 from tests.support.mesh_files import box_scene, off
@@ -237,6 +237,26 @@ def test_times_come_from_names_or_from_a_list(tmp_path: Path) -> None:
     found = [(member.name, member.time) for member in members({**table, "times": [3, 1.5, 2]}, tmp_path)]
     assert found == [("s1_t2.5", 1.5), ("s1_t10", 2.0), ("s1_t0", 3.0)]
     assert all(member.time is None for member in members(table, tmp_path))
+
+
+def test_times_in_names_may_have_powers_of_ten(tmp_path: Path) -> None:
+    _frames(tmp_path, "t_1e-3.off", "t_2.5E+2.off", "t-7.off")
+    found = members({"source": "files", "paths": ["*.off"], "times": "names"}, tmp_path)
+    assert [member.time for member in found] == [1e-3, 7.0, 250.0]
+
+
+@pytest.mark.parametrize("times", ["Names", [], 3, [0, 1, "2"]])
+def test_times_of_another_kind_are_refused(times: Any) -> None:
+    with pytest.raises(StudyError, match=r"times: (must be a list of numbers|each time must be a finite number)"):
+        Study.from_table(
+            {
+                "study": {"name": "moving"},
+                "lattice": {"xi_max": 2.0, "M": 8},
+                "norm": {"orders": [-2.0]},
+                "reference": {"source": "sphere"},
+                "family": [{"name": "frames", "source": "files", "paths": ["*.off"], "times": times}],
+            }
+        )
 
 
 def test_times_that_do_not_belong_to_files_are_refused(tmp_path: Path) -> None:

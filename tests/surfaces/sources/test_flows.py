@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
+from sobolev_batch.surfaces.sources.flows import carried
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import loaded, members
 
@@ -21,7 +22,7 @@ def positions(time: float, **settings: Any) -> np.ndarray:
 
 
 def velocity(time: float, angles: np.ndarray, strength: float, period: float) -> np.ndarray:
-    """The second case of Nair and Lauritzen with a background rotation, as rates of longitude and latitude."""
+    """The fourth case of Nair and Lauritzen, as rates of longitude and latitude."""
     longitudes, latitudes = angles.reshape(2, -1)
     turned = longitudes - 2 * np.pi * time / period
     share = np.cos(np.pi * time / period)
@@ -64,9 +65,11 @@ def test_members_are_in_the_order_of_their_times() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"times": []}, "times"),
+        ({"times": []}, r"must be a list of numbers, such as \[0.0, 0.5, 1.0\]"),
+        ({"times": "0, 1"}, "must be a list of numbers"),
+        ({"times": [0.0, True]}, "each time must be a finite number, found True among them"),
         ({"times": [1.0, 2.0, 1.0]}, "each time can be there once, found 1 again"),
-        ({"times": [float("nan")]}, "times.0"),
+        ({"times": [float("nan")]}, "each time must be a finite number, found nan among them"),
         ({"period": 0.0}, "period"),
         ({"strength": float("inf")}, "strength"),
     ],
@@ -74,6 +77,17 @@ def test_members_are_in_the_order_of_their_times() -> None:
 def test_settings_are_checked(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_source({**FLOW, **change})
+
+
+def test_what_the_vertices_depend_on_is_in_the_fingerprint() -> None:
+    changes: list[dict[str, Any]] = [{}, {"times": [0.5]}, {"strength": 1.0}, {"period": 4.0}]
+    found = {members({**FLOW, **change})[0].fingerprint_digest() for change in changes}
+    assert len(found) == len(changes)
+
+
+def test_a_vertex_at_the_centre_stays() -> None:
+    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
+    np.testing.assert_array_equal(carried(points, 1.0, 5.0, 2.0)[0], 0.0)
 
 
 def test_the_flow_needs_one_mesh() -> None:

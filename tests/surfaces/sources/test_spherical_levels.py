@@ -84,7 +84,7 @@ def test_levels_need_meshes() -> None:
         tables = {"sphere": {"source": "sphere"}, "icosphere": BALL}
         table = {"source": "spherical-levels", "mesh": tables[surface], "sphere": tables[sphere], "levels": [1]}
         (member,) = members(table)
-        with pytest.raises(MeshError, match="sphere is a closed form; coarser meshes need a source of one mesh"):
+        with pytest.raises(MeshError, match="sphere is a closed form; its triangles are needed"):
             member.load()
 
 
