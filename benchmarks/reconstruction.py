@@ -22,7 +22,7 @@ from sobolev_batch.results.meshes.render import render
 from sobolev_batch.results.meshes.views import MeshView
 
 _MEASURED_AT = (-2.0, -4.0)
-# Steps after which a fit is drawn.
+# Steps of the fits that are drawn.
 _STAGES = (5, 20, 60, 150)
 # Of pictures, which are seen from the front and above.
 _RIGHT = np.array([1.4, 1.25, 0.0]) / np.hypot(1.4, 1.25)

@@ -41,9 +41,9 @@ def evolution(
     Returns:
         Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
         length, and `growth`, the distance over that of the family's first time with a distance, NaN if that is not
-        larger than its error. Over `family` and
-        `order` it has `remesh_time`, the first time at which the distance has certainly grown by the factor; later it
-        may fall again. NaN where a family has no mesh of a time, and where no time is late enough.
+        larger than its error. Over `family` and `order` it has `remesh_time`, the first time at which the distance has
+        certainly grown by the factor; later it may fall again. NaN where a family has no mesh of a time, where no time
+        is late enough, and without a growth.
 
     Raises:
         InputError: The store has no tables yet, no mesh with a time, no such order or family, or the factor is not
@@ -163,8 +163,7 @@ def _dataset(
     # Nothing is known of the growth of a distance that may be zero.
     growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
     late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
-    remesh_time = found["time"].where(late).min("time")
-    late &= growth.notnull()
+    remesh_time = found["time"].where(late & growth.notnull()).min("time")
     return found.assign(
         growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
         remesh_time=remesh_time.transpose("family", "order").assign_attrs(

@@ -127,9 +127,11 @@ def test_errors_decide_when_growth_is_certain(store: Path) -> None:
 def test_a_first_distance_below_its_error_has_no_growth(store: Path) -> None:
     tree = sb.open_store(store).load()
     convergence = tree["convergence"].to_dataset()
-    errors = convergence["error"].copy()
-    errors.loc[{"mesh": "coarse/0.0", "order": -4.0}] = 1.0
-    tree["convergence"] = xr.DataTree(convergence.assign(error=errors))
+    distances, errors = convergence["distance"].copy(), convergence["error"].copy()
+    # The others are many times as large.
+    distances.loc[{"mesh": "coarse/0.0", "order": -4.0}] = 1e-9
+    errors.loc[{"mesh": "coarse/0.0", "order": -4.0}] = 2e-9
+    tree["convergence"] = xr.DataTree(convergence.assign(distance=distances, error=errors))
     found = sb.evolution(tree, -4.0).sel(family="coarse", order=-4.0)
     assert found["growth"].isnull().all()
     assert np.isnan(found["remesh_time"])

@@ -236,8 +236,8 @@
     }, space);
   };
 
-  const drawings = [convergence, data.evolution && evolution, data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
-    data.witness.length && witness].filter(Boolean);
+  const drawings = [convergence, data.evolution && evolution, data.matrix && matrix, data.matrix && map,
+    data.spectrum && spectrum, data.energy && energy, data.witness.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
   document.addEventListener("order", ({ detail }) => { state.order = detail; redraw(); });
