@@ -4,13 +4,22 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere test test-fast coverage soak check bench docs audit format clean
+.PHONY: study icosphere league test test-fast coverage soak check bench docs audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
 
 icosphere: $(READY)  ## run the paper's study
 	$(BIN)/sobolev-batch run workflows/icosphere.toml
+
+MESHES := storage/remeshers/meshes.csv
+
+league: $(MESHES)  ## run four remeshers on eight objects and rank them
+	$(BIN)/sobolev-batch run workflows/remeshers/remeshers.toml
+
+$(MESHES): workflows/remeshers/make_meshes.py $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[remeshers]'
+	$(BIN)/python $< $(@D)
 
 # Whole files, in the order of tests/conftest.py. Three for two cores, since many tests wait for processes to start.
 PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder

@@ -18,6 +18,7 @@ from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
 from benchmarks.timing import Effort, machine_facts
 from benchmarks.transforms import against_the_direct_sum, against_the_paper, as_in_the_paper, growth
+from benchmarks.verdicts import verdicts
 
 _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "1": against_the_paper,
@@ -32,6 +33,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "10": low_orders,
     "11": fits,
     "12": reconstructions,
+    "13": verdicts,
     "growth": growth,
     "scale": tiny_meshes,
 }
@@ -50,7 +52,7 @@ def main() -> None:
         *machine_facts(),
         f"times are medians of {effort.repeats} turns each, taken alternately",
         "items 1 to 4: ratios of times are other / ours; items 5 to 7, 9, 11 and 12: ours / other; item 10: processor "
-        "seconds, and other / ours against sums; "
+        "seconds, and other / ours against sums; item 13: seconds, and those of Hausdorff and Chamfer distances; "
         "distances: relative difference",
     ]
     print("\n".join(["", format_table(rows), "", *facts]))

@@ -27,8 +27,20 @@ PAGES = {
     **{
         f"docs/{name}.md": f"{name}.html"
         for name in (
-            *("tutorial", "studies", "surfaces", "fitting", "reconstruction", "moving", "queries", "store", "numerics"),
-            *("clusters", "scale", "reliability", "stability", "design"),
+            *(
+                "walkthroughs",
+                "gallery",
+                "tutorial",
+                "commands",
+                "studies",
+                "leagues",
+                "formats",
+                "surfaces",
+                "fitting",
+                "reconstruction",
+                "moving",
+            ),
+            *("testing", "queries", "store", "numerics", "clusters", "scale", "reliability", "stability", "design"),
         )
     },
     "workflows/README.md": "workflows.html",

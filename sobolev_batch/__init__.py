@@ -8,6 +8,7 @@ task; a reduction over the stored fields makes the tables. Data flows one way th
     fitting    -> derivatives of distances, meshes that come nearer to a target
     batch      -> zarr store -> norms, distances, convergence (a study as tasks on a cluster)
     results    -> tables, plots, a report, a lazy DataTree
+    testing    -> verdicts on two surfaces, for test suites
 
 `surfaces` imports none of the others; `spectral` and `fitting` import neither dask nor zarr. See docs/design.md.
 
@@ -19,9 +20,11 @@ The public names by subject:
   on the way; `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for
   tensors.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
-- Surfaces: `Mesh`, `read_mesh`, `write_mesh`, `icosphere`, `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over
-  two `Interval`; a `Similarity` scales and moves them.
+- Surfaces: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`, `icosphere`,
+  `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two `Interval`, `PointCloud`, `read_points`; a
+  `Similarity` scales and moves them.
 - Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
+- Test suites: `assert_same_surface`, or `same_surface` for its `Verdict`.
 - For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
 - Studies: `Study`, `plan` and its `StudyPlan`, `run` and its `Summary`, `submit` and its `Submission`.
 - Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -50,6 +51,28 @@ def byte_count(memory: float | str) -> int:
             f"memory must be a positive number of bytes, or a size such as '4GB' or '800MiB', found {memory!r}"
         )
     return count
+
+
+def fraction(value: float | str) -> float:
+    """Return a positive fraction, given as a number or in per cent.
+
+    Args:
+        value: Number such as 0.01, or a text such as "0.01", "1%" or "1 %".
+
+    Raises:
+        InputError: It is neither, or not positive.
+
+    >>> fraction("1%"), fraction("0.01"), fraction(0.01)
+    (0.01, 0.01, 0.01)
+    """
+    text = str(value).strip()
+    try:
+        number = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        number = math.nan
+    if isinstance(value, bool) or not 0 < number < math.inf:
+        raise InputError(f"a fraction is a positive number such as 0.01, or a text such as '1%', found {value!r}")
+    return number
 
 
 def format_bytes(count: float) -> str:

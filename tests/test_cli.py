@@ -10,6 +10,7 @@ import select
 import shlex
 import signal
 import subprocess
+import sys
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from plyfile import PlyData, PlyElement
 
 import sobolev_batch as sb
 from sobolev_batch import icosphere
+from sobolev_batch.results.tables.formatting import Digits
 from tests.support.commands import COMMAND, STUDY, call, command
 from tests.support.drawing import obstacle
 
@@ -39,9 +42,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
     output, errors = (folder / "run.out").read_text(), (folder / "run.err").read_text()
     assert "Sobolev distance of order -10 to reference" in output
-    assert re.search(
-        r"ico/1 +80 +0\.5823 +\S+e-\d\d ± \S+e-\d\d +\S+e-\d\d +\d\.\d{3} ± \de-\d\d +(\d+\.\d %)?\n", output
-    )
+    number = r"\d+(\.\d+)?"
+    row = rf"ico/1 +80 +0\.5823 +{number} % ± {number} % +{number} ± {number} +{number} ± {number} +\d+ %\n"
+    assert re.search(row, output)
     assert "3 computed, 0 reused, 0 failed; store: storage/cli.zarr" in output
     assert re.search(r"dashboard: http://127\.0\.0\.1:\d+/status", errors)
     assert re.search(r"\[3/3\] \S+: complete, \d+\.\d\d s", errors)
@@ -58,7 +61,7 @@ def test_a_second_run_reuses_everything_and_starts_no_cluster(folder: Path) -> N
 def test_plan_and_status(folder: Path) -> None:
     plan = call("plan", "study.toml", folder=folder)
     assert plan.returncode == 0
-    assert "3 in 1 families, reference reference" in plan.stdout
+    assert "3 in 1 family, reference reference" in plan.stdout
     assert "xi_max 3, M 16, spacing 0.375, half period 1.33333" in plan.stdout
     assert "41.6KB per surface, 124.8KB in all" in plan.stdout
     assert "storage/cli.zarr, 3 of 3 already stored" in plan.stdout
@@ -79,21 +82,58 @@ def test_tables_in_every_format(folder: Path) -> None:
     records = json.loads(outputs["json"])
     assert [record["mesh"] for record in records] == ["ico/0", "ico/1"]
     assert {record["order"] for record in records} == {-3.0}
-    distance = f"{records[1]['distance']:.6e}"
-    for style in ("text", "markdown", "latex"):
-        assert distance in outputs[style], style
-    assert outputs["csv"].splitlines()[0].startswith("order,mesh,family,name,level,status,reason,triangles")
-    assert float(outputs["csv"].splitlines()[2].split(",")[9]) == records[1]["distance"]
+    relative = Digits.percent(records[1]["relative"], records[1]["relative_error"]).together
+    assert relative in outputs["text"]
+    assert relative in outputs["markdown"]
+    assert relative.replace("%", r"\%") in outputs["latex"]
+    header, _, line = (row.split(",") for row in outputs["csv"].splitlines()[:3])
+    assert header[:4] == ["order", "mesh", "family", "name"]
+    assert float(line[header.index("distance")]) == records[1]["distance"]
     assert records[0]["rate"] is None
     assert r"\toprule" in outputs["latex"]
     assert "| ico/1" in outputs["markdown"]
 
 
+def test_orders_come_in_lists_and_meshes_by_patterns(folder: Path) -> None:
+    def orders(*arguments: str) -> list[float]:
+        done = call("table", "storage/cli.zarr", "--format", "json", *arguments, folder=folder)
+        assert done.returncode == 0, done.stderr
+        return list(dict.fromkeys(record["order"] for record in json.loads(done.stdout)))
+
+    assert orders("--order", "-3,-10") == [-3.0, -10.0]
+    assert orders("--order=-3, -10", "--order", "-3.7,-3") == [-3.0, -10.0, -3.7]
+    listed = call("table", "storage/cli.zarr", "--order", "-3;-10", folder=folder)
+    assert (listed.returncode, listed.stdout) == (2, "")
+    assert "'-3;-10' is neither a number nor a list of numbers such as -4,-6" in " ".join(listed.stderr.split())
+    done = call("witness", "storage/cli.zarr", "--mesh", "*/[1]", "--order", "-3,-4", "--output", "w", folder=folder)
+    assert [Path(line).name for line in done.stdout.split()] == ["0001-ico-1.ply"]
+    assert "witness_minus_3" in (folder / "w" / "0001-ico-1.ply").read_bytes()[:2000].decode("ascii", "replace")
+    done = call("witness", "storage/cli.zarr", "--mesh", "ico/*", "--output", "w", folder=folder)
+    assert len(done.stdout.split()) == 2
+
+
 def test_matrices(folder: Path) -> None:
     done = call("table", "storage/cli.zarr", "--matrix", "--order", "-3", folder=folder)
-    assert re.search(r"^3 reference( +\d(\.\d+)?\(\d+\)e[+-]0\d){2}$", done.stdout, re.M), done.stdout
+    assert "order -3, in % of the norm of reference" in done.stdout
+    assert re.search(r"^3 reference( +\d+(\.\d+)?\(\d+\)){2}$", done.stdout, re.M), done.stdout
     lines = call("table", "storage/cli.zarr", "--matrix", "--format", "csv", folder=folder).stdout.splitlines()
     assert len(lines) == 1 + 2 * 3 * 3
+
+
+def test_the_smallest_mesh_below_a_bound(folder: Path) -> None:
+    (record,) = json.loads(
+        call("table", "storage/cli.zarr", "--below", "500%", "--order", "-3", "--format", "json", folder=folder).stdout
+    )
+    assert record["mesh"] == "ico/0"
+    none = call("table", "storage/cli.zarr", "--below", "0.001 %", folder=folder)
+    assert none.stdout.startswith("Smallest mesh below 0.001 % of the norm of reference, order -10\n")
+    assert "nearest: ico/1" in none.stdout
+    refused = call("table", "storage/cli.zarr", "--below", "much", folder=folder)
+    assert refused.returncode == 2
+    assert "a fraction is a positive number such as 0.01, or a text such as '1%', found 'much'" in refused.stderr
+    both = call("table", "storage/cli.zarr", "--below", "1%", "--matrix", folder=folder)
+    assert both.returncode == 2
+    assert "ask for one of them" in both.stderr
 
 
 def test_plot_draws_every_picture(folder: Path) -> None:
@@ -107,6 +147,35 @@ def test_plot_draws_every_picture(folder: Path) -> None:
     assert done.stdout.split() == [f"pictures/{name}.png" for name in names]
     for name in done.stdout.split():
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_plot_for_a_paper(folder: Path) -> None:
+    place = ("plot", "storage/cli.zarr", "--output", "paper")
+    chosen = ("--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
+    done = call(*place, *chosen, "--format", "svg,pdf", "--format", "pdf", folder=folder)
+    files = done.stdout.split()
+    assert files[:4] == [f"paper/{name}.{ending}" for name in ("convergence", "transform") for ending in ("svg", "pdf")]
+    assert all((folder / name).exists() for name in files)
+    text = (folder / "paper" / "convergence.svg").read_text(encoding="utf-8")
+    assert "number of vertices" in text
+    # In points.
+    assert 'width="238.11' in text
+    assert 'height="170.07' in text
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--family", "co*"), "the study has no family 'co*', only ico, reference"),
+        (("--format", "png,gif"), "'gif' is none of png, svg, pdf"),
+        (("--size", "6"), "a size is WIDTHxHEIGHT"),
+    ],
+)
+def test_plots_that_cannot_be_had(folder: Path, option: tuple[str, str], words: str) -> None:
+    done = call("plot", "storage/cli.zarr", "--output", "none", *option, folder=folder)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not (folder / "none").exists()
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +192,11 @@ def test_compare_to_an_accuracy(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--order", "-6", "--rtol", "1e-3", folder=pair)
     assert done.returncode == 0
     assert re.search(r"^xi_max \d\.\d+, M \d+, complex", done.stdout, re.M)
-    value, error = map(float, re.findall(r"order -6: (\S+) ± (\S+)", done.stdout)[0])
-    assert error <= 1e-3 * value
+    sentence = r"^1\.off differs from 3\.off by (\S+) % ± (\S+) % at order -6"
+    value, error = map(float, re.findall(sentence, done.stdout)[0])
+    # One digit is shown of the error, rounded up.
+    assert error <= 2e-3 * value
+    assert re.search(r"^order -6: distance 0\.\d+ ± 0\.\d+ \(truncation", done.stdout, re.M)
 
 
 @pytest.mark.parametrize(("option", "words"), [("--M", "M must be an even integer"), ("--xi-max", "xi_max must be")])
@@ -147,16 +219,18 @@ def test_an_accuracy_out_of_reach_is_wrong_input(pair: Path) -> None:
 def test_files_with_equal_triangles_need_no_computation(pair: Path) -> None:
     done = call("compare", "3.off", "3.off", "--order", "-0.6", "--rtol", "1e-2", folder=pair)
     assert done.returncode == 0, done.stderr
-    assert "both files have the same triangles" in done.stdout
-    assert re.search(r"^order -0.6: 0\.0+e\+00 ± 0e\+00", done.stdout, re.MULTILINE)
+    assert done.stdout.startswith("3.off and 3.off are identical: they have the same triangles.\nscale ")
+    assert call("compare", "3.off", "3.off", folder=pair).stdout == done.stdout
 
 
 def test_an_accuracy_at_a_low_order_says_what_was_sampled(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--order", "-1", "--rtol", "1e-1", folder=pair)
     assert re.search(r"^xi_max .*, \d+ octaves up to \d.*, seed 0$", done.stdout, re.MULTILINE)
-    number, *parts = re.findall(r"\d\.?\d*e[+-]\d+", done.stdout.splitlines()[-1])[1:]
+    number, texts = re.findall(r"^order -1: distance \S+ ± (\S+) \((.*)\)", done.stdout, re.MULTILINE)[0]
+    parts = re.findall(r"\d\.?\d*e[+-]\d+", texts)
     assert len(parts) == 4
-    assert sum(map(float, parts)) == pytest.approx(float(number), rel=0.3)
+    # The sum is rounded up to one digit.
+    assert 0.5 * float(number) < sum(map(float, parts)) < 1.1 * float(number)
 
 
 def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
@@ -186,12 +260,133 @@ def test_the_old_name_of_memory_works_for_now(pair: Path) -> None:
 
 
 def test_compare_two_files(pair: Path) -> None:
-    done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", folder=pair)
+    done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", "--M", "64", folder=pair)
     assert done.returncode == 0, done.stderr
     assert re.match(
-        r"scale 0\.5\d*, origin \S+ \S+ \S+\norder -4: \S+e-01 ± .*\norder -2: \S+e\+00 ± \S+ \(truncation .*\)\n$",
+        r"1\.off differs from 3\.off by \S+ % ± \S+ % at order -4; \d+ % of it is lost area\.\n"
+        r"1\.off differs from 3\.off by \S+ % ± \S+ % at order -2; \d+ % of it is lost area\.\n"
+        r"order -4: distance 0\.\d+ ± .*\norder -2: distance \S+ ± \S+ \(truncation .*\)\n"
+        r"scale 0\.5\d*, origin \S+ \S+ \S+\n$",
         done.stdout,
     )
+
+
+def test_compare_is_exact_to_1_per_cent_without_options(pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", folder=pair)
+    value, error = map(float, re.findall(r"by (\S+) % ± (\S+) % at order -2", done.stdout)[0])
+    # One digit is shown of the error, rounded up.
+    assert error <= 0.02 * value
+    assert re.search(r"^xi_max ", done.stdout, re.M)
+
+
+def test_compare_writes_where_meshes_differ(pair: Path, tmp_path: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--order", "-4", "--witness", str(tmp_path / "new" / "w"), folder=pair)
+    assert re.search(r"\n1\.off has less area near \(.*\); witness: \S+-a\.ply \S+-b\.ply\n$", done.stdout)
+    for label, name in (("a", "1.off"), ("b", "3.off")):
+        written, own = sb.read_mesh(tmp_path / "new" / f"w-{label}.ply"), sb.read_mesh(pair / name)
+        np.testing.assert_array_equal(written.vertices, own.vertices)
+
+
+def test_compare_names_changes_that_are_as_far_away(pair: Path) -> None:
+    options = ("--order", "-4", "--xi-max", "3", "--M", "24", "--yardsticks")
+    done = call("compare", "1.off", "3.off", *options, folder=pair)
+    assert done.returncode == 0, done.stderr
+    assert re.search(
+        r"^At order -4, 1\.off is as far from 3\.off as\n"
+        r"  3\.off moved by \S+ % of its radius,\n"
+        r"  3\.off with noise of \S+ % of its radius,\n"
+        r"  3\.off decimated to \d+ triangles\.\n",
+        done.stdout,
+        re.M,
+    )
+
+
+@pytest.mark.parametrize(
+    ("files", "below", "status", "start"),
+    [
+        (("3.off", "3.off"), "1e-6", 0, "same surface: relative distance 0 ± 0 "),
+        (("1.off", "3.off"), "0.2", 0, "same surface: "),
+        (("1.off", "3.off"), "0.01", 1, "different surfaces: "),
+    ],
+)
+def test_the_exit_status_of_a_verdict(files: tuple[str, str], below: str, status: int, start: str, pair: Path) -> None:
+    done = call("compare", *files, "--below", below, folder=pair)
+    assert (done.returncode, done.stderr) == (status, "")
+    (line,) = done.stdout.splitlines()
+    assert line.startswith(f"{files[0]}: {start}")
+    assert f"at order -4, {'within' if status == 0 else 'above'} rtol {float(below):g}" in line
+
+
+def test_what_cannot_be_told_has_an_exit_status_of_its_own(pair: Path) -> None:
+    # As exactly as the package itself computes it.
+    first, third = (sb.read_mesh(pair / name) for name in ("1.off", "3.off"))
+    truth = float(sb.distance(first, third, -4, rtol=1e-4)["distance"] / sb.norm(third, -4, rtol=1e-4)["norm"])
+    done = call("compare", "1.off", "3.off", "--no-scaling", "--below", repr(truth), folder=pair)
+    assert done.returncode == 4
+    assert done.stdout.startswith("1.off: undecided: ")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--proximity", "--rtol", "0.1"), "gives a verdict and no numbers; leave out --proximity, --rtol"),
+        (("--order", "-2", "--order", "-4"), "--below takes one --order"),
+        (("--below", "1"), "--below takes a fraction between 0 and 1, or 0 and 100 %, found 1"),
+    ],
+)
+def test_a_verdict_takes_no_options_of_numbers(options: tuple[str, ...], message: str, pair: Path) -> None:
+    done = call("compare", "1.off", "3.off", "--below", "0.1", *options, folder=pair)
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+@pytest.fixture(scope="module")
+def scans(pair: Path) -> Path:
+    """The same folder, with points on the spheres: as text, and as PLY with areas."""
+    points = 2.0 * icosphere(2).vertices
+    np.savetxt(pair / "scan.xyz", points)
+    rows = np.array([(*point, 0.3) for point in points], dtype=[(name, "f8") for name in ("x", "y", "z", "patch")])
+    PlyData([PlyElement.describe(rows, "vertex")]).write(pair / "scan.ply")
+    return pair
+
+
+def test_compare_points_with_a_mesh(scans: Path) -> None:
+    done = call("compare", "scan.ply", "3.off", "--weight", "patch", "--order", "-4", folder=scans)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.match(r"scan\.ply differs from 3\.off by \S+ % ± \S+ % at order -4", done.stdout)
+    area = str(0.3 * len(icosphere(2).vertices))
+    # The same points and areas in another file, and as the reference.
+    same = call("compare", "scan.xyz", "3.off", "--area", area, "--order", "-4", folder=scans)
+    assert same.stdout == done.stdout.replace("scan.ply", "scan.xyz")
+    turned = call("compare", "3.off", "scan.xyz", "--area", area, "--below", "0.9", folder=scans)
+    assert (turned.returncode, turned.stderr) == (0, "")
+    assert turned.stdout.startswith("3.off: same surface: ")
+
+
+def test_equal_points_are_told_apart_from_equal_triangles(scans: Path) -> None:
+    done = call("compare", "scan.xyz", "scan.xyz", "--area", "50", folder=scans)
+    assert done.stdout.startswith("scan.xyz and scan.xyz are identical: they have the same points.\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("scan.xyz", "3.off"), "scan.xyz holds points and no triangles; give the area of each by --weight, or that"),
+        (("scan.ply", "3.off", "--below", "0.1"), "scan.ply holds points and no triangles"),
+        (("1.off", "3.off", "--area", "50"), "--weight and --area are for files of points, and both files have tri"),
+        (("scan.xyz", "3.off", "--area", "50", "--proximity"), "--proximity takes two meshes; leave it out for points"),
+        (("scan.xyz", "3.off", "--area", "50", "--yardsticks"), "--yardsticks takes two meshes"),
+        (("scan.xyz", "scan.ply", "--area", "50", "--witness", "w"), "--witness takes at least one mesh; leave it out"),
+        (("scan.xyz", "3.off", "--area", "50", "--weight", "4"), "both --weight and --area are given; give one of"),
+        (("nowhere.ply", "3.off", "--area", "50"), "nowhere.ply: cannot be read"),
+        (("scan.xyz", "3.off", "--weight", "4"), "scan.xyz: the file has 3 columns and no column 4"),
+        (("scan.xyz", "3.off", "--area", "50", "--order", "-1"), "finite only for orders below -3/2, found -1"),
+    ],
+)
+def test_points_that_cannot_be_compared(arguments: tuple[str, ...], message: str, scans: Path) -> None:
+    done = call("compare", *arguments, folder=scans)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert message in done.stderr
 
 
 def test_compare_two_files_by_proximity(pair: Path) -> None:
@@ -202,7 +397,7 @@ def test_compare_two_files_by_proximity(pair: Path) -> None:
 
 BAD = [
     (("run", "no.toml"), "no.toml: cannot be read: No such file or directory"),
-    (("run", "broken.toml"), "unknown key lattice.m"),
+    (("run", "broken.toml"), "[lattice]: unknown key m: did you mean M?"),
     (("run", "order.toml"), "orders below -1/2, found -0.5"),
     (("run", "odd.toml"), "M must be an even integer"),
     (("run", "outside.toml"), "holds only |coordinate| < 1/(2h) = 0.666667"),
@@ -211,12 +406,19 @@ BAD = [
     (("run", "other.toml", "--store", "storage/cli.zarr"), "a store of another study is there"),
     (("status", "nothing.zarr"), "no store of a study is there"),
     (("table", "nothing.zarr"), "no store of a study is there"),
-    (("table", "storage/cli.zarr", "--order", "-7"), "the store has no order -7, only -10, -3"),
+    (("table", "storage/cli.zarr", "--order", "-0.4"), "finite only for orders below -1/2, found -0.4"),
     (("compare", "a.ply", "b.ply"), "a.ply: cannot be read"),
     (("compare", "nan.off", "nan.off"), "nan.off: 1 of 3 vertices have NaN"),
     (("plot", "storage/cli.zarr", "--output", "study.toml"), "study.toml: pictures cannot be written there"),
     (("plot", "storage/cli.zarr", "--witness", "ico/11"), "no mesh 'ico/11', did you mean 'ico/1'?"),
     (("witness", "storage/cli.zarr", "--mesh", "ico/11"), "no mesh 'ico/11', did you mean 'ico/1'?"),
+    (("witness", "storage/cli.zarr", "--mesh", "scan*"), "no computed mesh with triangles that matches 'scan*'; its"),
+    (("report", "storage/cli.zarr", "--witness", "r*"), "that matches 'r*'; its labels are such as 'ico/0', 'ico/1'"),
+    (
+        ("run", "study.toml", "--store", "huge.zarr", "--memory", "1000TB"),
+        "memory of a worker of 1.0PB is more than there is",
+    ),
+    (("plan", "greedy.toml"), "[accuracy]: memory of 1.0PB is more than any worker has"),
     (("witness", "storage/cli.zarr", "--mesh", "reference"), "'reference' is the reference: its witness is zero"),
     (("witness", "storage/cli.zarr", "--output", "study.toml"), "study.toml: no files can be written there"),
 ]
@@ -230,6 +432,8 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
     outside = STUDY.replace("M = 16", "M = 8").replace('"sphere"', '"icosphere"\nlevels = [1]')
     (folder / "outside.toml").write_text(outside)
     (folder / "other.toml").write_text(STUDY.replace('"cli"', '"other"'))
+    greedy = STUDY.replace("[lattice]\nxi_max = 3.0\nM = 16", '[accuracy]\nrtol = 0.1\nmemory = "1000TB"')
+    (folder / "greedy.toml").write_text(greedy)
     (folder / "taken").mkdir(exist_ok=True)
     (folder / "taken" / "precious").write_text("text")
     (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
@@ -240,6 +444,47 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
     assert done.stderr.count("\n") == 1
     assert done.stdout == ""
     assert (folder / "taken" / "precious").read_text() == "text"
+
+
+COMMANDS = "compare fit init league plan plot release report run status submit table verify witness"
+# Libraries that take long to import.
+NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic trimesh matplotlib finufft psutil tabulate"
+HELP = """
+import sys
+from click.testing import CliRunner
+from sobolev_batch.cli import cli
+
+for arguments in (["--help"], *([name, "--help"] for name in cli.commands)):
+    shown = CliRunner().invoke(cli, arguments, env={"COLUMNS": sys.argv[1]})
+    assert shown.exit_code == 0
+    print(shown.output)
+print(*cli.commands, file=sys.stderr)
+assert not set(sys.modules) & set(sys.argv[2:]), set(sys.modules) & set(sys.argv[2:])
+"""
+
+
+@pytest.mark.parametrize("columns", ["80", "100"])
+def test_help_imports_nothing_that_computes(columns: str) -> None:
+    arguments = [sys.executable, "-c", HELP, columns, *NUMERICS.split()]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert sorted(done.stderr.split()) == COMMANDS.split()
+    assert max(map(len, done.stdout.splitlines())) <= int(columns)
+    assert "..." not in done.stdout.replace("[ARGS]...", "")
+    # Every option says in sentences what it does.
+    for text in re.findall(r"^  -.*(?:\n {10,}.*)*", done.stdout, re.MULTILINE):
+        words = " ".join(text.split())
+        assert re.search(r"\w[)']?\.( |$)", words), words
+
+
+def test_shells_complete_commands_and_options() -> None:
+    environment = {"_SOBOLEV_BATCH_COMPLETE": "bash_source"}
+    script = [sys.executable, "-c", "from sobolev_batch.cli import cli; cli(prog_name='sobolev-batch')"]
+    source = subprocess.run(script, capture_output=True, text=True, check=False, env={**os.environ, **environment})
+    assert "complete -o nosort -F _sobolev_batch_completion sobolev-batch" in source.stdout
+    asked = {"_SOBOLEV_BATCH_COMPLETE": "bash_complete", "COMP_WORDS": "sobolev-batch table --o", "COMP_CWORD": "2"}
+    found = subprocess.run(script, capture_output=True, text=True, check=False, env={**os.environ, **asked})
+    assert found.stdout.split() == ["plain,--order", "plain,--over-time"]
 
 
 def test_wrong_input_ends_a_process_in_the_same_way(folder: Path) -> None:
@@ -331,7 +576,10 @@ def balls(tmp_path: Path) -> Path:
 def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(balls: Path) -> None:
     done = command("fit", "start.ply", "target.ply", "-o", "fitted.obj", "--order", "-4", "--steps", "20", folder=balls)
     assert done.returncode == 0, done.stderr
-    numbers = r"distance (\S+e-\d\d) ± \S+, Hausdorff at least (\S+), Chamfer (\S+), smallest angle (\S+) degrees"
+    numbers = (
+        r"differs by (\S+) % ± \S+ %, distance \S+ ± \S+, Hausdorff ≥ (\S+), "
+        r"Chamfer (\S+), smallest angle (\S+) degrees"
+    )
     before, after = (re.search(rf"{word}: +{numbers}", done.stdout) for word in ("before", "after"))
     assert before is not None
     assert after is not None
@@ -372,7 +620,7 @@ def test_the_options_of_fit_reach_it(balls: Path) -> None:
 def test_fit_keeps_the_unit_if_asked(balls: Path) -> None:
     arguments = ("start.ply", "target.ply", "-o", "f.ply", "--steps", "1")
     scaled, own = (call("fit", *arguments, *more, folder=balls).stdout for more in ((), ("--no-scaling",)))
-    numbers = [re.search(r"before: distance (\S+)", text) for text in (scaled, own)]
+    numbers = [re.search(r"before: differs by .*, distance (\S+)", text) for text in (scaled, own)]
     assert numbers[0] is not None
     assert numbers[1] is not None
     # The square root of a length of some 30 units, and more.

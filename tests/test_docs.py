@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 import sobolev_batch as sb
+from sobolev_batch.cli import cli
 from tests.support.repository import PACKAGE, ROOT
 
 
@@ -113,6 +114,14 @@ def test_the_versions_of_stored_results_are_those_of_the_code() -> None:
     for name in ("Schema", "Numerics"):
         (version,) = re.findall(rf"^{name.upper()}_VERSION = (\d+)$", sources, re.MULTILINE)
         assert f"- **{name} version**, {version} now:" in text
+
+
+def test_every_command_is_listed_with_its_functions() -> None:
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| .* \| (.+) \|$", text, re.MULTILINE)
+    assert sorted(command for command, _ in rows) == sorted(cli.commands)
+    for _, functions in rows:
+        assert set(re.findall(r"`sb\.(\w+)`", functions)) <= set(sb.__all__)
 
 
 def test_every_deprecated_parameter_is_listed() -> None:

@@ -20,7 +20,7 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     numbers = re.findall(r"^\*\*(\d+)\.", (ROOT / "docs" / "queries.md").read_text(encoding="utf-8"), re.M)
     assert numbers == [str(i + 1) for i in range(10)]
-    assert len(blocks("docs/queries.md", "python")) == 11
+    assert len(blocks("docs/queries.md", "python")) == 13
     found = run_blocks("docs/queries.md")
 
     levels = [f"icosphere/{level}" for level in range(4)]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -14,23 +14,29 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.compare import Comparer
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
-from sobolev_batch.batch.cluster.clients import local_client, thread_client
+from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_store_access
 from sobolev_batch.batch.cluster.worker_plugin import waiting_reason
+from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.fields.compute import compute_fields
+from sobolev_batch.batch.reuse import first_choice, take_over
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
-from sobolev_batch.batch.store.store import stored_choice
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace
-from sobolev_batch.errors import DamageError
+from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.html import reasons, table_html
+from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.spectral.backends.machine import require_machine_memory
 from sobolev_batch.spectral.errors.budget import NormEstimate
 
 _log = logging.getLogger(__name__)
@@ -55,6 +61,7 @@ class Summary:
         failed: Reason for each mesh whose field could not be computed, by its label.
         not_compared: For each mesh whose field is stored, but not the witness function or the Hausdorff and Chamfer
             distances that the study asks for: the comparison that is missing, and the reason.
+        imprecise: Largest relative error of the distances of each mesh that are less accurate than the study asks for.
 
     >>> import sobolev_batch as sb
     >>> summary = sb.Summary("results.zarr", computed=("ico/2",), reused=("ico/1",), failed={"f/a": "no triangles"})
@@ -67,32 +74,48 @@ class Summary:
     reused: tuple[str, ...]
     failed: Mapping[str, str]
     not_compared: Mapping[str, str] = field(default_factory=dict)
+    imprecise: Mapping[str, float] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        counts = f"{len(self.computed)} computed, {len(self.reused)} reused, {len(self.failed)} failed"
+        errors = {label: f"error of {100 * error:.2g} %" for label, error in self.imprecise.items()}
+        return table_html(
+            f"Run: {counts}",
+            [
+                ("store", self.store),
+                *reasons("failed", self.failed),
+                *reasons("not compared", self.not_compared),
+                *reasons("imprecise", errors),
+            ],
+        )
 
     @classmethod
     def _of(cls, workspace: Workspace, computed: set[int], not_compared: Mapping[str, str]) -> Self:
-        labels, failed = workspace.labels, workspace.failures
+        labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
         return cls(
             workspace.store.path,
-            tuple(label for i, label in enumerate(labels) if i in computed and label not in failed),
-            tuple(label for i, label in enumerate(labels) if i not in computed),
+            tuple(label for i, label in labels.items() if i in computed and label not in failed),
+            tuple(label for i, label in labels.items() if i not in computed),
             failed,
             not_compared,
+            _imprecise(workspace),
         )
 
 
 def run(
-    study: Study,
+    study: Study | StudyCollection,
     store: str | Path | Location,
     client: Client | None = None,
     *,
     workers: int | None = None,
     memory: float | str | None = None,
     on_progress: Notify | None = None,
+    reuse: Sequence[str | Path | Location] = (),
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
     Args:
-        study: Study to carry out.
+        study: Study to carry out, or collection: studies of several objects, one after the other.
         store: Path or URL of a new or existing store. All workers must reach it under the same name. A store
             in memory://, which is gone when the process ends, is computed by threads of this process.
         client: Client of the cluster to compute on. By default a cluster of single-threaded processes on
@@ -102,9 +125,14 @@ def run(
         memory: Memory of each of these workers, in bytes or as a text such as "4GB"; by default the
             machine's, divided equally.
         on_progress: Callback for each step; it is called in this thread.
+        reuse: Paths or URLs of other stores. Fields that they have already are copied, not computed: of the same
+            surface, reference, scaling, accuracy and lattice, whatever the mesh is called there. So the stores of parts
+            of a study become one. Of the store of a collection, those of the same object are. If the study asks for an
+            accuracy, a new store takes the lattice of the first one.
 
     Returns:
-        Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise.
+        Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
+        neither does an object whose study cannot be carried out; labels begin with the name of the object.
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
@@ -113,7 +141,8 @@ def run(
             written by another run (LockError).
         ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice; or
             the scheduler was lost.
-        InputError: The memory is not a size, or too little for a worker.
+        InputError: The memory is not a size, or too little for a worker; or the study or its workers ask for more than
+            there is.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -132,23 +161,136 @@ def run(
     >>> tree["distances"]["distance"].sizes["mesh"]
     2
     """
-    location = Location.of(store)
+    location, reusable = Location.of(store), _Reusable.of([Location.of(other) for other in reuse])
     cluster: AbstractContextManager[Client]
     if client is None:
+        # The workers of another cluster are asked before anything is computed.
+        for one in [study] if isinstance(study, Study) else study.studies.values():
+            if one.accuracy is not None and one.accuracy.asks_for_memory:
+                require_machine_memory(one.accuracy.allowed_bytes, "[accuracy]: memory")
+        if memory is not None:
+            # Otherwise a store would be made before the cluster refuses it.
+            memory_limit(memory)
         # In threads, where no other process would see the store.
         cluster = thread_client(workers) if location.is_in_memory else local_client(workers, memory)
     else:
         location, cluster = location.absolute(), nullcontext(client)
-    lock = Lock.of_this_process()
-    require_usable(location)
-    with locked(location, lock):
-        if client is not None:
-            require_store_access(client, location, lock)
-        return carry_out(study, location, lock, cluster, on_progress or (lambda progress: None))
+    for other in reusable.of_all():
+        Store.open(other)
+    job = _Job(cluster, client, on_progress or (lambda progress: None))
+    if isinstance(study, StudyCollection):
+        return job.run_every(study, location, reusable)
+    return job.run(study, location, reusable.of_all())
+
+
+@dataclass(frozen=True)
+class _Reusable:
+    """Other stores, whose fields are taken over.
+
+    Attributes:
+        single: Stores of single objects.
+        collections: Stores of the objects of each collection, by name.
+    """
+
+    single: tuple[Location, ...]
+    collections: tuple[Mapping[str, Location], ...]
+
+    @classmethod
+    def of(cls, locations: Sequence[Location]) -> Self:
+        """Return the stores at locations, of single objects or of collections."""
+        found = {location: CollectionStore.found(location) for location in locations}
+        return cls(
+            tuple(location for location, collection in found.items() if collection is None),
+            tuple(collection.begun for collection in found.values() if collection is not None),
+        )
+
+    def of_object(self, name: str) -> tuple[Location, ...]:
+        """Return the stores that may have fields of an object."""
+        return (*self.single, *(stores[name] for stores in self.collections if name in stores))
+
+    def of_all(self) -> tuple[Location, ...]:
+        """Return all stores."""
+        return (*self.single, *(store for stores in self.collections for store in stores.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Settings that all studies of one call of `run` share.
+
+    Attributes:
+        clients: Context that gives the client of the cluster.
+        client: Client that the caller has given, if any.
+        notify: Callback for each step.
+    """
+
+    clients: AbstractContextManager[Client]
+    client: Client | None
+    notify: Notify
+
+    def run(self, study: Study, location: Location, others: Sequence[Location]) -> Summary:
+        """Run one study, and take over fields of other stores."""
+        lock = Lock.of_this_process()
+        require_usable(location)
+        with locked(location, lock):
+            if self.client is not None:
+                require_store_access(self.client, location, lock)
+            return carry_out(study, location, lock, self.clients, self.notify, others)
+
+    def telling(self, part: str) -> Self:
+        """Return the job of a part of a collection, whose progress names it."""
+        return replace(self, notify=lambda progress: self.notify(replace(progress, part=part)))
+
+    def run_every(self, collection: StudyCollection, location: Location, reusable: _Reusable) -> Summary:
+        """Run the study of each object of a collection. One that cannot be carried out stops no other."""
+        stores = CollectionStore.prepared(location, collection).stores
+        summaries: dict[str, Summary] = {}
+        failed: dict[str, str] = {}
+        with ExitStack() as stack:
+            job = replace(self, clients=_EnteredOnce(self.clients, stack))
+            for number, (name, study) in enumerate(collection.studies.items(), 1):
+                part = f"{name}, {number} of {len(stores)}"
+                try:
+                    summaries[name] = job.telling(part).run(study, stores[name], reusable.of_object(name))
+                except StoreError:
+                    # That of the next object would not fare better.
+                    raise
+                except InputError as error:
+                    _log.error("%s: %s", name, error)
+                    failed[name] = str(error)
+        return Summary(
+            str(location),
+            tuple(f"{name}/{label}" for name, summary in summaries.items() for label in summary.computed),
+            tuple(f"{name}/{label}" for name, summary in summaries.items() for label in summary.reused),
+            failed
+            | {f"{name}/{label}": why for name, summary in summaries.items() for label, why in summary.failed.items()},
+            {f"{name}/{label}": why for name, one in summaries.items() for label, why in one.not_compared.items()},
+            {f"{name}/{label}": error for name, one in summaries.items() for label, error in one.imprecise.items()},
+        )
+
+
+class _EnteredOnce(AbstractContextManager[Client]):
+    """A context that is entered when it is first needed, and left with a stack: one cluster for many studies."""
+
+    def __init__(self, clients: AbstractContextManager[Client], stack: ExitStack) -> None:
+        self._clients, self._stack = clients, stack
+        self._client: Client | None = None
+
+    def __enter__(self) -> Client:
+        if self._client is None:
+            self._client = self._stack.enter_context(self._clients)
+        return self._client
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the context to the stack."""
 
 
 def carry_out(
-    study: Study, location: Location, lock: Lock, clients: AbstractContextManager[Client], notify: Notify
+    study: Study,
+    location: Location,
+    lock: Lock,
+    clients: AbstractContextManager[Client],
+    notify: Notify,
+    others: Sequence[Location] = (),
 ) -> Summary:
     """Run a study in a store that this process has locked; see `run`.
 
@@ -158,13 +300,16 @@ def carry_out(
         lock: Lock of the store.
         clients: Context that gives the client, entered if anything is missing.
         notify: Callback for each step.
+        others: Other stores, whose fields are taken over.
     """
-    plan = make_plan(study, stored_choice(location))
+    plan = make_plan(study, first_choice([location, *others]))
     # Planning may take minutes.
     lock.require(location)
     workspace = Workspace.prepared(location, plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
+        if others:
+            workspace.withdraw_results_of(take_over(workspace, others))
         if not workspace.pending and are_tabulated(workspace) and Comparer.of(workspace).is_done:
             return Summary._of(workspace, set(), {})
         with clients as client:
@@ -180,6 +325,7 @@ def carry_out(
             cluster = Cluster.of(client, study.libraries, beat)
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend)
+            cluster.workers.require_accuracy(study.accuracy)
             heartbeat.find_obstacle = lambda: waiting_reason(client, study.backend)
             workspace.store.scratch.discard()
             return _Run(cluster, heartbeat).carry_out(workspace)
@@ -245,6 +391,24 @@ class _Run:
                 workspace.withdraw(rows, "its values are not what was stored")
                 repaired.update(rows)
         raise AssertionError("unreachable: the last attempt returns or raises")
+
+
+def _imprecise(workspace: Workspace) -> dict[str, float]:
+    """Return the largest relative error of each mesh whose distances miss the accuracy, by its label."""
+    if workspace.plan.study.accuracy is None:
+        return {}
+    group = "convergence"
+    labels = workspace.store.read_strings(f"{group}/mesh")
+    distances, errors, relative, within = (
+        np.asarray(workspace.store.read(f"{group}/{name}", ...)) for name in ("distance", "error", "relative", "within")
+    )
+    # Of what is next to equal to the reference, no computation gives digits.
+    short = ~within.astype(bool) & (relative > NEXT_TO_EQUAL)
+    return {
+        label: float(np.max(errors[i][short[i]] / distances[i][short[i]]))
+        for i, label in enumerate(labels)
+        if short[i].any()
+    }
 
 
 def _larger_lattice(plan: Plan, distances: NormEstimate | None) -> LatticeChoice | None:

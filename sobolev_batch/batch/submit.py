@@ -88,8 +88,10 @@ def submit(study: Study, store: str | Path | Location, client: Client, *, timeou
     acquire(location, lock)
     try:
         require_store_access(client, location, lock)
+        workers = prepare_workers(client, study.libraries)
+        workers.with_backend(study.backend)
+        workers.require_accuracy(study.accuracy)
         plan = make_plan(study, stored_choice(location))
-        prepare_workers(client, study.libraries).with_backend(study.backend)
         workspace = Workspace.prepared(location, plan)
         heartbeat = Heartbeat(workspace.store, lock)
         heartbeat.cluster = client.scheduler.address

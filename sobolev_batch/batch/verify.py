@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 from sobolev_batch.batch.cluster.clients import available_cores
 from sobolev_batch.batch.cluster.execution import Cluster, Task
+from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
@@ -19,6 +21,7 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
+from sobolev_batch.html import reasons, table_html
 from sobolev_batch.parameters import renamed_parameters
 
 _log = logging.getLogger(__name__)
@@ -40,6 +43,8 @@ class Verification:
         tables: Damage of tables and coordinates, by the name of the array.
         withdrawn: True if the damaged records, and the tables if anything is damaged, were withdrawn, so that the
             next run computes them again.
+        objects: Verification of each object of a collection, by its name; none for a single study. The total of an
+            object without a store is 0.
 
     >>> import sobolev_batch as sb
     >>> sb.Verification("results.zarr", 5, 5, {}, {}, {}, withdrawn=False).is_sound
@@ -53,6 +58,37 @@ class Verification:
     comparisons: Mapping[str, str]
     tables: Mapping[str, str]
     withdrawn: bool
+    objects: Mapping[str, Verification] = field(default_factory=dict)
+
+    @classmethod
+    def _of_objects(cls, store: Location, objects: Mapping[str, Verification]) -> Self:
+        """Return the verification of a collection; labels begin with the name of the object."""
+
+        def joined(damage: Callable[[Verification], Mapping[str, str]]) -> dict[str, str]:
+            return {f"{name}/{label}": what for name, one in objects.items() for label, what in damage(one).items()}
+
+        damaged = [one for one in objects.values() if not one.is_sound]
+        return cls(
+            str(store),
+            sum(one.complete for one in objects.values()),
+            sum(one.total for one in objects.values()),
+            joined(lambda one: one.fields),
+            joined(lambda one: one.comparisons),
+            joined(lambda one: one.tables),
+            bool(damaged) and all(one.withdrawn for one in damaged),
+            objects,
+        )
+
+    def _repr_html_(self) -> str:
+        damage = [
+            *reasons("field", self.fields),
+            *reasons("comparison", self.comparisons),
+            *reasons("table", self.tables),
+        ]
+        remark = [("withdrawn", "the next run computes what is damaged again")] if self.withdrawn else []
+        verdict = f"Verification: {'sound' if self.is_sound else 'damaged'}"
+        counts = f"{self.complete} of {self.total} complete"
+        return table_html(verdict, [("store", self.store), ("surfaces", counts), *damage, *remark])
 
     @property
     def is_sound(self) -> bool:
@@ -65,8 +101,9 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     """Read everything that a store holds, and withdraw what is damaged so that a run computes it again.
 
     Args:
-        store: Path or URL of the store. If it cannot be written, nothing is withdrawn.
-        on_progress: Callback with the number of fields that were read, and the number of all.
+        store: Path or URL of the store, or that of a collection, whose objects are verified one after the other. If it
+            cannot be written, nothing is withdrawn.
+        on_progress: Callback with the number of fields of a store that were read, and the number of all.
 
     Raises:
         StoreError: The store does not exist, or cannot be read at all.
@@ -85,6 +122,19 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     >>> found.is_sound, found.complete, found.total
     (True, 2, 2)
     """
+    collection = CollectionStore.found(Location.of(store))
+    if collection is None:
+        return _verify_study(store, on_progress)
+    verified = {
+        name: _verify_study(place, on_progress)
+        if Store(place).exists()
+        else Verification(str(place), 0, 0, {}, {}, {}, withdrawn=False)
+        for name, place in collection.stores.items()
+    }
+    return Verification._of_objects(collection.location, verified)
+
+
+def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int], None] | None) -> Verification:
     opened = Store.open(store)
     lock = Lock.of_this_process()
     try:
@@ -110,6 +160,10 @@ def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
     labels, complete = store.labels(), complete_records(store.records())
     damaged = {row: f"its completion record is damaged ({what})" for row, what in store.record_table.damaged().items()}
+    tables = Tables(store).damaged()
+    if not tables:
+        lost = Tables(store).without_records(store.records())
+        damaged |= {row: "its completion record is missing" for row in lost if row not in damaged}
     whole = store.rows_with_complete_fields() if complete else set()
 
     def damage_of(row: int) -> str:
@@ -121,7 +175,6 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
-    tables = Tables(store).damaged()
     comparisons = {kind: _damaged_records(store, kind) for kind in KINDS}
     comparisons["witness"] |= _damaged_witnesses(store, complete)
     withdraw = lock is not None and bool(damaged or tables or any(comparisons.values()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
@@ -27,30 +27,29 @@ class Workspace:
     Attributes:
         store: Store, laid out for the plan.
         plan: Plan of the study.
-        rows: Rows of the plan, in the order of the store.
-        records: Completion record of each row, kept up to date; None without one.
+        labels: Label of each row of the store.
+        rows: Rows of the plan, by their number in the store. The store may have others, of meshes that the study
+            has lost: their fields stay, in case the meshes come back.
+        records: Completion record of each row of the store, kept up to date; None without one.
     """
 
     store: Store
     plan: Plan
-    rows: tuple[Row, ...]
+    labels: tuple[str, ...]
+    rows: Mapping[int, Row]
     records: list[Record | None]
 
     @classmethod
     def of(cls, store: Store, plan: Plan) -> Self:
         """Return the workspace of a store that is laid out for a plan."""
-        by_label = {row.label: row for row in plan.rows}
-        return cls(store, plan, tuple(by_label[label] for label in store.labels()), list(store.records()))
+        by_label, labels = {row.label: row for row in plan.rows}, store.labels()
+        rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
+        return cls(store, plan, labels, rows, list(store.records()))
 
     @classmethod
     def prepared(cls, location: Location, plan: Plan) -> Self:
         """Create or open the store of a plan; see `prepare_store`."""
         return cls.of(prepare_store(location, plan), plan)
-
-    @property
-    def labels(self) -> list[str]:
-        """Label of each row."""
-        return [row.label for row in self.rows]
 
     @property
     def reference(self) -> int:
@@ -59,20 +58,22 @@ class Workspace:
 
     @property
     def complete(self) -> dict[int, Record]:
-        """Records of the rows whose fields are stored."""
-        return complete_records(self.records)
+        """Records of the study's rows whose fields are stored."""
+        return {i: record for i, record in complete_records(self.records).items() if i in self.rows}
 
     @property
     def pending(self) -> list[int]:
         """Rows whose fields are to be computed."""
-        return [i for i, record in enumerate(self.records) if record is None or not record.completes(self.rows[i].key)]
+        records = {i: self.records[i] for i in self.rows}
+        return [i for i, record in records.items() if record is None or not record.completes(self.rows[i].key)]
 
     @property
     def failures(self) -> dict[str, str]:
         """Reason of each row without a field, by its label."""
+        records = {row.label: self.records[i] for i, row in self.rows.items()}
         return {
-            row.label: record.reason if record else "not computed"
-            for row, record in zip(self.rows, self.records, strict=True)
+            label: record.reason if record else "not computed"
+            for label, record in records.items()
             if record is None or record.status == "failed"
         }
 

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+from contextlib import suppress
+from typing import NoReturn
 
 import click
 
 # Importing these modules adds their commands to the group.
-from sobolev_batch.cli import fitting, meshes, stores, studies  # noqa: F401
-from sobolev_batch.cli.group import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_OTHER, EXIT_TERMINATED, cli
-from sobolev_batch.cli.interruption import Terminated, ignore_requests, raise_when_asked
+from sobolev_batch.cli import fitting, league, meshes, stores, studies  # noqa: F401
+from sobolev_batch.cli.group import EXIT_INPUT, EXIT_OTHER, cli
+from sobolev_batch.cli.interruption import (
+    SECONDS_TO_END,
+    Deadline,
+    Terminated,
+    end_process,
+    ignore_requests,
+    raise_when_asked,
+)
 from sobolev_batch.errors import InputError, SobolevBatchError
 
 __all__ = ["cli", "main"]
 
 # What to know about commands that were asked to end.
 _REMARKS = {"run": "; the same command continues from the store"}
+# They give up their lock of a store, which takes until the storage has answered.
+_SECONDS_WITH_LOCK = dict.fromkeys(("run", "submit", "verify", "release"), 30.0)
 
 
 def main() -> None:
@@ -23,20 +35,18 @@ def main() -> None:
     debug = "--debug" in sys.argv
     command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
     # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
-    raise_when_asked()
+    deadline = Deadline(_REMARKS.get(command, ""), _SECONDS_WITH_LOCK.get(command, SECONDS_TO_END))
+    raise_when_asked(deadline)
     try:
         status = cli.main(standalone_mode=False)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, click.Abort):
-        ignore_requests()
-        click.echo(f"interrupted{_REMARKS.get(command, '')}", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+        # Some work takes SIGTERM for an interrupt.
+        _end(deadline.request or signal.SIGINT, command)
     except Terminated:
-        ignore_requests()
-        click.echo(f"terminated{_REMARKS.get(command, '')}", err=True)
-        sys.exit(EXIT_TERMINATED)
+        _end(signal.SIGTERM, command)
     except Exception as error:
         if debug:
             raise
@@ -45,3 +55,12 @@ def main() -> None:
         click.echo(f"error: {message}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
     sys.exit(status or 0)
+
+
+def _end(request: int, command: str) -> NoReturn:
+    """End a command that has cleaned up after itself."""
+    ignore_requests()
+    with suppress(OSError):
+        sys.stdout.flush()
+    # Without the end of the interpreter, which waits for threads that may still compute.
+    end_process(request, _REMARKS.get(command, ""))

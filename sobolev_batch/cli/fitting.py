@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import click
-import numpy as np
 
 from sobolev_batch.cli.group import cli
-from sobolev_batch.cli.interruption import terminations_as_interrupts
+from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.fit import fit
-from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitProgress
-from sobolev_batch.fitting.refine import refine
-from sobolev_batch.fitting.task import require_comparable
-from sobolev_batch.surfaces.formats.readers import read_mesh
-from sobolev_batch.surfaces.formats.writers import require_writable, write_mesh
-from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+
+if TYPE_CHECKING:
+    from sobolev_batch.fitting.closeness import Closeness
+    from sobolev_batch.fitting.optimisation.stages import FitProgress
+    from sobolev_batch.surfaces.shapes.mesh import Mesh
+    from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 # In radii of the target; distances have about as many digits.
 _MOST_ROUNDING = 1e-6
 
 
-@cli.command("fit")
+@cli.command("fit", short_help="Move the vertices of START to bring it nearer to TARGET.")
 @click.argument("start", type=click.Path(path_type=Path))
 @click.argument("target", type=click.Path(path_type=Path))
 @click.option(
@@ -37,28 +35,26 @@ _MOST_ROUNDING = 1e-6
     "--output",
     type=click.Path(path_type=Path),
     required=True,
-    help="File to write, .ply, .obj, .off or .stl.",
+    help="Write the mesh to this file, .ply, .obj, .off or .stl.",
 )
-@click.option(
-    "--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Sobolev order of the distance to lower."
-)
-@click.option("--steps", type=int, default=DEFAULT_STEPS, show_default=True, help="Largest number of steps.")
+@click.option("--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Lower the distance of this order.")
+@click.option("--steps", type=int, default=DEFAULT_STEPS, show_default=True, help="Take so many steps at most.")
 @click.option(
     "--smoothing",
     type=float,
     default=DEFAULT_SMOOTHING,
     show_default=True,
-    help="Smoothness of steps; more keeps triangles and worst points better, and the distance falls less. A far START "
-    "takes at least 4.",
+    help="Make steps so smooth. Smoother ones keep triangles and worst points better, but lower the distance less. "
+    "A far START takes at least 4.",
 )
 @click.option(
     *("--refine-to", "triangles"),
     type=int,
     metavar="TRIANGLES",
-    help="Split edges too, where that lowers the distance most, until there are so many triangles.",
+    help="Split edges, too, until there are so many triangles: those where that lowers the distance most.",
 )
 @click.option("--keep-boundary", is_flag=True, help="Leave vertices of open boundaries where they are.")
-@click.option("--no-scaling", is_flag=True, help="Keep the files' unit; otherwise TARGET is scaled to the unit sphere.")
+@click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise TARGET is scaled to the unit sphere.")
 def fit_command(
     start: Path,
     target: Path,
@@ -75,6 +71,16 @@ def fit_command(
     Both are mesh files in the same unit. The triangles stay as they are, unless you refine them. Ctrl-C ends with the
     best mesh so far, and so does SIGTERM.
     """
+    import numpy as np
+
+    from sobolev_batch.fitting.fit import fit
+    from sobolev_batch.fitting.refine import refine
+    from sobolev_batch.fitting.task import require_comparable
+    from sobolev_batch.surfaces.formats.readers import read_mesh
+    from sobolev_batch.surfaces.formats.writers import require_writable, write_mesh
+    from sobolev_batch.surfaces.shapes.mesh import Mesh
+    from sobolev_batch.surfaces.shapes.similarity import Similarity
+
     require_writable(output)
     if output.exists() and output.samefile(target):
         raise InputError(f"{output}: this is the target, which would be lost; name another file")
@@ -83,7 +89,7 @@ def fit_command(
     require_comparable(own, goal)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(goal)
     method = fit if triangles is None else partial(refine, triangles=triangles)
-    with _Steps() as shown, terminations_as_interrupts():
+    with _Steps() as shown, Deadline.with_results(shown.has_begun):
         fitted = method(
             similarity.apply(own),
             similarity.apply(goal),
@@ -105,6 +111,10 @@ def fit_command(
 
 def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str]:
     """Yield a remark if the file of a mesh, or the mesh's own unit, lacks digits for its vertices."""
+    import numpy as np
+
+    from sobolev_batch.surfaces.formats.readers import read_mesh
+
     try:
         written = read_mesh(path)
     except MeshError as error:
@@ -124,7 +134,12 @@ class _Steps:
     """Shows the steps of a fit on a terminal."""
 
     def __init__(self) -> None:
+        self._has_begun = False
         self._bar: Any = click.progressbar(length=1, label="steps", file=sys.stderr) if sys.stderr.isatty() else None
+
+    def has_begun(self) -> bool:
+        """Return whether a step has been taken."""
+        return self._has_begun
 
     def __enter__(self) -> Self:
         if self._bar is not None:
@@ -138,6 +153,7 @@ class _Steps:
             self._bar.__exit__(kind, error, trace)
 
     def __call__(self, progress: FitProgress) -> None:
+        self._has_begun = True
         if self._bar is not None:
             self._bar.length = progress.steps
             # Earlier rounds may have needed fewer steps than they had.
@@ -146,10 +162,13 @@ class _Steps:
 
 def _text(closeness: Closeness, scale: float) -> str:
     """Return the numbers on one line, lengths in the files' unit."""
-    if not np.isfinite(closeness.distance):
+    from sobolev_batch.results.tables.formatting import Digits
+
+    if not math.isfinite(closeness.distance):
         return "not measured"
-    parts = [f"distance {closeness.distance:.4e} ± {closeness.error:.0e}"]
-    if np.isfinite(closeness.hausdorff):
-        parts.append(f"Hausdorff at least {closeness.hausdorff / scale:.3g}")
+    relative = Digits.percent(closeness.relative, closeness.relative_error).together
+    parts = [f"differs by {relative}, distance {Digits.of(closeness.distance, closeness.error).together}"]
+    if math.isfinite(closeness.hausdorff):
+        parts.append(f"Hausdorff ≥ {closeness.hausdorff / scale:.3g}")
         parts.append(f"Chamfer {closeness.chamfer / scale:.3g}")
     return ", ".join([*parts, f"smallest angle {closeness.smallest_angle:.3g} degrees"])

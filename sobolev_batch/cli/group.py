@@ -7,8 +7,10 @@ import sys
 
 import click
 
-# Exit statuses; shells expect the last two after SIGINT and SIGTERM.
-EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 3, 130, 143
+# Exit statuses; `end_process` has those after SIGINT and SIGTERM.
+EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED = 1, 2, 3
+# Of `compare --below`, beside 0 for files that are the same; like diff, which has 1 for files that differ.
+EXIT_DIFFERENT, EXIT_UNDECIDED = 1, 4
 # Loggers of the drivers of object storage.
 _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
 
@@ -23,7 +25,8 @@ def cli(context: click.Context, debug: bool) -> None:
     A study file names families of meshes and a reference. `run` stores the Fourier transform of every
     mesh and prints its distance from the reference.
 
-    Exit status: 0 all done, 1 another error, 2 wrong input, 3 some meshes failed.
+    The exit status is 0 if all is done, 1 after another error, 2 if the input is wrong, 3 if some meshes failed, 130
+    after Ctrl-C and 143 after SIGTERM.
     """
     context.obj = debug
     logging.basicConfig(
@@ -36,5 +39,11 @@ def cli(context: click.Context, debug: bool) -> None:
         for driver in _DRIVERS:
             logging.getLogger(driver).setLevel(logging.INFO)
     else:
-        # The cluster's messages at shutdown would only hide the table.
-        logging.getLogger("distributed").setLevel(logging.ERROR)
+        # Not by the level of its logger, which the cluster sets itself when it is imported.
+        for handler in logging.root.handlers:
+            handler.addFilter(_is_shown)
+
+
+def _is_shown(record: logging.LogRecord) -> bool:
+    """Return whether a message is for users: those of the cluster at its start and end would only hide the table."""
+    return record.levelno >= logging.ERROR or not record.name.startswith("distributed")

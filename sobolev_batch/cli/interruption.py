@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, NoReturn
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 # By then the finalizer has returned.
 _AGAIN_SECONDS = 0.01
+# Time in which a command ends by itself; a transform may take longer to return to Python.
+SECONDS_TO_END = 1.0
+# Work that ends with what it has leaves out up to three steps, each when it is asked again.
+_SECONDS_TO_LEAVE_OUT = 0.5
 
 
 class Terminated(SystemExit):
     """The process was asked to end by SIGTERM."""
 
 
-def raise_when_asked() -> None:
+def raise_when_asked(deadline: Deadline) -> None:
     """Raise KeyboardInterrupt and `Terminated` in the main thread when the process is asked to end.
 
     Python only reports an exception that a signal raises within a finalizer. It is then raised again.
+
+    Args:
+        deadline: Deadline for the end of the process from then on.
     """
     signal.signal(signal.SIGTERM, _terminate)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
         signal.signal(signal.SIGINT, _interrupt)
     if not hasattr(signal, "setitimer"):  # Windows
         return
+    deadline.start()
     report = sys.unraisablehook
 
     def insist(lost: UnraisableHookArgs) -> None:
@@ -48,14 +58,79 @@ def raise_when_asked() -> None:
     sys.unraisablehook = insist
 
 
-@contextmanager
-def terminations_as_interrupts() -> Iterator[None]:
-    """Raise KeyboardInterrupt at SIGTERM as well, for work that ends with what it has."""
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+class Deadline:
+    """The end of this process soon after a request to end, even while it computes.
+
+    Python raises no exception until a library returns to it. A thread of its own hears of signals at once. It leaves
+    the command some time to clean up, and then ends the process: files and stores are only ever replaced as a whole.
+
+    Args:
+        remark: What to add to the last message.
+        seconds: Time to clean up.
+
+    Attributes:
+        request: Number of the signal that asks for the end; 0 before.
+    """
+
+    _current: ClassVar[Deadline | None] = None
+
+    def __init__(self, remark: str = "", seconds: float = SECONDS_TO_END) -> None:
+        self._remark, self._seconds = remark, seconds
+        self.request = 0
+        self._has_results: Callable[[], bool] | None = None
+        self._is_met = threading.Event()
+
+    def start(self) -> None:
+        """Listen to signals from now on."""
+        Deadline._current = self
+        requests, wake = os.pipe()
+        os.set_blocking(wake, False)
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+        threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
+
+    def _listen(self, requests: int) -> None:
+        number = 0
+        while number not in (signal.SIGINT, signal.SIGTERM):
+            number = os.read(requests, 1)[0]
+        self.request = number
+        while not self._is_met.wait(_SECONDS_TO_LEAVE_OUT if self._has_results else self._seconds):
+            if self._has_results is None or not self._has_results():
+                end_process(number, self._remark)
+            # It keeps what it has, and is to leave out whatever else takes long.
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    @classmethod
+    @contextmanager
+    def with_results(cls, has_results: Callable[[], bool]) -> Iterator[None]:
+        """Raise KeyboardInterrupt at each request, SIGTERM too, for work that ends with what it has.
+
+        Args:
+            has_results: Function that tells whether there is anything yet. It is called in another thread.
+        """
+        before = signal.signal(signal.SIGTERM, _interrupt)
+        deadline = cls._current or Deadline()
+        deadline._has_results = has_results
+        try:
+            yield
+        except BaseException:
+            signal.signal(signal.SIGTERM, before)
+            raise
+        finally:
+            deadline._has_results = None
+        if deadline.request:
+            # What is left to do is short, and nothing may come between.
+            deadline._is_met.set()
+            ignore_requests()
+        else:
+            signal.signal(signal.SIGTERM, before)
+
+
+def end_process(number: int, remark: str) -> NoReturn:
+    """End this process at once, with the last message and the status that shells expect: 130 or 143."""
+    word = "interrupted" if number == signal.SIGINT else "terminated"
+    with suppress(OSError):
+        os.write(2, f"{word}{remark}\n".encode())
+    os._exit(128 + number)
 
 
 def ignore_requests() -> None:
@@ -77,5 +152,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _silence_cancellations() -> None:
-    """Keep the event loop of Dask's client from printing a traceback for each call that the request cancels."""
-    logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
+    """Keep Dask from printing a traceback for each call that the request cancels, and for each worker that ends."""
+    for name in ("tornado.application", "distributed"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -4,83 +4,169 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from sobolev_batch.cli.below import below_option, judge_files
 from sobolev_batch.cli.group import cli
-from sobolev_batch.cli.options import memory_of
-from sobolev_batch.parameters import byte_count
-from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.norms import distance
-from sobolev_batch.surfaces.formats.readers import read_mesh
-from sobolev_batch.surfaces.proximity import proximity
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.cli.options import best_effort_option, memory_of, memory_option, orders_option
+from sobolev_batch.cli.points import point_options, read_pair, require_mesh, two_meshes
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Of compare, which takes the nearest that can be had where nobody asks for more.
+_DEFAULT_RTOL = 1e-2
 
 
 @cli.command("compare")
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
-@click.option("--order", "orders", type=float, multiple=True, help="Sobolev order; may be repeated. [default: -2]")
-@click.option("--rtol", type=float, help="Largest relative error; use instead of --xi-max and --M.")
-@click.option("--memory", type=byte_count, metavar="SIZE", help="Memory of a transform, for --rtol. [default: 2GB]")
+@orders_option("Print the distance of this order, which may be any below -1/2.", "-2")
+@click.option("--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest to be had]")
+@memory_option("Let a transform for --rtol take so much memory. [default: 2GB]")
 @click.option("--memory-gb", type=float, hidden=True)
-@click.option("--xi-max", type=float, help="Highest frequency on each axis. [default: 5]")
-@click.option("--M", "intervals", type=int, help="Lattice intervals on each axis. [default: 64]")
-@click.option("--proximity", "with_proximity", is_flag=True, help="Also print Hausdorff and Chamfer distances.")
-@click.option("--no-scaling", is_flag=True, help="Keep the files' unit; otherwise B is scaled to the unit sphere.")
+@best_effort_option
+@click.option(
+    "--xi-max",
+    type=float,
+    help="Sample frequencies up to this one on each axis, in place of --rtol. [default: 5 with --M]",
+)
+@click.option(
+    "--M",
+    "intervals",
+    type=int,
+    help="Divide each axis of the lattice into so many intervals, in place of --rtol. [default: 64 with --xi-max]",
+)
+@click.option(
+    "--yardsticks",
+    "with_yardsticks",
+    is_flag=True,
+    help="Print which move, noise and decimation bring B as far from itself, too. It takes several times as long.",
+)
+@click.option("--proximity", "with_proximity", is_flag=True, help="Print Hausdorff and Chamfer distances, too.")
+@click.option(
+    "--witness",
+    "witness_path",
+    type=click.Path(path_type=Path),
+    metavar="PATH",
+    help="Write both meshes with the witness function of the first order at their vertices, for MeshLab: into "
+    "PATH-a.ply and PATH-b.ply.",
+)
+@click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
+@point_options
+@below_option
+@click.pass_context
 def compare_command(
+    context: click.Context,
     a: Path,
     b: Path,
     orders: tuple[float, ...],
     rtol: float | None,
     memory: int | None,
     memory_gb: float | None,
+    best_effort: bool,
     xi_max: float | None,
     intervals: int | None,
+    with_yardsticks: bool,
     with_proximity: bool,
+    witness_path: Path | None,
     no_scaling: bool,
+    weight: str | None,
+    area: float | None,
+    below: float | None,
 ) -> None:
-    """Print the Sobolev distance of two mesh files.
+    """Print how much two files of meshes or points differ.
 
-    B is the reference.
+    B is the reference. The difference is given in per cent of its norm, with a bound on the error, and with the share
+    of the squared distance that a change of area explains. With --below, print one line on whether both are the same
+    surface. The exit status is then 0 if they are, 1 if they are not, and 4 if that cannot be told.
     """
+    from sobolev_batch.parameters import byte_count
+    from sobolev_batch.spectral.lattice import Lattice
+    from sobolev_batch.spectral.metrics.norms import distance
+    from sobolev_batch.spectral.metrics.yardsticks import yardsticks
+    from sobolev_batch.surfaces.proximity import proximity
+    from sobolev_batch.surfaces.shapes.mesh import Mesh
+    from sobolev_batch.surfaces.shapes.placement import placement_doubt
+    from sobolev_batch.surfaces.shapes.similarity import Similarity
+    from sobolev_batch.testing.witness import require_place, write_difference
+
+    if below is not None:
+        context.exit(judge_files(context, a, b, below))
     if rtol is not None and (xi_max is not None or intervals is not None):
         raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
     memory = memory_of(memory, "--memory-gb", None if memory_gb is None else byte_count(1e9 * memory_gb))
-    lattice = (
-        None if rtol is not None else Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
-    )
-    first, second = read_mesh(a), read_mesh(b)
+    lattice = None
+    if xi_max is not None or intervals is not None:
+        lattice = Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
+    elif rtol is None:
+        rtol, best_effort = _DEFAULT_RTOL, True
+    first, second = read_pair(a, b, weight, area)
+    if witness_path is not None:
+        require_mesh("--witness", (first, second))
+        require_place(witness_path)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)
+    doubt = placement_doubt(*(surface.extent for surface in pair))
+    if doubt is not None:
+        click.echo(f"note: {a.name}: {doubt}", err=True)
     # Refused before a long computation where its library is not installed.
-    nearness = proximity(*pair) if with_proximity else None
-    orders = tuple(dict.fromkeys(orders)) or (-2.0,)
-    results = distance(*pair, orders, lattice=lattice, rtol=rtol, memory=memory)
-    click.echo(f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}")
-    if rtol is not None and "M" not in results.attrs:
-        click.echo("both files have the same triangles: nothing had to be computed")
-    elif rtol is not None:
-        click.echo(_settings_text(results.attrs))
-    for order in results["order"].values:
-        result = results.sel(order=order)
-        names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
-        parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
-        remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
-        click.echo(f"order {order:g}: {result['distance'].item():.9e} ± {result['error'].item():.0e} ({parts}){remark}")
+    nearness = proximity(*two_meshes("--proximity", pair)) if with_proximity else None
+    orders = orders or (-2.0,)
+    accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
+    if with_yardsticks:
+        results = yardsticks(*two_meshes("--yardsticks", pair), orders, **accuracy)
+    else:
+        results = distance(*pair, orders, **accuracy)
+    parts = "triangles" if isinstance(first, Mesh) else "points"
+    _print_answers(a.name, b.name, results, first.area / second.area - 1, parts, rtol)
+    click.echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
     if nearness is not None:
         click.echo(
             f"Hausdorff at least {nearness.hausdorff:.2e}, "
             f"Chamfer {nearness.chamfer:.4e} ± {nearness.chamfer_error:.0e} (s.e.)"
         )
+    if witness_path is not None:
+        difference = write_difference(first, second, witness_path, orders[0], scaling=not no_scaling)
+        click.echo(difference.sentence(a.name))
+
+
+def _print_answers(
+    name: str, reference: str, results: xr.Dataset, area_change: float, parts: str, rtol: float | None
+) -> None:
+    """Print a sentence for each order, what is as far away if that was measured, and then the numbers."""
+    from sobolev_batch.results.tables.sentences import answer, likeness
+
+    by_order = [results.sel(order=order) for order in results["order"].values]
+    for sentence in dict.fromkeys(answer(name, reference, result, area_change, parts) for result in by_order):
+        click.echo(sentence)
+    # Of equal meshes there is no more to tell.
+    unequal = [result for result in by_order if result["distance"] > 0]
+    for result in unequal if "moved" in results else ():
+        click.echo(likeness(name, reference, result))
+    for result in unequal:
+        click.echo(_details(result, rtol))
+    if rtol is not None and "M" in results.attrs:
+        click.echo(_settings_text(results.attrs))
+
+
+def _details(result: xr.Dataset, rtol: float | None) -> str:
+    """Return the distance of one order and the parts of its error, on one line."""
+    from sobolev_batch.results.tables.formatting import Digits
+
+    names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
+    parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
+    remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
+    distance_text = Digits.of(result["distance"].item(), result["error"].item()).together
+    return f"order {result['order'].item():g}: distance {distance_text} ({parts}){remark}"
 
 
 def _settings_text(attributes: Mapping[str, Any]) -> str:
     """Return what was chosen for an accuracy, on one line."""
     text = f"xi_max {attributes['xi_max']:.4g}, M {attributes['M']}, {attributes['dtype']}"
     if attributes["octaves"]:
-        text += (
-            f", {attributes['octaves']} octaves up to {attributes['highest_frequency']:.4g}, seed {attributes['seed']}"
-        )
+        octaves = f"{attributes['octaves']} octave{'s' * (attributes['octaves'] != 1)}"
+        text += f", {octaves} up to {attributes['highest_frequency']:.4g}, seed {attributes['seed']}"
     return text

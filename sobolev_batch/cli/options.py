@@ -1,23 +1,95 @@
-"""Options that several commands have."""
+"""Options that several commands have.
+
+The modules of commands import whatever computes inside of their functions: with it, a command would take seconds to
+show its help.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.results.tables.defaults import FORMATS
+
+if TYPE_CHECKING:
+    from sobolev_batch.batch.storage.location import Location
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-store_argument = click.argument("store", type=Location.of, metavar="STORE")
+
+class Numbers(click.ParamType):  # type: ignore[type-arg]
+    """One number, or several with commas between them."""
+
+    name = "numbers"
+
+    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> tuple[float, ...]:
+        """Return the numbers of an option."""
+        try:
+            # A default was converted already.
+            return value if isinstance(value, tuple) else tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is neither a number nor a list of numbers such as -4,-6", param, context)
+
+
+def orders_option(text: str, default: str) -> Callable[[Command], Command]:
+    """Return the option --order of a command, which takes several orders: each once, as they are given."""
+
+    def flattened(context: click.Context, param: click.Parameter, lists: tuple[tuple[float, ...], ...]) -> Any:
+        return tuple(dict.fromkeys(number for numbers in lists for number in numbers))
+
+    return click.option(
+        *("--order", "orders"),
+        type=Numbers(),
+        multiple=True,
+        callback=flattened,
+        metavar="ORDERS",
+        help=f"{text} Give several as --order -4,-6, or repeat the option. [default: {default}]",
+    )
+
+
+def meshes_option(name: str, text: str, default: str) -> Callable[[Command], Command]:
+    """Return an option that takes labels of meshes."""
+    return click.option(
+        *(name, "meshes"),
+        multiple=True,
+        metavar="MESH",
+        help=f"{text} A pattern such as 'scans/*' stands for several. The option may be repeated. [default: {default}]",
+    )
+
+
+def location(value: Any) -> Location:
+    """Return the location of a store that an option names."""
+    from sobolev_batch.batch.storage.location import Location
+
+    return Location.of(value)
+
+
+def _memory_size(value: Any) -> int:
+    from sobolev_batch.parameters import byte_count
+
+    return byte_count(value)
+
+
+store_argument = click.argument("store", type=location, metavar="STORE")
 store_option = click.option(
-    "--store", type=Location.of, metavar="PATH|URL", help="Store of the results. [default: storage/NAME.zarr]"
+    "--store", type=location, metavar="PATH|URL", help="Keep the results in this store. [default: storage/NAME.zarr]"
+)
+format_option = click.option(
+    *("--format", "style"),
+    type=click.Choice(FORMATS),
+    default="text",
+    show_default=True,
+    help="Print text, markdown or latex for people, csv or json for programs.",
 )
 study_argument = click.argument("study", type=click.Path(path_type=Path))
-order_option = click.option("--order", "orders", type=float, multiple=True, help="Only this order; may be repeated.")
+best_effort_option = click.option(
+    "--best-effort",
+    is_flag=True,
+    help="Compute the nearest accuracy that can be had where the one asked for is out of reach. Mark what falls short.",
+)
 trust_option = click.option(
     "--trust-network",
     is_flag=True,
@@ -28,20 +100,25 @@ folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path),
     default=".",
-    help="Base folder of the study's relative paths, to rebuild its meshes. [default: current folder]",
+    help="Rebuild the meshes of the study with its relative paths starting here. [default: current folder]",
 )
 up_option = click.option(
     "--up",
     type=click.Choice(["x", "y", "z"]),
     default="z",
     show_default=True,
-    help="Axis of the meshes that points up.",
+    help="Draw the meshes with this axis pointing up.",
 )
 
 
 def output_option(text: str, default: str) -> Callable[[Command], Command]:
     """Return the option --output of a command that writes files."""
     return click.option("--output", type=click.Path(path_type=Path), default=default, show_default=True, help=text)
+
+
+def memory_option(text: str, *, old: str = "") -> Callable[[Command], Command]:
+    """Return the option --memory, or a hidden one that is its old name."""
+    return click.option(old or "--memory", type=_memory_size, metavar="SIZE", help=text, hidden=bool(old))
 
 
 def memory_of(memory: int | None, old: str, old_memory: int | None) -> int | None:
@@ -52,3 +129,10 @@ def memory_of(memory: int | None, old: str, old_memory: int | None) -> int | Non
         raise click.UsageError(f"{old} is the old name of --memory; give --memory alone")
     click.echo(f"{old} is now called --memory and takes sizes such as 4GB; {old} will be removed", err=True)
     return old_memory
+
+
+def fraction_of_norm(text: str) -> float:
+    """Return a number such as 0.01 or 1%."""
+    from sobolev_batch.parameters import fraction
+
+    return fraction(text)

@@ -9,36 +9,63 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.release import release
-from sobolev_batch.batch.verify import verify
 from sobolev_batch.cli.group import EXIT_OTHER, EXIT_SOME_FAILED, cli
-from sobolev_batch.cli.options import folder_option, order_option, output_option, store_argument, up_option
+from sobolev_batch.cli.options import (
+    folder_option,
+    format_option,
+    fraction_of_norm,
+    meshes_option,
+    orders_option,
+    output_option,
+    store_argument,
+    up_option,
+)
+from sobolev_batch.cli.reporter import ProgressLine
 from sobolev_batch.errors import SobolevBatchError, StoreError
-from sobolev_batch.results.open import fields_read, open_store
-from sobolev_batch.results.status import status
-from sobolev_batch.results.tables.convergence import format_table
-from sobolev_batch.results.tables.evolution import REMESHING_FACTOR, format_evolution
-from sobolev_batch.results.tables.matrix import format_matrix
-from sobolev_batch.results.tables.text import FORMATS, Format
+from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
 
 if TYPE_CHECKING:
+    from sobolev_batch.batch.storage.location import Location
+    from sobolev_batch.results.figures.pictures import PictureFormat
     from sobolev_batch.results.meshes.views import Axis
 
-_FOLLOW_SECONDS = 5.0
+_FOLLOW_SECONDS = 2.0
+_PICTURE_FORMATS = ("png", "svg", "pdf")
+
+
+def _formats(given: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the formats that are listed, each once."""
+    formats = tuple(dict.fromkeys(part.strip().lower() for text in given for part in text.split(",")))
+    for name in formats:
+        if name not in _PICTURE_FORMATS:
+            raise click.BadParameter(f"{name!r} is none of {', '.join(_PICTURE_FORMATS)}")
+    return formats
 
 
 @cli.command("status")
 @store_argument
-@click.option("--follow", is_flag=True, help="Repeat until the run has ended.")
+@click.option("--follow", is_flag=True, help="Show the progress on one line until the run has ended.")
 @click.pass_context
 def status_command(context: click.Context, store: Location, follow: bool) -> None:
-    """Show the progress of STORE's study, and what failed and why."""
+    """Show the progress of STORE's study, and what failed and why.
+
+    The time left is estimated from the surfaces that were finished last.
+
+    The exit status is 3 if some surfaces failed, and 1 if the run failed or shows no sign of life.
+    """
+    from sobolev_batch.results.status import status
+
     current = status(store)
+    line = ProgressLine()
     while follow and current.going_on:
-        click.echo(f"{current}\n")
+        line.show(current.progress)
         time.sleep(_FOLLOW_SECONDS)
         current = status(store)
+        if current.run_store and not current.going_on:
+            # Between two objects of a collection, no run goes on for a moment.
+            time.sleep(_FOLLOW_SECONDS)
+            current = status(store)
+    line.close()
     click.echo(current)
     if current.failed or current.not_compared:
         context.exit(EXIT_SOME_FAILED)
@@ -52,17 +79,23 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 def verify_command(context: click.Context, store: Location) -> None:
     """Check all data of STORE against its checksums.
 
-    Damaged data are named. If STORE can be written, they are also removed, and `run` computes them again.
-    The exit status is 1 if anything is damaged.
+    Of a collection, all objects are checked. Damaged data are named. If STORE can be written, they are also removed,
+    and `run` computes them again. The exit status is 1 if anything is damaged.
     """
+    from sobolev_batch.batch.verify import verify
+
     with click.progressbar(label="fields", file=sys.stderr, show_pos=True, length=0) as bar:
 
         def show(done: int, total: int) -> None:
-            bar.length = total
+            if done == 1:
+                # Of the next object of a collection, too.
+                bar.length = (bar.length or 0) + total
             bar.update(1)
 
         result = verify(store, show)
-    click.echo(f"{store}: {result.complete} of {result.total} surfaces complete, their fields read back")
+    for name, one in (result.objects or {str(store): result}).items():
+        counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
+        click.echo(f"{name}: {counts if one.total else 'it has no results yet'}")
     tables = {f"table {name}": damage for name, damage in result.tables.items()}
     for name, damage in (*result.fields.items(), *result.comparisons.items(), *tables.items()):
         click.echo(f"{name}: {damage}")
@@ -84,6 +117,8 @@ def verify_command(context: click.Context, store: Location) -> None:
 @click.option("--force", is_flag=True, help="Release it even if its run was active a moment ago.")
 def release_command(store: Location, force: bool) -> None:
     """Remove the lock that a killed run left on STORE."""
+    from sobolev_batch.batch.store.release import release
+
     lock = release(store, force=force)
     if lock is None:
         click.echo(f"{store}: not locked by any run")
@@ -93,91 +128,173 @@ def release_command(store: Location, force: bool) -> None:
 
 @cli.command("table")
 @store_argument
-@click.option("--format", "style", type=click.Choice(FORMATS), default="text", show_default=True)
-@order_option
+@format_option
+@orders_option("Print the tables of this order, which may be any below -1/2.", "the study's")
+@click.option(
+    "--x",
+    default="edge_length",
+    show_default=True,
+    help="Observe rates in edge_length, triangles, vertices, seconds, or a number among the metadata of the meshes.",
+)
 @click.option("--matrix", is_flag=True, help="Print the distances of every mesh to every other instead.")
 @click.option("--over-time", is_flag=True, help="Print the distances of meshes that move, over time, instead.")
-@click.option("--truth", metavar="FAMILY", help="True surface of --over-time if it moves. [default: the reference]")
+@click.option(
+    "--below",
+    type=fraction_of_norm,
+    metavar="FRACTION",
+    help="Print the smallest mesh of each family with a relative distance below FRACTION, such as 1%, instead.",
+)
+@click.option(
+    "--truth",
+    metavar="FAMILY",
+    help="Measure --over-time from this family, which is the true surface. [default: the reference]",
+)
 @click.option(
     "--factor",
     type=click.FloatRange(min=1.0, min_open=True),
-    help=f"Growth of the distance at which a new mesh pays, for --over-time. [default: {REMESHING_FACTOR:g}]",
+    help=f"Say for --over-time when the distance has grown by this factor. [default: {REMESHING_FACTOR:g}]",
 )
 def table_command(
     store: Location,
     style: Format,
     orders: tuple[float, ...],
+    x: str,
     matrix: bool,
     over_time: bool,
+    below: float | None,
     truth: str | None,
     factor: float | None,
 ) -> None:
-    """Print the tables or distance matrices of STORE."""
-    if matrix and over_time:
-        raise click.UsageError("--matrix and --over-time are two tables: ask for one of them")
+    """Print the tables or distance matrices of STORE. Of a collection, print the tables of all objects.
+
+    Orders that the study lacks are computed from its stored fields. The table says what they rest on.
+    """
+    if matrix + over_time + (below is not None) > 1:
+        raise click.UsageError("--matrix, --over-time and --below are different tables: ask for one of them")
     for name, is_given in (("--truth", truth is not None), ("--factor", factor is not None)):
         if is_given and not over_time:
             raise click.UsageError(f"{name} belongs to --over-time")
-    tree, chosen = open_store(store), orders or None
+    from sobolev_batch.batch.collection_store import CollectionStore
+    from sobolev_batch.results.open import open_store
+    from sobolev_batch.results.tables.convergence import format_table, format_tables
+    from sobolev_batch.results.tables.evolution import format_evolution
+    from sobolev_batch.results.tables.matrix import format_matrix
+    from sobolev_batch.results.tables.smallest import format_smallest
+
+    chosen = orders or None
+    collection = CollectionStore.found(store)
+    if collection is not None:
+        if matrix or over_time or below is not None:
+            raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
+        click.echo(format_tables(collection.begun, style, chosen, x=x))
+        return
+    tree = open_store(store)
     if over_time:
         click.echo(format_evolution(tree, style, chosen, truth=truth, factor=factor or REMESHING_FACTOR))
+    elif below is not None:
+        click.echo(format_smallest(tree, style, chosen, below=below))
     else:
-        form = format_matrix if matrix else format_table
-        click.echo(form(tree, style, chosen))
+        click.echo(format_matrix(tree, style, chosen) if matrix else format_table(tree, style, chosen, x=x))
 
 
 @cli.command("plot")
 @store_argument
-@output_option("Folder of the pictures.", ".")
-@click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Mesh to draw; may be repeated.")
+@output_option("Write the pictures into this folder.", ".")
+@click.option(
+    *("--format", "formats"),
+    multiple=True,
+    metavar="png|svg|pdf",
+    callback=lambda _context, _option, given: _formats(given),
+    help="Write this format; may be repeated, or a list such as pdf,png. [default: png]",
+)
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT",
+    help="Make each panel this large, in cm, mm or in, such as 8.4x6cm. Panels of several orders are stacked.",
+)
+@orders_option("Draw only this order.", "all of the store")
+@click.option(
+    *("--family", "families"), multiple=True, metavar="NAME|GLOB", help="Draw only this family; may be repeated."
+)
+@click.option(
+    "--x",
+    help="Draw convergence over this: edge_length, triangles, vertices, seconds, or a number among the metadata of the "
+    "meshes. [default: edge_length, triangles for a league]",
+)
+@meshes_option("--witness", "Draw this mesh with its witness function.", "a few")
 @folder_option
 @up_option
 @click.pass_context
 def plot_command(
-    context: click.Context, store: Location, output: Path, witnesses: tuple[str, ...], folder: Path, up: Axis
+    context: click.Context,
+    store: Location,
+    output: Path,
+    formats: tuple[PictureFormat, ...],
+    size: str | None,
+    orders: tuple[float, ...],
+    families: tuple[str, ...],
+    x: str | None,
+    meshes: tuple[str, ...],
+    folder: Path,
+    up: Axis,
 ) -> None:
     """Draw the results of STORE as pictures.
 
-    They show convergence, transforms, distances and spectra, and some of the meshes.
+    They show convergence, transforms, distances and spectra, and some of the meshes. Of a collection, they show the
+    league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
-    # Imported here, since it takes as long as the start of all other commands.
-    from sobolev_batch.results.figures.plots import write_plots
+    from sobolev_batch.batch.collection_store import CollectionStore
+    from sobolev_batch.results.figures.pictures import Output, parse_size
+    from sobolev_batch.results.figures.plots import Selection, write_plots
     from sobolev_batch.results.figures.witness_plots import write_witness_plots
+    from sobolev_batch.results.league.league import league
+    from sobolev_batch.results.league.plot import write_league_plots
+    from sobolev_batch.results.open import fields_read, open_store
+    from sobolev_batch.results.tables.sizes import EDGE_LENGTH
 
+    written_as = Output(formats or ("png",), None if size is None else parse_size(size))
+    if CollectionStore.found(store) is not None:
+        if meshes:
+            raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
+        leagues = league(store, orders or None, x=x or "triangles", methods=families or None)
+        for path in write_league_plots(leagues, output, written_as):
+            click.echo(path)
+        return
+    selection = Selection(orders or None, families or None, x or EDGE_LENGTH)
     with fields_read(store):
         tree = open_store(store)
         # First, since a label may be wrong.
-        witness_paths, missing = write_witness_plots(tree, output, folder, witnesses, up)
-        paths = write_plots(tree, output)
-    for path in (*paths, *witness_paths):
+        witness_paths, missing = write_witness_plots(tree, output, folder, meshes, up, selection, written_as)
+        plots = write_plots(tree, output, selection, written_as)
+    for path in (*plots.paths, *witness_paths):
         click.echo(path)
+    for name, notes in plots.notes.items():
+        click.echo(f"{name}: {'; '.join(notes)}", err=True)
     if missing:
         labels_by_reason: dict[str, list[str]] = {}
         for label, reason in missing.items():
             labels_by_reason.setdefault(reason, []).append(label)
         parts = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in labels_by_reason.items())
         click.echo(f"not drawn with their witness functions: {parts}", err=True)
-        if witnesses:
+        if meshes:
             context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("witness")
 @store_argument
-@click.option("--mesh", "meshes", multiple=True, metavar="MESH", help="Only this mesh; may be repeated.")
-@click.option(
-    *("--order", "orders"), type=float, multiple=True, help="Any below -1/2; may be repeated. [default: the study's]"
-)
+@meshes_option("--mesh", "Write this mesh.", "all")
+@orders_option("Write witness functions of this order, which may be any below -1/2.", "the study's")
 @click.option(
     *("--format", "style"),
     type=click.Choice(["ply", "vtp"]),
     default="ply",
     show_default=True,
-    help="ply for MeshLab and similar programs, vtp for ParaView.",
+    help="Write ply for MeshLab and similar programs, or vtp for ParaView.",
 )
-@output_option("Folder of the files.", ".")
+@output_option("Write the files into this folder.", ".")
 @folder_option
 @click.pass_context
 def witness_command(
@@ -195,7 +312,6 @@ def witness_command(
     length. The study makes the meshes again; a mesh is skipped and named if that fails, or if it is not the one that
     was computed.
     """
-    # Imported here, as for plots.
     from sobolev_batch.results.meshes.export import Exporter
 
     exporter = Exporter.of(store, orders or None, folder)
@@ -221,16 +337,19 @@ def witness_command(
 
 @cli.command("report")
 @store_argument
-@output_option("File of the page.", "report.html")
+@output_option("Write the page to this file.", "report.html")
 @folder_option
 @up_option
-@click.option("--witness", "witnesses", multiple=True, metavar="MESH", help="Mesh to show; may be repeated.")
-def report_command(store: Location, output: Path, folder: Path, up: Axis, witnesses: tuple[str, ...]) -> None:
+@meshes_option("--witness", "Show this mesh with its witness function.", "a few")
+def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes: tuple[str, ...]) -> None:
     """Write the results of STORE as one HTML page.
 
-    The page needs no other files and makes no requests.
+    The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its
+    league; each object has a store, and a report, of its own.
     """
-    # Imported here, as for plots.
-    from sobolev_batch.results.report.build import report
+    from sobolev_batch.results.report.build import write_report
 
-    click.echo(report(store, output, folder=folder, witnesses=witnesses, up=up))
+    written = write_report(store, output, folder=folder, witnesses=meshes, up=up)
+    click.echo(written.path)
+    for omission in written.omissions:
+        click.echo(f"left out: {omission}", err=True)

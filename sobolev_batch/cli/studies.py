@@ -1,37 +1,76 @@
-"""Commands that take a study: run, submit, plan."""
+"""Commands that make or take a study: init, run, submit, plan."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.batch.cluster.clients import remote_client
-from sobolev_batch.batch.run import run
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.study.study import Study
-from sobolev_batch.batch.submit import submit
 from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
-from sobolev_batch.cli.options import memory_of, store_option, study_argument, trust_option
-from sobolev_batch.cli.reporter import Reporter
-from sobolev_batch.parameters import byte_count
-from sobolev_batch.results.open import open_store
-from sobolev_batch.results.plan import DEFAULT_FOLDER, default_store, plan
-from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch.cli.options import (
+    best_effort_option,
+    location,
+    memory_of,
+    memory_option,
+    store_option,
+    study_argument,
+    trust_option,
+)
+
+if TYPE_CHECKING:
+    from sobolev_batch.batch.storage.location import Location
+    from sobolev_batch.batch.study.collection import StudyCollection
+    from sobolev_batch.batch.study.study import Study
+
+# Lines about distances that are less accurate than asked for.
+_MOST_IMPRECISE = 10
+
+
+@cli.command("init", short_help="Write a study file for a folder of meshes.")
+@click.argument("folder", type=click.Path(path_type=Path), default=".")
+@click.option(
+    *("-o", "--output"),
+    type=click.Path(path_type=Path),
+    default="study.toml",
+    show_default=True,
+    help="Write the study to this file, which must not exist.",
+)
+def init_command(folder: Path, output: Path) -> None:
+    """Write a study file for the meshes in FOLDER.
+
+    It runs as it is, and says what to change. The reference is the mesh that is called original, reference, target or
+    ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
+    in the number at the end. Several references are several objects. [default: current folder]
+    """
+    from sobolev_batch.batch.study.draft.init import init_study
+
+    click.echo(init_study(folder, output))
 
 
 @cli.command("run")
 @study_argument
 @store_option
-@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler, such as tls://host:8786.")
-@trust_option
-@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine. [default: one per core]")
 @click.option(
-    "--memory", type=byte_count, metavar="SIZE", help="Memory per process, such as 4GB. [default: equal parts]"
+    "--scheduler", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler, such as tls://host:8786."
 )
-@click.option("--worker-memory", type=byte_count, hidden=True)
+@trust_option
+@click.option(
+    "--workers", type=click.IntRange(min=1), help="Start so many processes on this machine. [default: one per core]"
+)
+@memory_option("Give each process so much memory, such as 4GB. [default: equal parts]")
+@memory_option("", old="--worker-memory")
+@best_effort_option
+@click.option(
+    "--reuse",
+    type=location,
+    multiple=True,
+    metavar="STORE",
+    help="Copy fields of this store that the study would compute again; may be repeated.",
+)
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -42,74 +81,211 @@ def run_command(
     workers: int | None,
     memory: int | None,
     worker_memory: int | None,
+    best_effort: bool,
+    reuse: tuple[Location, ...],
 ) -> None:
-    """Compute what is missing of STUDY and print its tables."""
+    """Compute what is missing of STUDY and print its tables.
+
+    Ctrl-C and SIGTERM end it. The same command continues from the store. A study with several objects gets a store for
+    each of them, and its league is printed.
+
+    The exit status is 3 if a mesh failed, or if a distance is less accurate than the study asks for.
+    """
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.run import run
+    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.cli.reporter import Reporter
+    from sobolev_batch.results.open import open_store
+    from sobolev_batch.results.tables.convergence import format_table
+
     memory = memory_of(memory, "--worker-memory", worker_memory)
     if scheduler and (workers or memory):
         raise click.UsageError(
             "--workers and --memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
-    parsed = Study.from_toml(study)
-    location = store or _made_default_store(parsed)
+    parsed = _parsed(study, best_effort=best_effort)
+    place = store or _made_default_store(parsed)
     with Reporter() as reporter:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, location, client, on_progress=reporter)
+                summary = run(parsed, place, client, on_progress=reporter, reuse=reuse)
         else:
             summary = run(
                 parsed,
-                location,
+                place,
                 workers=workers,
                 memory=None if memory is None else f"{memory}B",
                 on_progress=reporter,
+                reuse=reuse,
             )
-    click.echo(format_table(open_store(location)))
+    click.echo(format_table(open_store(place)) if isinstance(parsed, Study) else _league_text(place))
     click.echo(
         f"\n{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
         f"store: {summary.store}"
     )
     for label, reason in summary.not_compared.items():
         click.echo(f"{label}: {reason}", err=True)
-    if summary.failed or summary.not_compared:
+    for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:
+        click.echo(
+            f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True
+        )
+    if len(summary.imprecise) > _MOST_IMPRECISE:
+        click.echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
+    is_short = bool(summary.imprecise) and not _is_best_effort(parsed)
+    if summary.failed or summary.not_compared or is_short:
         context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("submit")
 @study_argument
-@click.option("--scheduler", metavar="ADDRESS", required=True, help="Dask scheduler, such as tls://host:8786.")
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    required=True,
+    help="Compute on the workers of this Dask scheduler, such as tls://host:8786.",
+)
 @trust_option
 @store_option
-def submit_command(study: Path, scheduler: str, trust_network: bool, store: Location | None) -> None:
+@best_effort_option
+@click.pass_context
+def submit_command(
+    context: click.Context,
+    study: Path,
+    scheduler: str,
+    trust_network: bool,
+    store: Location | None,
+    best_effort: bool,
+) -> None:
     """Hand STUDY over to a cluster and return.
 
-    The cluster computes it without this process.
+    The cluster computes it without this process. The objects of a study are handed over one after another.
     """
-    parsed = Study.from_toml(study)
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.collection_store import CollectionStore
+    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.batch.submit import submit
+
+    parsed = _parsed(study, best_effort=best_effort)
+    location = (store or _made_default_store(parsed)).absolute()
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(parsed, store or _made_default_store(parsed), client)
-    click.echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
-    click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
+        if not isinstance(parsed, Study):
+            CollectionStore.prepared(location, parsed)
+
+        def hand_over(one: Study, place: Location) -> None:
+            submission = submit(one, place, client)
+            click.echo(
+                f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}"
+            )
+
+        refused = _for_each_object(parsed, location, hand_over, "submitted")
+    click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
+    if refused:
+        context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("plan")
 @study_argument
 @store_option
-@click.option("--scheduler", metavar="ADDRESS", help="Plan for its workers. [default: processes on this machine]")
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Plan for the workers of this scheduler. [default: processes on this machine]",
+)
 @trust_option
-def plan_command(study: Path, store: Location | None, scheduler: str | None, trust_network: bool) -> None:
+@best_effort_option
+@click.pass_context
+def plan_command(
+    context: click.Context,
+    study: Path,
+    store: Location | None,
+    scheduler: str | None,
+    trust_network: bool,
+    best_effort: bool,
+) -> None:
     """Show what running STUDY would do.
 
     Nothing is computed. The plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be
     stored, and the number of surfaces that the store has already.
     """
-    parsed = Study.from_toml(study)
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.parameters import format_bytes
+    from sobolev_batch.results.plan import StudyPlan, default_store, plan
+    from sobolev_batch.results.tables.formatting import duration
+
+    parsed = _parsed(study, best_effort=best_effort)
+    plans: list[StudyPlan] = []
+
+    def show(one: Study, place: Location) -> None:
+        plans.append(plan(one, place, client=client))
+        click.echo(plans[-1])
+
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
-        click.echo(plan(parsed, store, client=client))
+        refused = _for_each_object(parsed, store or default_store(parsed), show, "planned")
+    if len(plans) > 1:
+        seconds, stored = sum(one.seconds for one in plans), sum(one.total_bytes for one in plans)
+        click.echo(f"{len(plans)} objects: about {duration(seconds, digits=2)}, {format_bytes(stored)} of fields")
+    if refused:
+        context.exit(EXIT_SOME_FAILED)
 
 
-def _made_default_store(study: Study) -> Location:
+def _parsed(path: Path, *, best_effort: bool) -> Study | StudyCollection:
+    from sobolev_batch.batch.study.collection import read_study
+
+    study = read_study(path)
+    return study.with_best_effort() if best_effort else study
+
+
+def _is_best_effort(study: Study | StudyCollection) -> bool:
+    from sobolev_batch.batch.study.study import Study
+
+    studies = [study] if isinstance(study, Study) else study.studies.values()
+    return any(one.accuracy is not None and one.accuracy.best_effort for one in studies)
+
+
+def _for_each_object(
+    study: Study | StudyCollection, place: Location, act: Callable[[Study, Location], None], done: str
+) -> bool:
+    """Act on the study of each object and its store; a study of one object has the place itself.
+
+    As in `run`, an object that cannot be carried out stops no other. Return whether there was one.
+    """
+    from sobolev_batch.batch.collection_store import CollectionStore
+    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.errors import InputError, StoreError
+
+    if isinstance(study, Study):
+        act(study, place)
+        return False
+    stores, is_refused = CollectionStore.of(place, study).stores, False
+    for name, one in study.studies.items():
+        click.echo(f"{name}:")
+        try:
+            act(one, stores[name])
+        except StoreError:
+            raise
+        except InputError as error:
+            click.echo(f"not {done}: {error}", err=True)
+            is_refused = True
+    return is_refused
+
+
+def _league_text(place: Location) -> str:
+    """Return the league of a collection, or why there is none."""
+    from sobolev_batch.errors import InputError
+    from sobolev_batch.results.league.league import league
+    from sobolev_batch.results.league.text import format_league
+
+    try:
+        return format_league(league(place))
+    except InputError as error:
+        return f"no league: {error}"
+
+
+def _made_default_store(study: Study | StudyCollection) -> Location:
     """Return the default store of a study, whose folder is made; folders that users name are not."""
-    location = default_store(study)
-    with location.access("written"):
+    from sobolev_batch.results.plan import DEFAULT_FOLDER, default_store
+
+    place = default_store(study)
+    with place.access("written"):
         DEFAULT_FOLDER.mkdir(exist_ok=True)
-    return location
+    return place

@@ -30,6 +30,8 @@ class Closeness:
         hausdorff: Hausdorff distance, a lower bound in units of length; NaN without VTK or a target of triangles.
         chamfer: Chamfer distance, in units of length; NaN likewise.
         smallest_angle: Smallest angle of all triangles, in degrees.
+        relative: Distance over the norm of the target.
+        relative_error: Error of that.
 
     >>> import sobolev_batch as sb
     >>> sb.Closeness(distance=0.5, error=0.01, smallest_angle=30.0).distance
@@ -41,6 +43,8 @@ class Closeness:
     hausdorff: float = np.nan
     chamfer: float = np.nan
     smallest_angle: float = np.nan
+    relative: float = np.nan
+    relative_error: float = np.nan
 
     @classmethod
     def unknown(cls) -> Self:
@@ -62,7 +66,8 @@ class Closeness:
                 continue
         if found is None:
             found = distance(mesh, target, order, lattice=lattice)
-        closeness = cls(found["distance"].item(), found["error"].item(), smallest_angle=smallest_angle(mesh))
+        numbers = {name: found[name].item() for name in ("distance", "error", "relative", "relative_error")}
+        closeness = cls(**numbers, smallest_angle=smallest_angle(mesh))
         if not isinstance(target, Mesh):
             return closeness
         try:

@@ -10,19 +10,14 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
+from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.optimisation.descent import End
-from sobolev_batch.fitting.optimisation.stages import (
-    DEFAULT_ORDER,
-    DEFAULT_SMOOTHING,
-    DEFAULT_STEPS,
-    FitProgress,
-    FitSettings,
-    Run,
-)
+from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run
 from sobolev_batch.fitting.task import FitTask
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand
+from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Growth of the Hausdorff distance that a user should know.
@@ -58,8 +53,8 @@ class Fit:
 
 
 def fit(
-    mesh: Mesh,
-    target: Operand,
+    mesh: MeshLike,
+    target: OperandLike,
     order: float = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
@@ -75,7 +70,7 @@ def fit(
     far.
 
     Args:
-        mesh: Mesh to start from. Vertices at one place move together.
+        mesh: Mesh to start from, or what `as_mesh` makes one of. Vertices at one place move together.
         target: Surface in the same unit of length, or its field from `fourier_transform` or a store. Distances depend
             on the unit: bring both to the unit ball with a `Similarity` unless you have reasons.
         order: Order s < -1/2 of the distance. At orders of -1.5 and below, the squared distance at half the order is
@@ -104,6 +99,7 @@ def fit(
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
+    mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     task = FitTask.of(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
     before = measured(task)

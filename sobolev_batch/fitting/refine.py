@@ -9,23 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.derivative.transform import require_mesh
+from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.fit import Fit, concluded, measured
 from sobolev_batch.fitting.optimisation.descent import End
-from sobolev_batch.fitting.optimisation.stages import (
-    DEFAULT_ORDER,
-    DEFAULT_SMOOTHING,
-    DEFAULT_STEPS,
-    FitProgress,
-    FitSettings,
-    Run,
-)
+from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run
 from sobolev_batch.fitting.subdivision import Edges
 from sobolev_batch.fitting.task import FitTask, welded
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand
+from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # While the goal is so many times as large, all edges are split. A choice of triangles came no nearer then: fits pull
@@ -41,8 +35,8 @@ MOST_TRIANGLES = 1_000_000
 
 
 def refine(
-    mesh: Mesh,
-    target: Operand,
+    mesh: MeshLike,
+    target: OperandLike,
     order: float = DEFAULT_ORDER,
     *,
     triangles: int,
@@ -61,7 +55,7 @@ def refine(
     triangles are split. An interrupt (Ctrl-C) ends with the best mesh so far.
 
     Args:
-        mesh: Mesh to start from. Vertices at one place become one.
+        mesh: Mesh to start from, or what `as_mesh` makes one of. Vertices at one place become one.
         target: Surface in the same unit of length, or its field; see `fit`.
         order: Order s < -1/2 of the distance.
         triangles: Number of triangles to reach, up to 1,000,000. The result may have a few less, as splits come in
@@ -88,6 +82,7 @@ def refine(
     >>> len(refined.mesh.triangles) <= 80, refined.after.distance < refined.before.distance / 10
     (True, True)
     """
+    mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     refinement = _Refinement(target, lattice, settings, Execution(threads=thread_count(threads)), triangles)
     task = refinement.begun(mesh)
@@ -136,7 +131,6 @@ class _Refinement:
         Raises:
             InputError: See `refine`.
         """
-        require_mesh(mesh)
         count, goal = len(mesh.triangles), self.triangles
         if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
             raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")

@@ -12,15 +12,16 @@ import numpy as np
 from pydantic import Field, SerializeAsAny, field_validator
 
 from sobolev_batch.errors import InputError, MeshError, StudyError
+from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.fit import fitted_mesh
-from sobolev_batch.fitting.optimisation.stages import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS, FitSettings
+from sobolev_batch.fitting.optimisation.stages import FitSettings
 from sobolev_batch.fitting.refine import MOST_TRIANGLES, largest_while_refining, refined_mesh
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.sources.derived.nested import NestedSource, load_mesh, parse_nested
 from sobolev_batch.surfaces.sources.fingerprints import installed_version
-from sobolev_batch.surfaces.sources.nested import NestedSource, load_mesh, parse_nested
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
@@ -33,6 +34,8 @@ from sobolev_batch.surfaces.sources.registry import (
 
 # Raise it whenever a fit of the same mesh gives another one.
 _VERSION = 2
+# Usual processor time of a step, and for each triangle of it.
+_STEP_SECONDS, _STEP_TRIANGLE_SECONDS = 0.01, 4e-5
 # Measured peak of a fit: its lattice, and for each triangle of the mesh and of the target.
 _LATTICE_BYTES, _TRIANGLE_BYTES, _TARGET_BYTES = 3e8, 2e3, 400.0
 _KEPT = 8
@@ -99,7 +102,10 @@ class FitSource(TargetSource):
         """Return one member for each mesh to start from."""
         target, starts = self.target_member(folder), self.mesh.members(folder)
         return tuple(
-            FittedMember(start.name, start.level, start, target, self.settings, time=start.time) for start in starts
+            FittedMember(
+                start.name, start.level, start, target, self.settings, time=start.time, metadata=start.metadata
+            )
+            for start in starts
         )
 
 
@@ -182,7 +188,12 @@ class FittedMember(Member):
         count = self.triangles or start.triangles
         largest = count if self.triangles is None else largest_while_refining(start.triangles, count)
         own_bytes = _LATTICE_BYTES + _TRIANGLE_BYTES * largest + _TARGET_BYTES * target.triangles
-        return ExpectedSize(count, max(start.projected_bytes, target.projected_bytes, own_bytes))
+        step_seconds = _STEP_SECONDS + _STEP_TRIANGLE_SECONDS * count
+        return ExpectedSize(
+            count,
+            max(start.projected_bytes, target.projected_bytes, own_bytes),
+            start.seconds + target.seconds + step_seconds * self.settings.steps,
+        )
 
 
 @dataclass(frozen=True)

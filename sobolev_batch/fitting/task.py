@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.derivative.transform import require_mesh
 from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run, stages_of
 from sobolev_batch.fitting.subdivision import Edges
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, check_surface, common_lattice, field_of, quality_of
+from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, quality_of, refuse_points
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -116,12 +115,11 @@ def require_comparable(mesh: Mesh, target: Operand) -> None:
     Raises:
         InputError: See `fit`.
     """
-    require_mesh(mesh)
+    refuse_points(target)
     if isinstance(target, xr.DataArray):
         quality = quality_of(target)
         extent = None if quality is None else quality.extent
     else:
-        check_surface(target)
         extent = target.extent
     if extent is not None:
         _require_one_place(mesh.extent, extent)

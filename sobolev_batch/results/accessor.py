@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.decomposition import proportion
-from sobolev_batch.spectral.metrics.inputs import Operand, pair_of
+from sobolev_batch.spectral.metrics.inputs import OperandLike, pair_of
 from sobolev_batch.spectral.metrics.interpolation import full_lattice, interpolate
 from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
 from sobolev_batch.spectral.metrics.spectrum import spectrum
@@ -59,21 +59,21 @@ class SobolevAccessor:
         """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""
         return self._each(lambda field: norm(field, order))
 
-    def inner_product(self, other: Operand, order: Orders) -> xr.Dataset:
+    def inner_product(self, other: OperandLike, order: Orders) -> xr.Dataset:
         """Return the inner product with another field or a surface; see `sobolev_batch.inner_product`."""
         return self._each_with(other, order, lambda field, common: inner_product(field, common, order))
 
-    def distance(self, other: Operand, order: Orders) -> xr.Dataset:
+    def distance(self, other: OperandLike, order: Orders) -> xr.Dataset:
         """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""
         return self._each_with(other, order, lambda field, common: distance(field, common, order))
 
-    def proportion(self, other: Operand, order: Orders) -> xr.Dataset:
+    def proportion(self, other: OperandLike, order: Orders) -> xr.Dataset:
         """Return the parts of the distance that are area and shape; see `sobolev_batch.proportion`."""
         return self._each_with(other, order, lambda field, common: proportion(field, common, order))
 
     def spectrum(
         self,
-        other: Operand | None,
+        other: OperandLike | None,
         order: Orders,
         *,
         bands: int | Sequence[float] | None = None,
@@ -84,7 +84,7 @@ class SobolevAccessor:
         See `sobolev_batch.spectrum`.
         """
 
-        def one(field: xr.DataArray, common: Operand | None) -> xr.Dataset:
+        def one(field: xr.DataArray, common: xr.DataArray | None) -> xr.Dataset:
             return spectrum(field, common, order, bands=bands, similarity=similarity)
 
         if other is None:
@@ -92,7 +92,13 @@ class SobolevAccessor:
         return self._each_with(other, order, one)
 
     def witness(
-        self, other: Operand, order: Orders, points: ArrayLike, *, eps: float | None = None, memory: float | None = None
+        self,
+        other: OperandLike,
+        order: Orders,
+        points: ArrayLike,
+        *,
+        eps: float | None = None,
+        memory: float | None = None,
     ) -> xr.DataArray:
         """Return the witness function at points (n, 3), positive where this surface has more area.
 
@@ -139,7 +145,7 @@ class SobolevAccessor:
         return full_lattice(self._field)
 
     def _each_with(
-        self, other: Operand, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]
+        self, other: OperandLike, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]
     ) -> xr.Dataset:
         """Apply a function to each field and one other, which is transformed once if it is a surface."""
         stacked = self._stacked()

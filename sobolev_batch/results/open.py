@@ -10,6 +10,7 @@ from typing import Any
 import xarray as xr
 
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.hierarchy import DIGEST, DIGESTS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.errors import DamageError, InputError
@@ -53,10 +54,12 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
             "it is missing",
         )
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
-    keys: Any = opened.zarr_store()
+    keys: Any = opened.zarr_store(recorded=opened.recorded_chunks)
     with opened.location.access("read"):
         tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
     tree.encoding = {**tree.encoding, _SOURCE: str(store)}
+    for name in (DIGEST, DIGESTS):
+        tree.attrs.pop(name, None)
     for node in tree.subtree:
         # Older stores describe fewer variables.
         describe(node.dataset)
@@ -68,6 +71,12 @@ def as_tree(store: AnyStore) -> xr.DataTree:
     return store if isinstance(store, xr.DataTree) else open_store(store)
 
 
+def source_of(tree: xr.DataTree) -> str | None:
+    """Return the path or URL at which a tree was opened by `open_store`; None for other trees."""
+    source = tree.encoding.get(_SOURCE)
+    return None if source is None else str(source)
+
+
 def location_of(store: AnyStore) -> str | Path | Location:
     """Return the path or URL of a store, which may be open.
 
@@ -76,13 +85,13 @@ def location_of(store: AnyStore) -> str | Path | Location:
     """
     if not isinstance(store, xr.DataTree):
         return store
-    source = store.encoding.get(_SOURCE)
-    if not source:
+    source = source_of(store)
+    if source is None:
         raise InputError(
             "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "
             "or give the path or URL of the store"
         )
-    return str(source)
+    return source
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,15 +14,23 @@ from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.sizing import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
-from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.batch.study.collection import StudyCollection
+from sobolev_batch.batch.study.pilots import Survey
+from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import complete_records
+from sobolev_batch.html import table_html
 from sobolev_batch.parameters import format_bytes
+from sobolev_batch.results.forecast import Forecast
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.surfaces.shapes.placement import placement_doubt
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 DEFAULT_FOLDER = Path("storage")
+# More would hide the rest of a plan.
+_MOST_DOUBTS = 10
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,8 @@ class StudyPlan:
         store: Path or URL of the study's store.
         stored: Labels of the surfaces whose fields the store has already.
         refused: Reason for each surface that fits into no worker, by label.
+        doubtful: Reason for each surface that cannot be read, or may be in another unit or place than the reference, as
+            far as surfaces are quickly looked at.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -49,9 +60,24 @@ class StudyPlan:
     store: str
     stored: tuple[str, ...]
     refused: dict[str, str]
+    doubtful: dict[str, str]
     _plan: Plan = field(repr=False)
     _workers: Workers = field(repr=False)
     _sizes: dict[str, TaskSizes] = field(repr=False)
+    _forecast: Forecast = field(repr=False)
+
+    @property
+    def seconds(self) -> float:
+        """Time that a run will take on the workers, if they have their cores for themselves.
+
+        It leaves out comparisons with the reference, and distances of very many pairs.
+        """
+        return self._forecast.seconds
+
+    @property
+    def processor_seconds(self) -> float:
+        """Processor time that a run will take, that of starting processes included."""
+        return self._forecast.processor_seconds
 
     @property
     def study(self) -> Study:
@@ -116,11 +142,15 @@ class StudyPlan:
     def __str__(self) -> str:
         return "\n".join(f"{name + ':' * bool(name):<14} {text}" for name, text in self._lines())
 
+    def _repr_html_(self) -> str:
+        return table_html("Plan", self._lines())
+
     def _lines(self) -> Iterator[tuple[str, str]]:
         study, lattice = self.study, self.lattice
         orders = ", ".join(f"{order:g}" for order in study.orders)
         yield "study", study.title
-        yield "surfaces", f"{len(self.labels)} in {len(study.families)} families, reference {self.reference}"
+        families = f"{len(study.families)} famil{'y' if len(study.families) == 1 else 'ies'}"
+        yield "surfaces", f"{len(self.labels)} in {families}, reference {self.reference}"
         origin = " ".join(f"{x:.9g}" for x in self.similarity.origin)
         yield "similarity", f"scale {self.similarity.scale:.9g}, origin {origin}"
         yield (
@@ -140,6 +170,11 @@ class StudyPlan:
         yield from self._task_lines()
         yield "storage", f"{format_bytes(self.field_bytes)} per surface, {format_bytes(self.total_bytes)} in all"
         yield "store", f"{self.store}, {len(self.stored)} of {len(self.labels)} already stored"
+        first, *others = self._forecast.lines
+        yield "time", first
+        yield from (("", line) for line in others)
+        if study.witness or study.proximity is not None:
+            yield "", "witness functions, Hausdorff and Chamfer distances take more"
 
     def _octave_lines(self) -> Iterator[tuple[str, str]]:
         tail = self._plan.tail
@@ -151,9 +186,7 @@ class StudyPlan:
             f"{self.octaves} beyond the lattice, to |xi| {tail.highest_frequency:.4g}: wavelengths down to "
             f"{shortest:.3g} of the files' unit; {tail.size:,} samples",
         )
-        seconds = float(f"{self._plan.octave_seconds:.1g}")
-        octave_bytes = format_bytes(tail.size * self._plan.item_bytes)
-        yield "", f"{octave_bytes} per surface; about {seconds:g} s of processor time in all"
+        yield "", f"{format_bytes(tail.size * self._plan.item_bytes)} per surface"
 
     def _transform_lines(self) -> Iterator[tuple[str, str]]:
         accuracy, transform = self.study.accuracy, self._plan.transform
@@ -187,6 +220,10 @@ class StudyPlan:
             yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
         for label, reason in self.refused.items():
             yield "refused", f"{label}: {reason}"
+        for label, reason in list(self.doubtful.items())[:_MOST_DOUBTS]:
+            yield "doubtful", f"{label}: {reason}"
+        if len(self.doubtful) > _MOST_DOUBTS:
+            yield "doubtful", f"and {len(self.doubtful) - _MOST_DOUBTS} more"
 
 
 def plan(
@@ -204,6 +241,7 @@ def plan(
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
         AccuracyError: The accuracy that the study asks for is out of reach.
+        InputError: The study asks for more memory than any worker has.
         ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice.
         StoreError: The store cannot be reached, or the location holds something else.
 
@@ -213,35 +251,53 @@ def plan(
     (5, 5, Lattice(xi_max=5.0, M=48))
     >>> print(found)  # doctest: +ELLIPSIS
     study:         ...
-    surfaces:      5 in 1 families, reference reference
+    surfaces:      5 in 1 family, reference reference
     ...
     """
     study = study if isinstance(study, Study) else Study.from_toml(study)
     location = default_store(study) if store is None else Location.of(store)
-    study_plan = make_plan(study, stored_choice(location))
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
+    workers.require_accuracy(study.accuracy)
+    earlier_choice, started = stored_choice(location), time.process_time()
+    study_plan = make_plan(study, earlier_choice)
+    planning_seconds = 0.0 if study_plan.choice is earlier_choice else time.process_time() - started
     sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
-    stored = _stored_keys(location)
+    records = _stored_records(location)
+    stored = {row.label: records[row.label] for row in study_plan.rows if _is_stored(row, records)}
     return StudyPlan(
         store=str(location),
-        stored=tuple(row.label for row in study_plan.rows if row.key and stored.get(row.label) == row.key),
+        stored=tuple(stored),
         refused=refused,
+        doubtful=_doubts_of(study_plan),
         _plan=study_plan,
         _workers=workers,
         _sizes=sizes,
+        _forecast=Forecast.of(study_plan, stored, workers, client, planning_seconds),
     )
 
 
-def default_store(study: Study) -> Location:
+def _is_stored(row: Row, records: Mapping[str, Record]) -> bool:
+    return row.label in records and records[row.label].completes(row.key)
+
+
+def _doubts_of(study_plan: Plan) -> dict[str, str]:
+    members = {row.label: (row.family, row.member) for row in study_plan.rows if row.label != study_plan.reference}
+    survey = Survey(members, study_plan.similarity, study_plan.reference_extent)
+    survey.look_at_others()
+    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in survey.extents.items()}
+    return {**survey.set_aside, **{label: doubt for label, doubt in doubts.items() if doubt is not None}}
+
+
+def default_store(study: Study | StudyCollection) -> Location:
     """Return the location of a study's store if none is named."""
     return Location.of(DEFAULT_FOLDER / f"{study.name}.zarr")
 
 
-def _stored_keys(location: Location) -> dict[str, str]:
-    """Return the keys of all stored fields by label."""
+def _stored_records(location: Location) -> dict[str, Record]:
+    """Return the records of all stored fields by label."""
     store = Store(location)
     if not store.exists() or store.is_unfinished:
         return {}
     store.attributes()
     labels = store.labels()
-    return {labels[row]: record.key for row, record in complete_records(store.records()).items()}
+    return {labels[row]: record for row, record in complete_records(store.records()).items()}

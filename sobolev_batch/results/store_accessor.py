@@ -81,7 +81,7 @@ class StoreAccessor:
         return _labelled(order, "norm", norms, {})
 
     def distance(self, mesh: str, other: str, order: Orders) -> xr.Dataset:
-        """Return the distance of two meshes with its error, and its parts that are area and shape.
+        """Return the distance of two meshes with its error, relative to the other one, and in parts of area and shape.
 
         See `sobolev_batch.distance` and `sobolev_batch.proportion`.
 
@@ -91,8 +91,9 @@ class StoreAccessor:
             order: One order s < -1/2, or several.
 
         Returns:
-            As `sobolev_batch.distance`, with `area_part` and `shape_part` (order), float64, in the square root of a
-            unit length.
+            `distance`, its `error` and the parts of the error, `relative` and `relative_error` as
+            `sobolev_batch.distance`, with `area_part` and `shape_part` (order), float64, in the square root of a unit
+            length.
 
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
@@ -101,8 +102,11 @@ class StoreAccessor:
         True
         """
         fields, row, against = self._fields(mesh, other)
-        _, distances, parts = fields.reducer(check_orders(order), against).norms([row])
-        return _labelled(order, "distance", distances, {"area_part": parts.area, "shape_part": parts.shape})
+        norms, distances, parts = fields.reducer(check_orders(order), against).norms([row, against])
+        relative, relative_errors = distances.relative_to(NormEstimate(*(part[:, 1:] for part in norms)))
+        others = {"relative": relative, "relative_error": relative_errors}
+        parts_by_name = {"area_part": parts.area, "shape_part": parts.shape}
+        return _labelled(order, "distance", distances, {**others, **parts_by_name})
 
     def spectrum(self, mesh: str, other: str | None, order: Orders) -> xr.Dataset:
         """Return the squared distance of two meshes, or the squared norm of one, by octaves of the frequency |ξ|.
@@ -167,11 +171,22 @@ class StoreAccessor:
 
     @cached_property
     def _stored(self) -> StoredFields:
-        store = Store.open(location_of(self._tree))
-        study = store.attributes()["study"]
-        lattice, octaves = Lattice(**study["lattice"]), study.get("octaves")
-        tail = None if octaves is None else TailSampling.from_table(octaves)
-        return StoredFields(store, store.records(), lattice, tail, store.labels().index(study["reference"]))
+        return stored_fields(self._tree)
+
+
+def stored_fields(tree: xr.DataTree) -> StoredFields:
+    """Return the fields of an open store.
+
+    Raises:
+        InputError: The tree does not say where it was opened.
+    """
+    store = Store.open(location_of(tree))
+    study = store.attributes()["study"]
+    lattice, octaves = Lattice(**study["lattice"]), study.get("octaves")
+    tail = None if octaves is None else TailSampling.from_table(octaves)
+    labels, removed = store.labels(), store.removed
+    records = [None if label in removed else record for label, record in zip(labels, store.records(), strict=True)]
+    return StoredFields(store, records, lattice, tail, labels.index(study["reference"]))
 
 
 def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[str, Reals]) -> xr.Dataset:

@@ -21,6 +21,7 @@ from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -52,7 +53,7 @@ class Field:
 
 @renamed_parameters(orders="order")
 def fourier_transform(
-    surface: Surface,
+    surface: SurfaceLike,
     lattice: Lattice,
     eps: float | None = None,
     *,
@@ -65,7 +66,8 @@ def fourier_transform(
     """Return the Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
 
     Args:
-        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length.
+        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length; or what `as_mesh`
+            makes a mesh of, such as the path of a file.
         lattice: Frequencies ξ, in cycles per unit length.
         eps: Accuracy relative to the surface's area; the error is a small multiple of it. Default 1e-9, or 1e-6 in
             single precision.
@@ -99,7 +101,7 @@ def fourier_transform(
     """
     settings = TransformSettings(eps, dtype, Quadrature(quadrature))
     execution = Execution(backend_named(backend), thread_count(threads))
-    field = compute_field(surface, lattice, settings, check_orders(order), execution)
+    field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution)
     attributes = {
         "long_name": "Fourier transform of the area measure",
         "units": "squared units of length",
@@ -151,7 +153,7 @@ def compute_field(
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
         probe = probe_block(surface, lattice, settings, orders, block, values, draws)
-    return Field(values, Quality.of_surface(surface, probe), settings, transformed.points, transformed.backend)
+    return Field(values, Quality.of_surface(surface, probe, lattice), settings, transformed.points, transformed.backend)
 
 
 def field_for(

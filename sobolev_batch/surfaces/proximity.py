@@ -10,6 +10,7 @@ import trimesh
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 DEFAULT_POINTS = 10_000
@@ -40,17 +41,17 @@ class Proximity:
     chamfer_error: float
 
 
-def proximity(a: Mesh, b: Mesh, *, points: int = DEFAULT_POINTS, seed: int = 0) -> Proximity:
+def proximity(a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, seed: int = 0) -> Proximity:
     """Measure Hausdorff and Chamfer distances with VTK, from points to the closest points of triangles.
 
     Args:
-        a: First mesh.
-        b: Second mesh, in the same unit of length.
+        a: First mesh, or what `as_mesh` makes one of.
+        b: Second mesh, in the same unit of length, or what `as_mesh` makes one of.
         points: Number of random points on each mesh, spread evenly by area.
         seed: Seed of the random points; the same seed gives the same numbers.
 
     Raises:
-        InputError: VTK is not installed (the extra ``vtk``), or ``points`` is out of range.
+        InputError: VTK is not installed (the extra ``vtk``), or ``points`` is out of range; or see `as_mesh`.
 
     Source: P. Cignoni, C. Rocchini, R. Scopigno, "Metro: measuring error on simplified surfaces" (1998),
     doi:10.1111/1467-8659.00236, for distances of random points; Chamfer distance as H. Barrow et al., "Parametric
@@ -73,16 +74,17 @@ def proximity(a: Mesh, b: Mesh, *, points: int = DEFAULT_POINTS, seed: int = 0) 
             f"Hausdorff and Chamfer distances need a library that is missing ({error}); install the extra: "
             "pip install 'sobolev-batch[vtk]'"
         ) from error
+    meshes = as_mesh(a), as_mesh(b)
     # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
-    scale = 2.0 ** np.frexp(max(float(np.abs(mesh.vertices).max()) for mesh in (a, b)))[1]
+    scale = 2.0 ** np.frexp(max(float(np.abs(mesh.vertices).max()) for mesh in meshes))[1]
     seeds = np.random.SeedSequence(seed).spawn(2)
     search = vtkHausdorffDistancePointSetFilter()
-    for port, (mesh, mesh_seed) in enumerate(zip((a, b), seeds, strict=True)):
+    for port, (mesh, mesh_seed) in enumerate(zip(meshes, seeds, strict=True)):
         search.SetInputData(port, _with_points(pyvista, mesh, scale, points, np.random.default_rng(mesh_seed)))
     search.SetTargetDistanceMethodToPointToCell()
     search.Update()
     of_points, farthest = [], 0.0
-    for port, mesh in enumerate((a, b)):
+    for port, mesh in enumerate(meshes):
         distances = scale * np.asarray(pyvista.wrap(search.GetOutput(port)).point_data["Distance"])
         of_points.append(distances[:points])
         # A vertex that no triangle uses is not on the surface.

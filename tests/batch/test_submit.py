@@ -71,6 +71,29 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
         assert call("status", store, "--follow").returncode == 0
 
 
+def test_the_objects_of_a_collection_are_handed_over_one_after_another(study_path: Path, tmp_path: Path) -> None:
+    text = study_path.read_text(encoding="utf-8").replace('[reference]\nsource = "sphere"\n', "")
+    objects = {"ball": '{ source = "sphere" }', "gone": '{ source = "files", paths = ["no.ply"] }'}
+    sections = [f'[[object]]\nname = "{name}"\nreference = {reference}\n' for name, reference in objects.items()]
+    study_path.write_text("\n".join([text, *sections]), encoding="utf-8")
+    store = tmp_path / "all.zarr"
+    with tcp_cluster([]) as (address, _):
+        submitted = command("submit", study_path, "--scheduler", address, "--store", store)
+        assert submitted.returncode == 3, submitted.stderr
+        assert submitted.stdout.splitlines() == [
+            "ball:",
+            f"6 of 6 surfaces to be computed by the cluster at {address}",
+            "gone:",
+            f"follow it by: sobolev-batch status --follow {store}",
+        ]
+        assert "not submitted: the reference cannot be made" in submitted.stderr
+        followed = call("status", store, "--follow")
+    assert followed.returncode == 3, followed.stdout
+    assert "gone: it has no results; run the study again to see why" in followed.stdout
+    league = call("league", store, "--method", "ico")
+    assert "League at order -3, over 1 object" in league.stdout, league.stderr
+
+
 def test_what_is_wrong_is_said_before_anything_is_handed_over(tmp_path: Path, store_path: Path) -> None:
     table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
     gpu = small_table(transform={"backend": "gpu"})

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, Similarity, Sphere
-from sobolev_batch.surfaces.sources.decimation import DecimatedMember
+from sobolev_batch.surfaces.sources.derived.decimation import DecimatedMember
 from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX
 

@@ -145,8 +145,7 @@ def test_coordinates_are_written_again(
 def test_a_damaged_record_counts_as_none(damage: Damage, store: Path, study: Study, client: Client) -> None:
     damage(store / "records/record/c/2")
     found = verify(store)
-    # One that is gone looks like one that was never written.
-    assert list(found.fields) == ([] if damage is delete else ["ico/2"])
+    assert list(found.fields) == ["ico/2"]
     assert found.complete == 4
     assert run(study, store, client).computed == ("ico/2",)
     assert verify(store).is_sound
@@ -217,9 +216,12 @@ def test_fields_that_are_replaced_are_not_described_any_more(store: Path, tmp_pa
 @pytest.mark.parametrize("damage", [truncate, empty, delete])
 def test_damaged_metadata_are_said(damage: Damage, store: Path, study: Study) -> None:
     damage(store / "zarr.json")
-    for use in (Store.open, open_store, lambda place: run(study, place, workers=1)):
-        with pytest.raises(StoreError, match=r"results\.zarr: .*(no store of a study is there|holds no store)"):
+    for use in (Store.open, open_store):
+        with pytest.raises(StoreError, match=r"results\.zarr: .*no store of a study is there"):
             use(store)
+    if damage is delete:
+        with pytest.raises(StoreError, match=r"results\.zarr: .*holds no store"):
+            run(study, store, workers=1)
 
 
 def load(store: Path) -> None:

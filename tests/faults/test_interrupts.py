@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from sobolev_batch.batch.storage.lock import LOCK_KEY
@@ -15,6 +18,7 @@ from tests.support.commands import call, read_until, started, write_toml
 
 # Alone it takes two; a machine may have much else to do.
 _SECONDS = 240
+_POLL_SECONDS = 0.01
 
 
 def interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[str, str]:
@@ -112,3 +116,90 @@ def test_a_request_within_a_finalizer_is_heard(number: int, status: int, word: s
     assert lines[0] == "goes on"
     assert lines[1:] == [word]
     assert found.returncode == status
+
+
+# A command within a function of C, which does not return to Python while a transform goes on.
+COMPUTING = """
+import ctypes, sys
+import click
+import sobolev_batch.cli as line
+
+@click.command("compute")
+def compute():
+    block = ctypes.CDLL(None).pthread_mutex_lock
+    mutex = ctypes.create_string_buffer(256)
+    block(mutex)
+    click.echo("computes", err=True)
+    block(mutex)  # held already
+
+line.cli.add_command(compute, sys.argv[1])
+line.main()
+"""
+
+
+@pytest.mark.parametrize("command", ["compare", "table"])
+@pytest.mark.parametrize(
+    ("number", "status", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_a_command_ends_while_a_library_computes(command: str, number: int, status: int, word: str) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPUTING, command], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert read_until(process, "computes")
+    while psutil.Process(process.pid).status() != psutil.STATUS_SLEEPING:
+        time.sleep(_POLL_SECONDS)
+    _, rest = interrupted(process, number)
+    assert (process.returncode, rest) == (status, f"{word}\n")
+
+
+# Work that keeps what it has is asked again for each part that takes long, and is not killed.
+KEEPING = """
+import signal, sys, time
+import click
+import sobolev_batch.cli as line
+from sobolev_batch.cli.interruption import Deadline
+
+@click.command("keep")
+def keep():
+    parts = []
+    with Deadline.with_results(lambda: True):
+        for part in range(3):
+            try:
+                click.echo("works", err=True)
+                while True:
+                    time.sleep({limit})
+            except KeyboardInterrupt:
+                parts.append(part)
+    time.sleep(0.01)
+    click.echo(f"written: {{parts}}")
+
+line.cli.add_command(keep, "keep")
+sys.argv = ["sobolev-batch", "keep"]
+line.main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_work_that_keeps_what_it_has_is_asked_again_and_not_killed(number: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", KEEPING.format(limit=_SECONDS)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert read_until(process, "works")
+    process.send_signal(number)
+    output, rest = process.communicate(timeout=_SECONDS)
+    assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
+
+
+def test_a_status_that_is_followed_ends_without_a_traceback(store_path: Path, tmp_path: Path) -> None:
+    with started("run", write_toml(tmp_path), "--store", store_path, "--workers", "1") as process:
+        read_until(process, "[1/5]")
+        process.send_signal(signal.SIGSTOP)
+        with started("status", store_path, "--follow") as follower:
+            assert follower.stdout is not None
+            line = follower.stdout.readline()
+            assert re.match(r"[1-5] of 5 done, 0 failed, ", line), line
+            output, rest = interrupted(follower, signal.SIGTERM)
+            assert (follower.returncode, rest) == (143, "terminated\n"), output

@@ -225,8 +225,12 @@ def far_field() -> xr.DataArray:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mesh": sb.Sphere()}, "only the vertices of a Mesh can move, found Sphere"),
-        ({"target": "ball"}, "expected a Mesh, a Sphere, a parametrised surface"),
+        ({"mesh": sb.Sphere()}, "expected a Mesh, the path of a mesh file, a pair"),
+        (
+            {"target": 7},
+            "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), a PointCloud or a Fourier "
+            "field; found int",
+        ),
         ({"target": sb.Sphere(1.0, (9, 0, 0))}, "do not overlap: move one of them to the other first"),
         ({"target": sb.Sphere(1000.0)}, "are both in the same unit of length?"),
         ({"order": -0.5}, "finite only for orders below -1/2, found -0.5"),

@@ -40,6 +40,8 @@ def tree() -> xr.DataTree:
             "status": ("mesh", ["complete", "complete", "failed", "complete"]),
             "reason": ("mesh", ["", "", "no 50% of it | is <there>", ""]),
             "triangles": ("mesh", [20, 1280, 0, 0]),
+            "vertices": ("mesh", [12, 642, 0, 0]),
+            "seconds": ("mesh", [0.25, 2.0, 0.5, 0.125]),
         },
         coords={"mesh": MESHES},
     )

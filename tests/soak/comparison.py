@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import xarray as xr
 
-from sobolev_batch import open_store
+from sobolev_batch import DamageError, open_store
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import Store
 
@@ -39,8 +39,8 @@ def differences(ours: Location, theirs: Location) -> Iterator[str]:
                 yield f"{store.labels()[row]}: another field"
     trees = open_store(ours), open_store(theirs)
     for name in _TABLES:
-        found, expected = (tree[name].to_dataset().drop_vars(_OF_THE_RUN, errors="ignore") for tree in trees)
         try:
+            found, expected = (tree[name].to_dataset().drop_vars(_OF_THE_RUN, errors="ignore") for tree in trees)
             xr.testing.assert_allclose(found.drop_attrs(), expected.drop_attrs(), rtol=_TABLE_RTOL, atol=0)
-        except AssertionError as error:
+        except (AssertionError, DamageError) as error:
             yield f"{name}: {error}"

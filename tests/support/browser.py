@@ -57,6 +57,31 @@ class Browser:
             )
         )
 
+    def open_report(self, path: Path, *, width: int = 1100) -> None:
+        """Load the page of a report and wait for its charts."""
+        self.open(path, width=width)
+        self.wait("document.documentElement.classList.contains('drawn')")
+
+    def relative_columns(self) -> dict[str, bool]:
+        """Whether the relative distances of each table that has some are seen without scrolling it sideways."""
+        return dict(
+            self.tell(
+                "Object.fromEntries([...document.querySelectorAll('th[data-name=relative]')].map(head => { "
+                "const [box, area] = [head, head.closest('.scroll')].map(e => e.getBoundingClientRect()); "
+                "return [head.closest('table').id, box.left >= area.left && box.right <= area.right]; }))"
+            )
+        )
+
+    def download_tables(self, folder: Path) -> set[str]:
+        """Click the CSV button of every table, and return the names of the files that come into a folder."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        self.command("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+        count = self.tell("document.querySelectorAll('button.csv').length")
+        self.driver.execute_script("document.querySelectorAll('button.csv').forEach(button => button.click())")
+        WebDriverWait(self.driver, 20, 0.05).until(lambda _: len(list(folder.glob("*.csv"))) == count)
+        return {path.name for path in folder.glob("*.csv")}
+
     def complaints(self) -> list[str]:
         """Errors on its console since the last call; of warnings, those are its own about drawing."""
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]

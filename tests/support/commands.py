@@ -60,7 +60,7 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["sobolev-batch", *map(str, arguments)])
         # Signals are the test runner's, and so are its log handlers: the command is to set up its own.
-        patch.setattr(cli, "raise_when_asked", lambda: None)
+        patch.setattr(cli, "raise_when_asked", lambda deadline: None)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)
         # It tells of connections that earlier tests of this process left open.

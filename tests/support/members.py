@@ -10,7 +10,7 @@ from sobolev_batch.surfaces.sources.registry import Member, parse_source
 
 BALL: dict[str, Any] = {"source": "icosphere", "levels": [3]}
 
-# A table of each source; box.off must lie in the folder of the study.
+# A table of each source; box.off and scan.csv must lie in the folder of the study.
 KINDS: dict[str, dict[str, Any]] = {
     "icosphere": {"source": "icosphere", "levels": [1, 0]},
     "sphere": {"source": "sphere", "radius": 2.0, "center": [1, 2, 3]},
@@ -19,6 +19,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "torus": {"source": "torus", "R": 2, "r": 0.5, "center": [1, 2, 3]},
     "torus-grid": {"source": "torus-grid", "R": 2, "r": 0.5, "levels": [1, 0]},
     "files": {"source": "files", "paths": ["box.off"]},
+    "points": {"source": "points", "paths": ["scan.csv"], "weight": "area"},
     "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
     "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
     "fit": {
@@ -34,6 +35,8 @@ KINDS: dict[str, dict[str, Any]] = {
         "steps": 3,
         "triangles": [40, 24],
     },
+    "moved": {"source": "moved", "mesh": BALL, "distances": [0.1, 0.02], "direction": [0, 0, 2]},
+    "noisy": {"source": "noisy", "mesh": BALL, "amplitudes": [0.1, 0.02], "seed": 3},
     "flow": {"source": "flow", "mesh": BALL, "times": [2.0, 0.5], "period": 4.0, "strength": 1.0},
     "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
 }

@@ -82,7 +82,7 @@ class Comparer:
         for kind in self.kinds:
             kind.finish(records[kind.name])
         self.workspace.store.consolidate()
-        return failed_comparisons(self.workspace.labels, records, self.meshes.rows)
+        return failed_comparisons(dict(enumerate(self.workspace.labels)), records, self.meshes.rows)
 
     def _hide(self) -> None:
         """Have readers find no comparison until all are made: rows may be those of other fields or orders."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.analysis.ordering import TableOrder
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -17,17 +18,51 @@ from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.rates import observed_rates
+from sobolev_batch.surfaces.sources.registry import Metadata
 
 Reals = NDArray[np.float64]
 
 
-def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.Dataset:
-    """Return for each mesh family, level, status, reason, counts, sizes, digests, seconds, worker, backend."""
+class AnyMember(Protocol):
+    """Member, as tables of distances know it."""
+
+    @property
+    def time(self) -> float | None:
+        """Time of the surface; None without one."""
+
+    @property
+    def metadata(self) -> Metadata:
+        """Numbers and texts that the user knows of it."""
+
+
+class AnyRow(Protocol):
+    """Row, as tables of distances know it: `Row` of a plan, or a row of a stored table."""
+
+    @property
+    def label(self) -> str:
+        """Label of the mesh."""
+
+    @property
+    def member(self) -> AnyMember:
+        """Member that makes the mesh."""
+
+
+def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None], order: TableOrder) -> xr.Dataset:
+    """Return for each mesh family, level, rank, status, reason, counts, sizes, digests, seconds, worker, backend.
+
+    Args:
+        rows: Rows of the meshes, in the order of tables.
+        records: Their records.
+        order: Order of tables.
+    """
     filled = [record or Record(key="", status="failed", reason="not computed") for record in records]
     columns: dict[str, NDArray[np.generic]] = {
         "family": _strings([row.family for row in rows]),
         "name": _strings([row.member.name for row in rows]),
         "level": np.array([row.member.level for row in rows], dtype=np.int64),
+        "rank": np.array(order.ranks, dtype=np.int64),
+        "ordered_by": _strings(order.criteria),
+        "row": np.array(order.rows, dtype=np.int64),
         "status": _strings(["missing" if record is None else record.status for record in records]),
         "reason": _strings([record.reason for record in filled]),
     }
@@ -38,7 +73,7 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None]) -> xr.
     for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     variables = {name: ("mesh", values) for name, values in columns.items()}
-    return describe(xr.Dataset(variables, coords=_meshes(rows)))
+    return describe(xr.Dataset(variables, coords=_meshes(rows), attrs={"metadata": list(_metadata(rows))}))
 
 
 def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
@@ -47,7 +82,7 @@ def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstim
 
 
 def distances_dataset(
-    rows: Sequence[Row], others: Sequence[Row], orders: Sequence[float], distances: NormEstimate
+    rows: Sequence[AnyRow], others: Sequence[AnyRow], orders: Sequence[float], distances: NormEstimate
 ) -> xr.Dataset:
     """Return `distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
     coordinates = {**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))}
@@ -72,10 +107,11 @@ class DistancesToReference:
 
 
 def convergence_dataset(
-    rows: Sequence[Row],
+    rows: Sequence[AnyRow],
     orders: Sequence[float],
     to_reference: DistancesToReference,
     sizes: Reals,
+    families: Iterable[Sequence[int]],
     accuracy: Accuracy | None,
 ) -> xr.Dataset:
     """Return distances to the reference, relative ones and their decomposition, and observed orders of convergence.
@@ -85,27 +121,25 @@ def convergence_dataset(
         orders: Sobolev orders s.
         to_reference: Distances to the reference.
         sizes: Mean edge lengths (meshes,).
+        families: Meshes of each family that goes from coarse to fine.
         accuracy: Accuracy that the study asks for, if any.
     """
     reference, proportion = to_reference.reference, to_reference.proportion
     distances, errors = to_reference.distances.values, to_reference.distances.errors
     rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
-    for family in dict.fromkeys(row.family for row in rows):
-        # Only levels form a sequence; files of one family may be unrelated shapes.
-        members = [
-            i for i, row in enumerate(rows) if row.family == family and row.member.level >= 0 and row.label != reference
-        ]
+    for family in families:
+        members = [i for i in family if rows[i].label != reference]
         for k in range(len(orders)):
             rates[k, members], rate_errors[k, members] = observed_rates(
                 distances[k, members], errors[k, members], sizes[members]
             )
-    norms, norm_errors = to_reference.norms.values[:, None], to_reference.norms.errors[:, None]
-    relative = distances / norms
+    norms = NormEstimate(*(part[:, None] for part in to_reference.norms))
+    relative, relative_errors = to_reference.distances.relative_to(norms)
     within = np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference.distances)
     columns = {
         **to_reference.distances.named("distance"),
         "relative": relative,
-        "relative_error": errors / norms + relative * norm_errors / norms,
+        "relative_error": relative_errors,
         "area_part": proportion.area,
         "shape_part": proportion.shape,
         "rate": rates,
@@ -126,17 +160,30 @@ def _variables(values: Mapping[str, NDArray[Any]], *dimensions: str) -> dict[str
     return {name: ((*dimensions, "order"), np.moveaxis(array, 0, -1)) for name, array in values.items()}
 
 
-def _coordinates(rows: Sequence[Row], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:
+def _coordinates(rows: Sequence[AnyRow], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:
     return {**_meshes(rows), "order": ("order", np.array(orders, dtype=np.float64))}
 
 
-def _meshes(rows: Sequence[Row]) -> dict[str, tuple[str, NDArray[np.generic]]]:
-    """Return labels, and times where any mesh has one."""
-    labels = {"mesh": ("mesh", _strings([row.label for row in rows]))}
+def _meshes(rows: Sequence[AnyRow]) -> dict[str, tuple[str, NDArray[np.generic]]]:
+    """Return labels, and times and other metadata where any mesh has some."""
+    coordinates = {"mesh": _strings([row.label for row in rows]), **_metadata(rows)}
     times = [row.member.time for row in rows]
-    if all(time is None for time in times):
-        return labels
-    return {**labels, "time": ("mesh", np.array([np.nan if time is None else time for time in times]))}
+    if any(time is not None for time in times):
+        coordinates["time"] = np.array([np.nan if time is None else time for time in times])
+    return {name: ("mesh", values) for name, values in coordinates.items()}
+
+
+def _metadata(rows: Sequence[AnyRow]) -> dict[str, NDArray[np.generic]]:
+    """Return the metadata of meshes by name: numbers with NaN, or texts with empty ones, where a mesh has none."""
+    given = [dict(row.member.metadata) for row in rows]
+    columns: dict[str, NDArray[np.generic]] = {}
+    for name in dict.fromkeys(name for metadata in given for name in metadata):
+        values = [metadata.get(name) for metadata in given]
+        if any(isinstance(value, str) for value in values):
+            columns[name] = _strings(["" if value is None else str(value) for value in values])
+        else:
+            columns[name] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    return columns
 
 
 def _strings(values: Sequence[str]) -> NDArray[np.generic]:

@@ -202,7 +202,7 @@ class WitnessKind(ComparisonKind):
         workspace = self.meshes.workspace
         vertices = max(self.meshes.vertex_counts.values(), default=1)
         Witnesses(self.store).create(workspace.labels, self.study.witness, workspace.plan.reference, max(1, vertices))
-        self.records.create(len(workspace.rows))
+        self.records.create(len(workspace.labels))
 
     def finish(self, records: Records) -> None:
         """Remove values without a record, and list the array."""
@@ -244,7 +244,7 @@ class ProximityKind(ComparisonKind):
 
     def create(self) -> None:
         """Create the table, without values."""
-        rows = len(self.meshes.workspace.rows)
+        rows = len(self.meshes.workspace.labels)
         if not self.store.has(_PROXIMITY_GROUP):
             # Before the records: what the study does not ask for any more is found by its group.
             Tables(self.store).write(_PROXIMITY_GROUP, self._dataset([None] * rows))
@@ -262,7 +262,6 @@ class ProximityKind(ComparisonKind):
     def _dataset(self, records: Records) -> xr.Dataset:
         """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN."""
         records = self._current(records)
-
         columns: dict[str, Any] = {
             name: [record.numbers[name] if record and record.numbers else np.nan for record in records]
             for name in (field.name for field in fields(Proximity))
@@ -275,7 +274,8 @@ class ProximityKind(ComparisonKind):
         }
         labels = np.array(self.meshes.workspace.labels, dtype=object)
         variables = {name: ("mesh", values) for name, values in columns.items()}
-        return describe(xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes))
+        dataset = xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes)
+        return describe(dataset.isel(mesh=sorted(self.meshes.workspace.rows)))
 
     def _current(self, records: Records) -> list[ComparisonRecord | None]:
         """Return the records of the meshes and points that there are now."""
@@ -286,5 +286,5 @@ class ProximityKind(ComparisonKind):
         ]
 
     def _digest(self, records: Records) -> str:
-        lines = [None if record is None else record.to_json() for record in records]
+        lines = [None if record is None else record.to_json(row) for row, record in enumerate(records)]
         return hashlib.sha256(json.dumps([self.meshes.workspace.labels, lines]).encode()).hexdigest()

@@ -18,6 +18,7 @@ from sobolev_batch.batch.analysis.datasets import (
     meshes_dataset,
     norms_dataset,
 )
+from sobolev_batch.batch.analysis.ordering import TableOrder
 from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import Cluster, Task
@@ -27,15 +28,17 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum, stacked_levels
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
+from sobolev_batch.surfaces.shapes.point_cloud import require_finite_norm
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 3
+TABLES_VERSION = 5
 
 Reals = NDArray[np.float64]
 
@@ -58,25 +61,20 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     if every_pair:
         tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(complete, threads)]
     steps = Steps(cluster.notify, "reduction", len(tasks))
-    results = _Results.empty(workspace)
+    results = Results.empty(len(workspace.plan.study.orders), len(workspace.labels), every_pair=every_pair)
     for task, outcome in cluster.results(tasks, projected_bytes):
         if task.function == reducer.norms:
             results.enter_norms(outcome, *task.arguments)
         else:
             results.enter_tile(outcome, *task.arguments)
         steps.advance()
-    reference = workspace.reference
-    if every_pair:
-        # The direct sums are the more exact ones, and the same numbers in both tables.
-        results.distances[..., reference] = results.distances[..., reference, :] = results.to_reference
-    else:
-        results.distances[..., 0] = results.to_reference
+    results.enter_reference(workspace.reference)
     _write_tables(workspace, results)
     return NormEstimate(*results.to_reference)
 
 
 @dataclass(frozen=True, eq=False)
-class _Results:
+class Results:
     """The results of a reduction, NaN where there are none.
 
     Attributes:
@@ -92,10 +90,9 @@ class _Results:
     distances: Reals
 
     @classmethod
-    def empty(cls, workspace: Workspace) -> Self:
-        """Return the results before any task."""
-        orders, rows = len(workspace.plan.study.orders), len(workspace.rows)
-        others = rows if workspace.plan.study.pairs == "all" else 1
+    def empty(cls, orders: int, rows: int, *, every_pair: bool) -> Self:
+        """Return the results before any task, for numbers of orders and rows."""
+        others = rows if every_pair else 1
         shapes = (5, orders, rows), (5, orders, rows), (3, orders, rows), (5, orders, rows, others)
         return cls(*(np.full(shape, np.nan) for shape in shapes))
 
@@ -111,6 +108,14 @@ class _Results:
         pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
         self.distances[..., i[:, None], j] = pairs
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
+
+    def enter_reference(self, reference: int) -> None:
+        """Enter the distances to the row of the reference, once all norms are there."""
+        if self.distances.shape[-1] > 1:
+            # The direct sums are the more exact ones, and the same numbers in both tables.
+            self.distances[..., reference] = self.distances[..., reference, :] = self.to_reference
+        else:
+            self.distances[..., 0] = self.to_reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +136,25 @@ class StoredFields:
     tail: TailSampling | None
     reference: int
 
+    def results(self, orders: tuple[float, ...], *, every_pair: bool) -> Results:
+        """Compute norms and distances in this process, with the memory of one task.
+
+        Args:
+            orders: Sobolev orders s.
+            every_pair: True for the distances of all pairs, False for those to the reference alone.
+
+        Raises:
+            DamageError: A field is not what was stored.
+        """
+        reducer, complete = self.reducer(orders), list(complete_records(self.records))
+        results = Results.empty(len(orders), len(self.records), every_pair=every_pair)
+        for rows in reducer.row_batches(complete, 1):
+            results.enter_norms(reducer.norms(rows), rows)
+        for tile in reducer.tiles(complete, 1) if every_pair else ():
+            results.enter_tile(reducer.tile(*tile), *tile)
+        results.enter_reference(self.reference)
+        return results
+
     def reducer(self, orders: tuple[float, ...], compared_with: int | None = None) -> Reducer:
         """Return the reducer for some orders.
 
@@ -142,12 +166,16 @@ class StoredFields:
         areas, errors = np.full(len(self.records), np.nan), np.full((len(orders), len(self.records)), np.nan)
         weights = SobolevWeights(self.lattice, orders, None if self.tail is None else self.tail.cutoff)
         extents, qualities = [], {}
+        points: dict[int, PointSpectrum] = {}
         for i, record in complete.items():
             quality = Quality.from_json(record.quality)
             areas[i], errors[:, i] = quality.area, quality.error_norms(weights)
             extents.append(quality.extent)
             if quality.tail is not None:
                 qualities[i] = quality.tail
+            if quality.points is not None:
+                require_finite_norm(orders)
+                points[i] = quality.points
         reference = self.reference if self.reference in complete else None
         tails = None
         if self.tail is not None:
@@ -164,35 +192,43 @@ class StoredFields:
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums={i: record.checksums for i, record in complete.items()},
             tails=tails,
+            point_levels=stacked_levels(points, len(self.records)),
         )
 
 
 def make_reducer(workspace: Workspace) -> Reducer:
     """Return the reducer of a workspace."""
     plan = workspace.plan
-    fields = StoredFields(workspace.store, workspace.records, plan.lattice, plan.tail, workspace.reference)
+    records = [record if i in workspace.rows else None for i, record in enumerate(workspace.records)]
+    fields = StoredFields(workspace.store, records, plan.lattice, plan.tail, workspace.reference)
     return fields.reducer(plan.study.orders)
 
 
-def _write_tables(workspace: Workspace, results: _Results) -> None:
-    plan, rows, store = workspace.plan, workspace.rows, workspace.store
+def _write_tables(workspace: Workspace, results: Results) -> None:
+    plan, store = workspace.plan, workspace.store
     orders, reference = plan.study.orders, workspace.reference
-    others = rows if plan.study.pairs == "all" else (rows[reference],)
-    meshes = meshes_dataset(rows, workspace.records)
+    order = TableOrder.of(workspace)
+    shown = list(order.rows)
+    rows = [workspace.rows[i] for i in shown]
+    is_every_pair = plan.study.pairs == "all"
+    others = rows if is_every_pair else [workspace.rows[reference]]
+    distances = results.distances[..., shown, :][..., shown if is_every_pair else [0]]
+    meshes = meshes_dataset(rows, [workspace.records[i] for i in shown], order)
     to_reference = DistancesToReference(
         plan.reference,
-        NormEstimate(*results.to_reference),
-        Proportion(*results.proportions),
+        NormEstimate(*results.to_reference[..., shown]),
+        Proportion(*results.proportions[..., shown]),
         NormEstimate(*results.norms[..., reference]),
     )
-    sizes = meshes["edge_length_mean"].to_numpy()
-    convergence = convergence_dataset(rows, orders, to_reference, sizes, plan.study.accuracy)
+    sizes, families = meshes["edge_length_mean"].to_numpy(), order.families_with_rates(workspace.rows)
+    convergence = convergence_dataset(rows, orders, to_reference, sizes, families.values(), plan.study.accuracy)
     tables = Tables(store)
     replaced = tables.invalidate()
     store.write_qualities([record.quality if record else "" for record in workspace.records])
     tables.write("meshes", meshes, instead_of=replaced)
-    tables.write("norms", norms_dataset(rows, orders, NormEstimate(*results.norms)), instead_of=replaced)
-    pairs = distances_dataset(rows, others, orders, NormEstimate(*results.distances))
+    norms = norms_dataset(rows, orders, NormEstimate(*results.norms[..., shown]))
+    tables.write("norms", norms, instead_of=replaced)
+    pairs = distances_dataset(rows, others, orders, NormEstimate(*distances))
     tables.write("distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are stored.
     tables.write("convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)
@@ -210,18 +246,21 @@ def are_tabulated(workspace: Workspace) -> bool:
 def _digest(workspace: Workspace) -> str:
     """Return the SHA-256 of all that the tables depend on."""
     plan = workspace.plan
+    shown = [(workspace.rows[i], workspace.records[i]) for i in TableOrder.of(workspace).rows]
     rows = [
         [row.label, row.family, *((record.key, record.status, record.reason) if record else ("", "", ""))]
-        for row, record in zip(workspace.rows, workspace.records, strict=True)
+        for row, record in shown
     ]
-    times = [row.member.time for row in workspace.rows]
+    times, metadata = ([getattr(row.member, name) for row, _ in shown] for name in ("time", "metadata"))
     inputs = {
         "version": TABLES_VERSION,
         "rows": rows,
         "orders": plan.study.orders,
         "pairs": plan.study.pairs,
         "reference": plan.reference,
-        # Left out where there are none, as in stores that know no times.
+        "order_by": {family.name: family.order_by for family in plan.study.families},
+        # Left out where there are none, as in stores that know none.
         **({} if all(time is None for time in times) else {"times": times}),
+        **({"metadata": metadata} if any(metadata) else {}),
     }
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 
 import dask
@@ -16,6 +16,7 @@ from sobolev_batch.batch.cluster.address import Address
 from sobolev_batch.batch.cluster.connection import check_connection
 from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.parameters import byte_count, format_bytes
+from sobolev_batch.spectral.backends.machine import require_machine_memory
 
 _CONNECT_SECONDS = 15
 # In less, a worker with all its libraries has no memory left for any transform.
@@ -40,7 +41,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
     Raises:
         InputError: The memory is not a size, or too little for a worker.
     """
-    limit = "auto" if memory is None else _memory_limit(memory)
+    limit = "auto" if memory is None else memory_limit(memory)
     count = workers or available_cores()
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
@@ -67,9 +68,27 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
             dashboard_address="127.0.0.1:0",
         ) as cluster,
         Client(cluster) as client,
+        _ending_at_once(cluster),
     ):
         unshield()
         yield client
+
+
+@contextmanager
+def _ending_at_once(cluster: LocalCluster) -> Iterator[None]:
+    """Kill the workers of a cluster when this process is asked to end.
+
+    A worker in the midst of a transform does not answer when it is asked to close, and would be waited for.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        for nanny in cluster.workers.values():
+            nanny.auto_restart = False
+            if nanny.pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(nanny.pid, signal.SIGKILL)
+        raise
 
 
 @contextmanager
@@ -160,12 +179,18 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         yield client
 
 
-def _memory_limit(memory: float | str) -> int:
+def memory_limit(memory: float | str) -> int:
+    """Return the memory of a worker in bytes.
+
+    Raises:
+        InputError: The memory is not a size, too little for a worker, or more than there is.
+    """
     limit = byte_count(memory)
     if limit < _LEAST_BYTES:
         raise InputError(
             f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}; give it more"
         )
+    require_machine_memory(limit, "the memory of a worker")
     return limit
 
 

@@ -21,6 +21,7 @@ class Progress:
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
         record: Completion record of that mesh.
+        part: Object of a collection that is worked on, and its number, such as "cow, 2 of 8"; else empty.
     """
 
     stage: Stage
@@ -28,6 +29,7 @@ class Progress:
     total: int
     label: str = ""
     record: Record | None = None
+    part: str = ""
 
 
 Notify = Callable[[Progress], None]

@@ -16,6 +16,7 @@ from sobolev_batch.batch.cluster.worker_versions import VersionGuard
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, allowed_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
+from sobolev_batch.spectral.transform.durations import slowness
 
 _log = logging.getLogger(__name__)
 
@@ -111,6 +112,11 @@ def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
     return Workers(members)
 
 
+def worker_slowness(client: Client, address: str) -> float:
+    """Return how many times as long as predicted a transform takes on a worker; see `slowness`."""
+    return float(client.run(_slowness, workers=[address])[address])
+
+
 def waiting_reason(client: Client, backend: str) -> str:
     """Return what a study waits for that its cluster has lost; empty where it has all that it takes."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
@@ -135,6 +141,11 @@ def worker_backend(choice: str) -> Backend:
 async def _describe(dask_worker: Worker) -> WorkerInfo | None:
     plugin = dask_worker.plugins.get(_NAME)
     return None if plugin is None else await plugin.describe(dask_worker)
+
+
+async def _slowness(dask_worker: Worker) -> float:
+    # In a thread, or the worker would not answer meanwhile.
+    return await asyncio.to_thread(slowness, dask_worker.plugins[_NAME].backend)
 
 
 def _declares_gpu(worker: Worker) -> bool:

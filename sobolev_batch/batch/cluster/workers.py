@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import psutil
-
 from sobolev_batch.batch.study.schema import Backends
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.parameters import format_bytes
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.backends.machine import MachineMemory
 
 # Dask resources that tasks claim of a worker.
 MEMORY = "sobolev-batch-memory"
@@ -48,7 +48,7 @@ def allowed_bytes(limit: float | None) -> float:
     Args:
         limit: Memory limit of the worker; without one, the machine's memory.
     """
-    return _ALLOWED_FRACTION * (limit or psutil.virtual_memory().total) - _IDLE_BYTES
+    return _ALLOWED_FRACTION * (limit or MachineMemory.found().total_bytes) - _IDLE_BYTES
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Workers:
     @classmethod
     def of_this_machine(cls, count: int) -> Workers:
         """Return the workers of a cluster that a run without a scheduler would start here."""
-        allowed = allowed_bytes(psutil.virtual_memory().total / count)
+        allowed = allowed_bytes(MachineMemory.found().total_bytes / count)
         return cls((WorkerInfo("this machine", 1, allowed, "cpu", ""),) * count)
 
     @property
@@ -89,6 +89,20 @@ class Workers:
                 f"it takes about {format_bytes(projected_bytes)} in one task, and no worker has more than "
                 f"{format_bytes(self.largest_allowed_bytes)} for tasks (of its limit it keeps 15 % and 0.3 GB for "
                 "itself); start workers with more memory"
+            )
+
+    def require_accuracy(self, accuracy: Accuracy | None) -> None:
+        """Check that the workers have the memory that a study allows for a transform.
+
+        Raises:
+            InputError: The largest worker has less, in all.
+        """
+        largest = max(self.members, key=lambda member: member.allowed_bytes)
+        limit = (largest.allowed_bytes + _IDLE_BYTES) / _ALLOWED_FRACTION
+        if accuracy is not None and accuracy.asks_for_memory and accuracy.allowed_bytes > limit:
+            raise InputError(
+                f"[accuracy]: memory of {format_bytes(accuracy.allowed_bytes)} is more than any worker has: "
+                f"{format_bytes(limit)} on {largest.address}; ask for less, or start workers with more"
             )
 
     def with_backend(self, backend: Backends) -> Workers:

@@ -74,6 +74,10 @@ class Location:
         """Return the same location for processes that were started in another folder."""
         return self if self.scheme else Location(str(Path(self.name).absolute()))
 
+    def below(self, name: str) -> Location:
+        """Return the location of a name below this one."""
+        return Location(f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
+
     def zarr_store(self, largest_bytes: int = 0) -> ZarrStore:
         """Return the store that zarr and xarray take to read and write here.
 

@@ -49,12 +49,12 @@ class ComparisonRecords(RecordTable[ComparisonRecord]):
 
 
 def failed_comparisons(
-    labels: Sequence[str], records: Mapping[Kind, Sequence[ComparisonRecord | None]], rows: Container[int]
+    labels: Mapping[int, str], records: Mapping[Kind, Sequence[ComparisonRecord | None]], rows: Container[int]
 ) -> dict[str, str]:
     """Return the comparisons that failed, with their reasons, by the labels of the meshes.
 
     Args:
-        labels: Labels of all rows of a store.
+        labels: Label of each mesh by its row.
         records: Records of all rows, for each kind of comparison that the study asks for.
         rows: Rows of the meshes that have fields.
     """

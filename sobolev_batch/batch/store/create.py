@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,16 +29,17 @@ from sobolev_batch.batch.store.hierarchy import (
 )
 from sobolev_batch.batch.store.layout import Layout
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import UNFINISHED, Store
+from sobolev_batch.batch.store.store import REMOVED, UNFINISHED, Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 _log = logging.getLogger(__name__)
 
+_GROUPS_OF_FIELDS = ("fourier", OCTAVES_GROUP, RECORDS)
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
@@ -48,7 +50,12 @@ def require_usable(location: Location) -> None:
         StoreError: The location cannot be read, or holds something else.
     """
     store = Store(location)
-    if not store.exists():
+    try:
+        is_there = store.exists()
+    except DamageError:
+        # See `prepare_store`.
+        return
+    if not is_there:
         location.require_free(besides=LOCK_KEYS)
     elif not store.is_unfinished:
         store.attributes()
@@ -57,12 +64,18 @@ def require_usable(location: Location) -> None:
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     """Create the store of a plan, or open it and add rows for new meshes.
 
+    Rows of meshes that the study has lost stay. If one has come back under another name, it gets this name.
+
     Raises:
         StoreError: The location cannot be read or written, or holds something else or the store of another study,
             which then stays as it is.
     """
     store = Store(location)
-    if not store.exists():
+    try:
+        is_there = store.exists()
+    except DamageError as damage:
+        store, is_there = _with_new_root(store.location, plan, damage), True
+    if not is_there:
         store.location.require_free(besides=LOCK_KEYS)
         _create(store, plan)
         return store
@@ -80,14 +93,42 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
             )
             _replace_everything(store, plan)
         store.repair_labels()
+        _rename(store, plan)
         _extend(store, plan)
         _repair_axes(store, plan)
         if store.attributes().get("similarity") != _similarity_entry(plan.similarity):
             # Tables are in another unit of length, and the run may end before there are others.
             Tables(store).invalidate()
-        store.documents[""]["attributes"].update(_attributes(plan))
+        store.documents[""]["attributes"].update(_attributes(plan, store.labels()))
         # Written even if nothing changed: a location that cannot be written must fail before tasks start.
         store.consolidate()
+    return store
+
+
+def _with_new_root(location: Location, plan: Plan, damage: DamageError) -> Store:
+    """Return a store whose metadata at the root are damaged, with new ones that follow from its arrays and the plan.
+
+    Its tables are left out: they are made again.
+
+    Raises:
+        DamageError: The fields are not those of the plan's study, as far as that can be told.
+    """
+    store = Store.of_nodes(location, _GROUPS_OF_FIELDS)
+    store.documents[""] = _root({})
+    keys = {row.key for row in plan.rows}
+    field = store.documents.get(FIELD, {})
+    is_known = field and RECORD in store.documents and field["shape"][1:] == list(plan.lattice.shape)
+    if not is_known or not any(record is not None and record.key in keys for record in store.records()):
+        raise DamageError(
+            f"{location}: {ROOT}, the metadata at the root, is damaged, and no field of this study is found in the "
+            "store to make it again from; name another store, or remove this one",
+            damage.what,
+        )
+    _log.warning("%s: the metadata at the root are damaged, and are made again with the tables", store.path)
+    for name in [name for name, document in store.documents.items() if document["node_type"] == "array"]:
+        if name not in (FIELD, OCTAVES) and not name.startswith(f"{RECORDS}/"):
+            store.digest_stored(name)
+    store.documents[""] = _root(_attributes(plan, store.labels()))
     return store
 
 
@@ -137,7 +178,7 @@ def _create(store: Store, plan: Plan) -> None:
         )
         layout.add_dataset(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": labels}))
     _mark_unfinished(store, plan)
-    store.documents = {"": _root(_attributes(plan))}
+    store.documents = {"": _root(_attributes(plan, labels.tolist()))}
     groups = ("fourier", RECORDS, *([OCTAVES_GROUP] if plan.tail is not None else []))
     store.publish({key: content for group in groups for key, content in layout.keys(group).items()})
     store.consolidate()
@@ -171,17 +212,16 @@ def _repair_axes(store: Store, plan: Plan) -> None:
     columns = {} if plan.tail is None else _sample_columns(plan.tail)
     axes |= {f"{OCTAVES_GROUP}/{name}": values for name, (_, values, _) in columns.items()}
     for name, axis in axes.items():
-        array = store.array(name)
         try:
-            stored = np.asarray(array[...])
-        except ValueError:
+            stored = np.asarray(store.read(name, ...))
+        except DamageError:
             stored = None
         # Of a deleted array the fill values are left: NaN, or zeros for whole numbers.
         if stored is None or np.isnan(stored).any() or not stored.any():
-            array[...] = axis
+            store.write(name, ..., axis)
         elif not np.allclose(stored, axis, rtol=1e-9, atol=1e-12):
             if name.startswith("fourier"):
-                array[...] = axis
+                store.write(name, ..., axis)
                 continue
             raise StoreError(
                 f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
@@ -205,14 +245,28 @@ def _check_same_study(store: Store, plan: Plan) -> None:
             first, second = (str(len(table["octaves"])) if table else "none" for table in (old, new))
             comparisons.append(("octaves:", first, second if first != second else f"{second} others"))
     differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
-    removed = set(store.labels()) - {row.label for row in plan.rows}
-    if removed:
-        differences.append(f"meshes that this study lacks, such as {min(removed)!r}")
     if differences:
         raise StoreError(
             f"{store.path}: a store of another study is there, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
+
+
+def _rename(store: Store, plan: Plan) -> None:
+    """Give rows of meshes that the study has lost the labels of new meshes with the same fields."""
+    labels, planned = list(store.labels()), {row.label: row for row in plan.rows}
+    lost = [i for i, label in enumerate(labels) if label not in planned]
+    added = {row.key: row.label for label, row in planned.items() if row.key and label not in set(labels)}
+    if not lost or not added:
+        return
+    records = store.records()
+    renamed = False
+    for i in lost:
+        record = records[i]
+        if record is not None and record.status == "complete" and record.key in added:
+            labels[i], renamed = added.pop(record.key), True
+    if renamed:
+        store.write_labels(labels)
 
 
 def _extend(store: Store, plan: Plan) -> None:
@@ -228,16 +282,16 @@ def _extend(store: Store, plan: Plan) -> None:
         store.resize(name, (rows, *store.array(name).shape[1:]))
     # Empty qualities are written too, since a missing chunk counts as lost.
     for name, values in ((QUALITY, [""] * len(added)), *((name, added) for name in (LABELS, *of_octaves[1:]))):
-        store.array(name)[len(labels) :] = np.array(values, dtype=object)
+        store.write(name, slice(len(labels), None), np.array(values, dtype=object))
     for records in (ComparisonRecords(store, kind) for kind in KINDS):
         # xarray cannot read arrays of one group together that differ along `mesh`.
         if store.has(records.name):
             records.create(rows)
 
 
-def _attributes(plan: Plan) -> dict[str, Any]:
-    """Return the attributes of the root of the store of a plan."""
-    study = plan.study
+def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the attributes of the root of the store of a plan with some rows."""
+    study, planned = plan.study, {row.label for row in plan.rows}
     return {
         "title": study.title,
         "schema_version": SCHEMA_VERSION,
@@ -250,6 +304,7 @@ def _attributes(plan: Plan) -> dict[str, Any]:
             "reference": plan.reference,
             "table": dict(study.table),
         },
+        REMOVED: [label for label in labels if label not in planned],
         "similarity": _similarity_entry(plan.similarity),
         "versions": {name: version(name) for name in _RECORDED_VERSIONS},
     }

@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import zarr
@@ -20,8 +20,16 @@ from zarr.abc.store import Store as ZarrStore
 from zarr.buffer.cpu import Buffer as BytesBuffer
 from zarr.storage import MemoryStore, StorePath
 
+from sobolev_batch.batch.storage.checked import (
+    CHANGED,
+    CheckedStore,
+    NotingStore,
+    RecordedChunks,
+    digest_of,
+    document_digest,
+)
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.metadata import MOST_BYTES, Document, check_documents
+from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.errors import DamageError, StoreError
 
 ROOT = "zarr.json"
@@ -37,6 +45,8 @@ WITNESS_GROUP = "witness"
 WITNESS = "witness/witness"
 # Length of the checksum at the end of a chunk.
 _CHECKSUM_BYTES = 4
+# Attributes of the root: digest of the content of each chunk of small arrays, and that of the root itself.
+DIGESTS, DIGEST = "digests", "digest"
 _REQUESTS_AT_ONCE = 64
 
 
@@ -49,11 +59,13 @@ class Hierarchy:
     Attributes:
         location: Location of the store.
         documents: Metadata documents by the path of their node. That of the root, under "", lacks the others.
+        digests: Digest of the content of each key that is read as a whole: the chunks of tables and coordinates.
     """
 
     def __init__(self, store: str | Path | Location) -> None:
         self.location = Location.of(store)
         self.documents: dict[str, Document] = {}
+        self.digests: dict[str, str] = {}
 
     @property
     def path(self) -> str:
@@ -61,17 +73,39 @@ class Hierarchy:
         return self.location.name
 
     def exists(self) -> bool:
-        """Return whether a zarr hierarchy exists."""
+        """Return whether a zarr hierarchy exists.
+
+        Raises:
+            DamageError: The metadata at its root are not those that were written.
+        """
         if "" not in self.documents:
             root = self._read_document("")
             if root is None:
                 return False
+            self.digests = dict(root.get("attributes", {}).pop(DIGESTS, {}))
             # Groups repeat the metadata of what is in them, as the root does.
             for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
             self.documents[""] = root
         return True
+
+    @classmethod
+    def of_nodes(cls, store: str | Path | Location, groups: Iterable[str]) -> Self:
+        """Return a hierarchy from the metadata of some groups and their arrays, where those at the root are damaged.
+
+        Raises:
+            StoreError: The location cannot be read, or metadata are damaged too.
+        """
+        made = cls(store)
+        for group in groups:
+            ending = f"/{ROOT}"
+            for key in made.location.sizes(group):
+                document = made._read_document(key.removesuffix(ending)) if key.endswith(ending) else None
+                if document is not None:
+                    document.pop("consolidated_metadata", None)
+                    made.documents[key.removesuffix(ending)] = document
+        return made
 
     def has(self, name: str) -> bool:
         """Return whether a node exists, listed at the root or not."""
@@ -89,14 +123,21 @@ class Hierarchy:
             )
         return self.documents[name]
 
-    def zarr_store(self, name: str = FIELD) -> ZarrStore:
-        """Return the store that zarr and xarray take, adapted to the chunks of one array."""
+    def zarr_store(self, name: str = FIELD, recorded: Sequence[RecordedChunks] = ()) -> ZarrStore:
+        """Return the store that zarr and xarray take, adapted to the chunks of one array.
+
+        It holds what is read against the digests, and chunks of some arrays against the records of their rows.
+        """
         chunk = self.document(name)["chunk_grid"]["configuration"]["chunk_shape"]
-        return self.location.zarr_store(math.prod(chunk) * np.dtype(np.complex128).itemsize)
+        store = self.location.zarr_store(math.prod(chunk) * np.dtype(np.complex128).itemsize)
+        return CheckedStore(store, self.path, dict(self.digests), recorded) if self.digests or recorded else store
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
-        path = StorePath(self.zarr_store(name), name)
+        store = self.zarr_store(name)
+        if not name.startswith(f"{RECORDS}/") and name not in (FIELD, OCTAVES, WITNESS):
+            store = NotingStore(store, self.digests)
+        path = StorePath(store, name)
         metadata = zarr.AsyncArray.from_dict(path, self.document(name)).metadata
         # Chunks of zeros are data too: they must exist, or they would read as never computed.
         return zarr.Array(zarr.AsyncArray(metadata, path, config={"write_empty_chunks": True}))
@@ -147,6 +188,7 @@ class Hierarchy:
         """Forget nodes. They stay, but readers do not find them after `consolidate`."""
         for name in names:
             del self.documents[name]
+            self.forget_digests(name)
 
     def publish(self, keys: Mapping[str, bytes], last: str = "") -> None:
         """Write keys of a layout. The last one says that the others exist."""
@@ -156,9 +198,11 @@ class Hierarchy:
         for key, content in keys.items():
             if key.endswith(f"/{ROOT}"):
                 self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
+            else:
+                self.digests[key] = digest_of(content)
 
     def consolidate(self) -> None:
-        """Collect the metadata of all groups at the root, so that one read opens everything."""
+        """Collect the metadata of all groups at the root, so that one read opens everything, and the digests."""
         keys: dict[str, Buffer] = {
             f"{name}/{ROOT}".lstrip("/"): BytesBuffer.from_bytes(json.dumps(document).encode())
             for name, document in self.documents.items()
@@ -166,7 +210,21 @@ class Hierarchy:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
             zarr.consolidate_metadata(MemoryStore(keys), zarr_format=3)
-        self.location.write({ROOT: keys[ROOT].to_bytes()})
+        root = json.loads(keys[ROOT].to_bytes())
+        root["attributes"][DIGESTS] = self.digests
+        self.location.write({ROOT: json.dumps(sealed(root)).encode()})
+
+    def digest_stored(self, name: str) -> None:
+        """Take what is stored of a small array for what was written."""
+        for key in self.location.sizes(f"{name}/c"):
+            content = self.location.read(key)
+            if content is not None:
+                self.digests[key] = digest_of(content)
+
+    def forget_digests(self, name: str) -> None:
+        """Forget the digests of an array, which is about to be written."""
+        for key in [key for key in self.digests if key.startswith(f"{name}/c/") or key == f"{name}/c"]:
+            del self.digests[key]
 
     def _read_document(self, name: str) -> Document | None:
         text = self.location.read(f"{name}/{ROOT}".lstrip("/"), MOST_BYTES)
@@ -175,11 +233,37 @@ class Hierarchy:
         try:
             document = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
-            raise StoreError(
-                f"{self.path}: no store of a study is there: {name}/{ROOT} is damaged ({error})"
-            ) from error
+            problem = f"{f'{name}/{ROOT}'.lstrip('/')} is damaged ({error})"
+            raise DamageError(f"{self.path}: no store of a study is there: {problem}", problem) from error
+        if not name:
+            # First, since a run repairs what was changed, and not what somebody else wrote.
+            require_intact(self.path, document)
         check_documents(self.path, {name: document})
         return document
+
+
+def sealed(root: Document) -> Document:
+    """Return the metadata of a root with their own digest."""
+    attributes = {name: value for name, value in root["attributes"].items() if name != DIGEST}
+    unsealed = {**root, "attributes": attributes}
+    return {**root, "attributes": {**attributes, DIGEST: document_digest(unsealed)}}
+
+
+def require_intact(path: str, root: Document) -> None:
+    """Take the digest off the metadata of a root; those that an older version wrote have none.
+
+    Raises:
+        DamageError: They are not those that were written.
+    """
+    attributes = root.get("attributes")
+    attributes = attributes if isinstance(attributes, dict) else {}
+    digest = attributes.pop(DIGEST, None)
+    # Another schema is refused, with its own message, and may make digests in another way.
+    is_readable = attributes.get("schema_version") == SCHEMA_VERSION
+    if is_readable and digest is not None and digest != document_digest(root):
+        raise DamageError(
+            f"{path}: {ROOT}, the metadata at the root, is damaged ({CHANGED}); run the study again", CHANGED
+        )
 
 
 class StoredChunks:

@@ -43,7 +43,7 @@ class RecordTable(Generic[R]):
     def read_row(self, row: int) -> R | None:
         """Return the record of one row, or None if it has none that can be read."""
         try:
-            return self._kind.from_json(str(self._hierarchy.read(self.name, row)))
+            return self._kind.from_json(str(self._hierarchy.read(self.name, row)), row)
         except DamageError:
             return None
 
@@ -53,7 +53,7 @@ class RecordTable(Generic[R]):
 
     def write(self, row: int, record: R | None) -> None:
         """Write the record of a row, or erase it."""
-        self._hierarchy.write(self.name, row, "" if record is None else record.to_json())
+        self._hierarchy.write(self.name, row, "" if record is None else record.to_json(row))
 
     def remove(self) -> None:
         """Remove all records."""
@@ -67,7 +67,7 @@ class RecordTable(Generic[R]):
             try:
                 if isinstance(line, DamageError):
                     raise line
-                records[row] = self._kind.from_json(line)
+                records[row] = self._kind.from_json(line, row)
             except DamageError as error:
                 damage[row] = error.what
         return records, damage

@@ -15,6 +15,8 @@ from sobolev_batch.errors import DamageError, StoreError
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
 
+_ROW = "row"
+
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
@@ -27,27 +29,38 @@ def _first_problem(error: ValidationError) -> str:
 
 
 class JsonRecord:
-    """A dataclass that is stored as one line of JSON."""
+    """A dataclass that is stored as one line of JSON, which begins with its row: records of rows may trade places."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     kind: ClassVar[str]
 
-    def to_json(self) -> str:
-        """Return the record as one line of JSON."""
-        return json.dumps(asdict(self))  # type: ignore[call-overload]
+    def to_json(self, row: int) -> str:
+        """Return the record of a row as one line of JSON."""
+        return json.dumps({_ROW: row, **asdict(self)})  # type: ignore[call-overload]
 
     @classmethod
-    def from_json(cls, text: str) -> Self | None:
-        """Return the record that a line holds, or None if the line is empty.
+    def from_json(cls, text: str, row: int) -> Self | None:
+        """Return the record of a row that a line holds, or None if the line is empty.
 
         Raises:
-            DamageError: The line is not a record.
+            DamageError: The line is not a record, or that of another row.
         """
+        if not text:
+            return None
         try:
-            return _adapter(cast(Hashable, cls)).validate_json(text) if text else None
+            table = dict(json.loads(text))
+            # Older versions did not write it.
+            stored_row = table.pop(_ROW, row)
+            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
         except ValidationError as error:
             problem = _first_problem(error)
-            raise DamageError(f"a {cls.kind} is damaged ({problem}): {text[:80]!r}", problem) from error
+        except (ValueError, TypeError, RecursionError) as error:
+            problem = f"no table: {error}"
+        else:
+            problem = "" if stored_row == row else f"it is that of row {stored_row!r}"
+        if problem:
+            raise DamageError(f"a {cls.kind} is damaged ({problem}): {text[:80]!r}", problem)
+        return record
 
 
 @dataclass(frozen=True)

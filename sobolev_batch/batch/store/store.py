@@ -14,14 +14,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
-import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 from zarr.buffer.cpu import NDBuffer
 
+from sobolev_batch.batch.storage.checked import CHANGED, RecordedChunks, checksum_of, document_digest
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.scratch import Scratch
 from sobolev_batch.batch.store.hierarchy import (
+    DIGEST,
     FIELD,
     LABELS,
     OCTAVE_LABELS,
@@ -47,7 +48,11 @@ BlockSlices = tuple[slice, slice, slice]
 
 # Attribute of the root of a store that is being created.
 UNFINISHED = "unfinished"
-_MESHES = "meshes/mesh"
+# Attribute of the root of the store of a collection.
+COLLECTION = "collection"
+# Attribute of the root with the labels of meshes that the study has lost.
+REMOVED = "removed"
+_MESHES, _ROWS = "meshes/mesh", "meshes/row"
 _RUN = "run"
 
 
@@ -61,7 +66,7 @@ class Store(Hierarchy):
             for name, document in self.documents.items()
             if name in (FIELD, OCTAVES, WITNESS) or name.startswith(f"{RECORDS}/")
         }
-        return {"location": self.location, "documents": carried}
+        return {"location": self.location, "documents": carried, "digests": {}}
 
     @classmethod
     def open(cls, store: str | Path | Location) -> Self:
@@ -83,6 +88,11 @@ class Store(Hierarchy):
         if not self.exists() or self.documents[""].get("node_type") != "group":
             raise StoreError(f"{self.path}: no store of a study is there")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
+        if COLLECTION in attributes:
+            names = ", ".join(attributes[COLLECTION].get("objects", ())[:3])
+            raise StoreError(
+                f"{self.path}: the store of a collection; each of its objects has a store of its own below it: {names}"
+            )
         if self.is_unfinished:
             raise StoreError(
                 f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
@@ -103,20 +113,29 @@ class Store(Hierarchy):
         return self.exists() and bool(self.documents[""].get("attributes", {}).get(UNFINISHED))
 
     @property
+    def recorded_chunks(self) -> tuple[RecordedChunks, ...]:
+        """Arrays whose chunks the records of their rows tell of."""
+        found = []
+        # The checksum of the octaves stands behind those of the field.
+        for name, first in ((FIELD, 0), (OCTAVES, -1)):
+            if name in self.documents:
+                array = self.array(name)
+                found.append(RecordedChunks(name, RECORD, array.shape, array.chunks, array.dtype.str, first))
+        return tuple(found)
+
+    @property
     def scratch(self) -> Scratch:
         """Scratch space for parts of meshes, which no reader needs."""
         return Scratch(self.location)
 
     def labels(self) -> tuple[str, ...]:
-        """Return the label of each row. If they are damaged, take those of the table of meshes.
+        """Return the label of each row. If they are damaged, take those of the octaves or of the table of meshes.
 
         Raises:
             DamageError: Neither can be read.
             StoreError: The store cannot be read.
         """
-        labels = self._labels_of(LABELS)
-        if not labels and _MESHES in self.documents and self.array(_MESHES).shape == self.array(LABELS).shape:
-            labels = self._labels_of(_MESHES)
+        labels = next(filter(None, map(self._labels_of, self._label_arrays)), ()) or self._labels_in_tables()
         if not labels:
             raise DamageError(
                 f"{self.path}: {LABELS} is damaged, and nothing else says which field is whose; remove the store and "
@@ -126,11 +145,22 @@ class Store(Hierarchy):
         return labels
 
     def repair_labels(self) -> None:
-        """Write damaged labels again, from the table of meshes."""
-        names = (LABELS, OCTAVE_LABELS) if self.has_octaves else (LABELS,)
-        for name in names:
-            if not self._labels_of(name):
-                self.write(name, ..., np.array(self.labels(), dtype=object))
+        """Write labels again that are damaged, or of which one of two copies has been changed."""
+        copies = {name: self._labels_of(name) for name in self._label_arrays}
+        labels = next(filter(None, copies.values()), ()) or self.labels()
+        if any(copy != labels for copy in copies.values()):
+            self.write_labels(labels)
+            self.consolidate()
+
+    def write_labels(self, labels: Sequence[str]) -> None:
+        """Write the label of each row."""
+        for name in self._label_arrays:
+            self.write(name, ..., np.array(labels, dtype=object))
+
+    @property
+    def removed(self) -> frozenset[str]:
+        """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
+        return frozenset(self.attributes().get(REMOVED, ()))
 
     @property
     def record_table(self) -> RecordTable[Record]:
@@ -250,13 +280,21 @@ class Store(Hierarchy):
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one."""
         table = (self._read_document(RECORDS) or {}).get("attributes", {}).get(_RUN)
-        return None if table is None else RunRecord.from_table(table)
+        if table is None:
+            return None
+        # Older versions wrote none.
+        digest = table.pop(DIGEST, None)
+        if digest is not None and digest != document_digest(table):
+            raise DamageError(f"{self.path}: the record of the latest run is damaged ({CHANGED}): {table}", CHANGED)
+        return RunRecord.from_table(table)
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, in one key."""
         document = self.document(RECORDS)
         # Not remembered: consolidated metadata would tell readers of a run that ended long ago.
-        changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: record.to_table()}}
+        table = record.to_table()
+        run = {**table, DIGEST: document_digest(table)}
+        changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
         self.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
 
     def write_qualities(self, qualities: Sequence[str]) -> None:
@@ -268,6 +306,25 @@ class Store(Hierarchy):
             f"{self.path}: the field of {self.labels()[row]} is damaged ({problem}); run the study again", problem, row
         )
 
+    def _labels_in_tables(self) -> tuple[str, ...]:
+        """Return the labels that the table of meshes gives to rows, or none where it lacks one."""
+        if _ROWS not in self.documents:
+            return ()
+        try:
+            rows = np.asarray(self.read(_ROWS, ...)).tolist()
+        except DamageError:
+            return ()
+        by_row = dict(zip(rows, self._labels_of(_MESHES), strict=False))
+        return tuple(by_row[i] for i in range(len(by_row))) if set(by_row) == set(range(self._row_count)) else ()
+
+    @property
+    def _label_arrays(self) -> tuple[str, ...]:
+        return (LABELS, OCTAVE_LABELS) if self.has_octaves else (LABELS,)
+
+    @property
+    def _row_count(self) -> int:
+        return int(self.array(LABELS).shape[0])
+
     def _labels_of(self, name: str) -> tuple[str, ...]:
         """Return the labels in an array, or none if it is damaged or incomplete."""
         try:
@@ -278,21 +335,18 @@ class Store(Hierarchy):
 
 
 def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
-    """Return the lattice that was chosen for a store; None without a store, or if its study gave the lattice.
+    """Return the lattice that was chosen for a store; None without one, or if its study gave the lattice.
+
+    Damaged metadata tell none.
 
     Raises:
         StoreError: The location cannot be read, or holds something else.
     """
     existing = Store(store)
-    if not existing.exists() or existing.is_unfinished:
+    try:
+        if not existing.exists() or existing.is_unfinished:
+            return None
+    except DamageError:
         return None
     study = existing.attributes()["study"]
     return LatticeChoice.from_table(study["choice"], study.get("octaves")) if study.get("choice") else None
-
-
-def checksum_of(values: NDArray[Any]) -> int:
-    """Return the CRC-32C of a C-ordered array."""
-    data: Any = values.view(np.uint8).reshape(-1)
-    # The library takes only what cannot change while it reads.
-    data.flags.writeable = False
-    return int(google_crc32c.value(data))

@@ -44,6 +44,8 @@ class Tables:
         hidden = [*names, *(name for name in self.store.documents if name.split("/")[0] == WITNESS_GROUP)]
         if hidden:
             self.store.hide(hidden)
+            # Errors of norms need them, and they are written before tables are listed again.
+            self.store.forget_digests(QUALITY)
             self.store.consolidate()
         return names
 
@@ -74,6 +76,21 @@ class Tables:
         # Errors of norms need the qualities, which are written with them; witness functions need their axes.
         others = [*([QUALITY] if names else ()), *self._axes_of_witness()]
         return tuple(self._incomplete(names, self._groups()) + self._incomplete(others, others))
+
+    def without_records(self, records: Sequence[object | None]) -> tuple[int, ...]:
+        """Return the rows that tables list as complete, and that have no record.
+
+        Args:
+            records: Record of each row, or None.
+        """
+        if self.attributes("convergence") is None:
+            return ()
+        rows, statuses = (np.asarray(self.store.read(f"meshes/{name}", ...)).tolist() for name in ("row", "status"))
+        return tuple(
+            row
+            for row, status in zip(rows, statuses, strict=True)
+            if status == "complete" and (row >= len(records) or records[row] is None)
+        )
 
     def damaged(self) -> dict[str, str]:
         """Return the damage of each small array, of tables and coordinates, that cannot be read."""

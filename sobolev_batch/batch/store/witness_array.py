@@ -11,9 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.storage.checked import checksum_of
 from sobolev_batch.batch.store.hierarchy import ROOT, WITNESS, WITNESS_GROUP, StoredChunks
 from sobolev_batch.batch.store.layout import Layout
-from sobolev_batch.batch.store.store import Store, checksum_of
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import DamageError
 
 # Vertices of a chunk: coarse meshes waste little space, and fine ones have few chunks.
@@ -144,11 +145,11 @@ class Witnesses:
         }
 
     def _fits(self, axes: dict[str, NDArray[Any]], reference: str) -> bool:
-        """Return whether the stored functions have these orders, this reference and the first of these meshes."""
+        """Return whether the stored functions have these orders and this reference; records say whose they are."""
         if self.store.document(WITNESS_GROUP).get("attributes", {}).get("reference") != reference:
             return False
         try:
-            labels, orders = self.store.read_strings(_AXES[0]), np.asarray(self.store.read(_AXES[1], ...))
+            orders = np.asarray(self.store.read(_AXES[1], ...))
         except DamageError:
             return False
-        return labels == tuple(axes["mesh"][: len(labels)]) and np.array_equal(orders, axes["order"])
+        return np.array_equal(orders, axes["order"])

@@ -10,18 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice, choice_basis
+from sobolev_batch.batch.study.lattice_search import choose_lattice
+from sobolev_batch.batch.study.pilots import Members
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.samples import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.octaves.costs import SurfaceSize
+from sobolev_batch.spectral.metrics.datasets import VARIABLES
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
+from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, require_finite_norm
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -61,8 +65,9 @@ class Plan:
         reference: Label of the reference's row.
         blocks: Blocks of the lattice, one chunk of the store each.
         choice: Lattice and dtype of all fields.
-        sample: Sample of the reference, if an accuracy is asked for.
         reference_area: Area of the reference, in squared units of length.
+        reference_extent: Extent of the reference, in units of length.
+        sample: Sample of the reference, if an accuracy is asked for.
     """
 
     study: Study
@@ -71,8 +76,9 @@ class Plan:
     reference: str
     blocks: tuple[Block, ...]
     choice: LatticeChoice
+    reference_area: float
+    reference_extent: Extent
     sample: Sample | None = None
-    reference_area: float = 0.0
 
     @property
     def lattice(self) -> Lattice:
@@ -99,13 +105,6 @@ class Plan:
     def field_bytes(self) -> int:
         """Bytes of one stored field, octaves included."""
         return (self.lattice.half.size + (0 if self.tail is None else self.tail.size)) * self.item_bytes
-
-    @property
-    def octave_seconds(self) -> float:
-        """Predicted processor time of all transforms in octaves, on this machine or one like it."""
-        samplings = () if self.tail is None else self.tail.octaves
-        sizes = [SurfaceSize(row.member.expected_size().triangles, self.reference_area) for row in self.rows]
-        return sum(size.sampling_seconds(sampling) for size in sizes for sampling in samplings)
 
     def distance_target(self, row: Row) -> DistanceTarget | None:
         """Return the accuracy that the field of a row is computed for, if an accuracy is asked for."""
@@ -141,6 +140,8 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     own = _load_reference(members[reference][1])
     similarity = Similarity.to_unit_ball(own) if study.scaling.mode == "reference" else study.scaling.fixed
     surface = similarity.apply(own)
+    if isinstance(surface, PointCloud) or any(member.is_point_cloud for _, member in members.values()):
+        require_finite_norm(study.orders)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
     if not isinstance(surface, Sphere):
         require_inside(surface, choice.lattice)
@@ -156,7 +157,17 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     sample = None
     if study.accuracy is not None:
         sample = Sample.of(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
-    return Plan(study, similarity, tuple(rows), reference, _blocks(study, choice), choice, sample, surface.area)
+    return Plan(
+        study,
+        similarity,
+        tuple(rows),
+        reference,
+        _blocks(study, choice),
+        choice,
+        surface.area,
+        surface.extent,
+        sample,
+    )
 
 
 def _lattice_choice(
@@ -197,6 +208,7 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
+            _require_free_names(family.name, member)
             members[label] = family.name, member
     if not isinstance(study.reference, FamilyReference):
         try:
@@ -204,6 +216,15 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
         except StudyError as error:
             raise StudyError(f"reference: {error}") from error
     return members
+
+
+def _require_free_names(family: str, member: Member) -> None:
+    taken = next((name for name, _ in member.metadata if name in VARIABLES), None)
+    if taken is not None:
+        raise StudyError(
+            f"family {family!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which tables use "
+            f"themselves; rename it, for example to {family}_{taken}"
+        )
 
 
 def _reference_label(study: Study, members: Members) -> str:

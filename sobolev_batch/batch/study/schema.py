@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import codecs
 import os
-import re
-import tomllib
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import date
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+import pandas as pd
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from sobolev_batch.batch.study.refusals import dotted_key
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -20,7 +21,6 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.formats.raw_files import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import at_most
@@ -28,19 +28,15 @@ from sobolev_batch.surfaces.sources.registry import at_most
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
 
-# Larger study files and deeper tables are mistakes, or made to keep the parser busy.
-_LARGEST_FILE_BYTES = 4 << 20
+# Deeper tables and longer texts are mistakes, or made to keep the validation busy.
 _DEEPEST = 20
 _MOST_VALUES = 1_000_000
 _LONGEST_TEXT = 10_000
 _MOST_ORDERS = 100
 MOST_OCTAVES = 24
-_MOST_OFFENDERS = 10
 _LONGEST_NAME, _LONGEST_TITLE = 100, 1000
 # The range of TOML's integers.
 _LARGEST_INTEGER = (1 << 63) - 1
-# The parser takes time that is quadratic in the number of dotted parts of a key.
-_LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.[ \t]*+){100}""")
 
 
 def _name(text: str) -> str:
@@ -67,21 +63,34 @@ def _memory(value: Any) -> float:
         raise ValueError(str(error)) from error
 
 
+def _orders(orders: tuple[float, ...]) -> tuple[float, ...]:
+    """Return valid orders, each once."""
+    try:
+        return tuple(dict.fromkeys(check_orders(orders)))
+    except InputError as error:
+        positive = next((s for s in orders if s > 0.5), None)
+        raise ValueError(f"{error}; did you mean {-positive:g}?" if positive else str(error)) from error
+
+
 Name = Annotated[str, AfterValidator(_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Orders = Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)]
+Orders = Annotated[
+    tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS), AfterValidator(_orders)
+]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A section of a study file: frozen, of strict types, without unknown keys."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class _Header(_Section):
+class _Header(Section):
     name: Name
     title: Annotated[str, AfterValidator(_title)] = ""
 
 
-class _LatticeSection(_Section):
+class _LatticeSection(Section):
     xi_max: Number
     M: int
     octaves: Annotated[int, Field(ge=0, le=MOST_OCTAVES)] = 0
@@ -90,10 +99,11 @@ class _LatticeSection(_Section):
         return Lattice(self.xi_max, self.M)
 
 
-class _AccuracySection(_Section):
+class _AccuracySection(Section):
     rtol: Number
     memory: Annotated[float | None, BeforeValidator(_memory)] = None
     memory_gb: Number | None = None
+    best_effort: bool = False
 
     @model_validator(mode="after")
     def _one_memory(self) -> Self:
@@ -103,15 +113,16 @@ class _AccuracySection(_Section):
 
     def settings(self) -> Accuracy:
         memory = self.memory if self.memory_gb is None else 1e9 * self.memory_gb
-        return Accuracy(self.rtol) if memory is None else Accuracy(self.rtol, memory)
+        accuracy = Accuracy(self.rtol, best_effort=self.best_effort)
+        return accuracy if memory is None else replace(accuracy, allowed_bytes=memory)
 
 
-class _NormSection(_Section):
+class _NormSection(Section):
     orders: Orders
     pairs: Literal["all", "reference"] = "all"
 
 
-class _TransformSection(_Section):
+class _TransformSection(Section):
     eps: Number | None = None
     dtype: ComplexDtype | None = None
     quadrature: str | int = "auto"
@@ -121,7 +132,7 @@ class _TransformSection(_Section):
         return TransformSettings(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))
 
 
-class _ScalingSection(_Section):
+class _ScalingSection(Section):
     mode: Literal["reference", "none", "fixed"] = "reference"
     scale: Number | None = None
     origin: Annotated[tuple[Number, Number, Number] | None, Field(strict=False)] = None
@@ -134,31 +145,32 @@ class _ScalingSection(_Section):
         return self
 
 
-class _WitnessSection(_Section):
-    orders: Annotated[tuple[Number, ...] | None, Field(strict=False), at_most(_MOST_ORDERS)] = None
+class _WitnessSection(Section):
+    orders: Orders | None = None
 
     def settings(self, orders_of_norm: tuple[float, ...]) -> tuple[float, ...]:
-        return orders_of_norm if self.orders is None else distinct_orders(self.orders)
+        return orders_of_norm if self.orders is None else self.orders
 
 
-class _ProximitySection(_Section):
+class _ProximitySection(Section):
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
 
 
-class FamilyReferenceSection(_Section):
+class FamilyReferenceSection(Section):
     """Reference that is a member of a family."""
 
     family: str
     member: str | None = None
 
 
-class FamilyName(_Section):
-    """Key of a family that is not one of its source."""
+class FamilySection(Section):
+    """Keys of a family that are not those of its source."""
 
     name: Name
+    order_by: Literal["triangles", "names"] | None = None
 
 
-class StudyDocument(_Section):
+class StudyDocument(Section):
     """All sections of a study file. Families and sources are validated by their own schemas."""
 
     study: _Header
@@ -181,41 +193,39 @@ class StudyDocument(_Section):
         return self
 
 
-def distinct_orders(orders: Sequence[float]) -> tuple[float, ...]:
-    """Return valid orders, each once."""
-    return tuple(dict.fromkeys(check_orders(orders)))
+def without_frames(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a study with each DataFrame in its sections as the list of its rows, without what it does not know."""
+    return {
+        name: [_plain_section(entry) for entry in section] if isinstance(section, list) else _plain_section(section)
+        for name, section in table.items()
+    }
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a study file.
+def _plain_section(section: Any) -> Any:
+    if not isinstance(section, Mapping):
+        return section
+    return {key: _rows_of(value) if isinstance(value, pd.DataFrame) else value for key, value in section.items()}
 
-    Raises:
-        StudyError: It cannot be read, is too large, or is not TOML. The message does not name it.
-    """
-    try:
-        with open_regular(path) as file:
-            length = os.fstat(file.fileno()).st_size
-            data = file.read(_LARGEST_FILE_BYTES + 1)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if len(data) > _LARGEST_FILE_BYTES:
-        raise StudyError(
-            f"a study file has at most {_LARGEST_FILE_BYTES} bytes, found {max(length, len(data))}; "
-            "globs name many meshes in few words"
-        )
-    if data.startswith(codecs.BOM_UTF8):
-        raise StudyError("not a TOML file: it begins with a byte order mark; save it as UTF-8 without one")
-    if _LONG_KEY.search(data):
-        raise StudyError("a key has 100 dotted parts or more; those of a study have two")
-    try:
-        return tomllib.loads(data.decode("utf-8"))
-    except UnicodeDecodeError as error:
-        raise StudyError(f"not a TOML file: {error}; save it as UTF-8") from error
-    except RecursionError as error:
-        raise StudyError("its tables and lists are nested too deeply") from error
-    # Beyond TOML's own errors, numbers and dates that Python cannot hold.
-    except ValueError as error:
-        raise StudyError(f"not a TOML file: {error}") from error
+
+def _rows_of(frame: pd.DataFrame) -> list[dict[Any, Any]]:
+    """Return the rows of a frame, without what it does not know; dates and paths become texts."""
+    repeated = frame.columns[frame.columns.duplicated()]
+    if len(repeated):
+        raise StudyError(f"a DataFrame has the column {quoted(repeated[0])} twice; rename one")
+    rows = frame.to_dict(orient="records")
+    return [{key: _plain_cell(value) for key, value in row.items() if not _is_unknown(value)} for row in rows]
+
+
+def _is_unknown(value: Any) -> bool:
+    return bool(pd.api.types.is_scalar(value) and pd.isna(value))
+
+
+def _plain_cell(value: Any) -> Any:
+    if isinstance(value, date):
+        return value.isoformat()
+    if isinstance(value, np.generic):
+        return value.item()
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def require_modest(table: object) -> None:
@@ -226,37 +236,16 @@ def require_modest(table: object) -> None:
         value, path = waiting.pop()
         count += 1
         if len(path) > _DEEPEST:
-            raise StudyError(f"{_key(path)}: nested more than {_DEEPEST} deep")
+            raise StudyError(f"{dotted_key(path)}: nested more than {_DEEPEST} deep")
         if count > _MOST_VALUES:
-            raise StudyError(f"{_key(path)}: the study has more than {_MOST_VALUES} values")
+            raise StudyError(f"{dotted_key(path)}: the study has more than {_MOST_VALUES} values")
         if isinstance(value, Mapping):
             if not all(isinstance(key, str) for key in value):
-                raise StudyError(f"{_key(path)}: keys must be strings")
+                raise StudyError(f"{dotted_key(path)}: keys must be strings")
             waiting += ((entry, (*path, key)) for key, entry in value.items())
         elif isinstance(value, list | tuple):
             waiting += ((entry, (*path, index)) for index, entry in enumerate(value))
         elif isinstance(value, str) and len(value) > _LONGEST_TEXT:
-            raise StudyError(f"{_key(path)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
+            raise StudyError(f"{dotted_key(path)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
         elif isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-            raise StudyError(f"{_key(path)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
-
-
-def _key(path: Sequence[object]) -> str:
-    """Return the dotted key of a value, with unusual keys in quotes."""
-    return ".".join(str(key) if name_problem(str(key), 40) is None else quoted(key) for key in path[:8]) or "study"
-
-
-def explain(error: ValidationError) -> str:
-    """Return one line that names each offender: its key, what was found, and what is expected."""
-    lines = []
-    for item in error.errors(include_url=False)[:_MOST_OFFENDERS]:
-        key = _key(item["loc"])
-        if item["type"] == "extra_forbidden":
-            lines.append(f"unknown key {key}")
-        elif item["type"] == "missing":
-            lines.append(f"{key} is missing")
-        else:
-            message = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{key}: {message[0].lower() + message[1:]}, found {quoted(item['input'])}")
-    more = error.error_count() - len(lines)
-    return "; ".join(lines) + (f"; and {more} more" if more else "")
+            raise StudyError(f"{dotted_key(path)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")

@@ -3,42 +3,56 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, Self
 
+import numpy as np
 from pydantic import ValidationError
 
+from sobolev_batch.batch.study.refusals import joined, shown_value, source_refusals, study_refusals
 from sobolev_batch.batch.study.schema import (
     Backends,
-    FamilyName,
     FamilyReferenceSection,
+    FamilySection,
     StudyDocument,
-    distinct_orders,
-    explain,
-    read_toml,
     require_modest,
+    without_frames,
 )
+from sobolev_batch.batch.study.suggestions import similar_name
+from sobolev_batch.batch.study.toml import read_toml
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, quoted
-from sobolev_batch.surfaces.sources.registry import Source, parse_source
+from sobolev_batch.surfaces.sources.registry import Source, parse_source, source_type_of
 
 REFERENCE_LABEL = "reference"
 
 
 @dataclass(frozen=True)
 class Family:
-    """A named source of surfaces."""
+    """A named source of surfaces.
+
+    Attributes:
+        name: Name of the family.
+        source: Source of its surfaces.
+        order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
+            names, in which they are no sequence from coarse to fine and have no rates.
+    """
 
     name: str
     source: Source
+    order_by: Literal["triangles", "names"] | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +132,17 @@ class Study:
     largest_chunk_bytes: int = 256 << 20
     octaves: int = 0
 
+    def __post_init__(self) -> None:
+        for name, types in _TYPES.items():
+            value = getattr(self, name)
+            if not isinstance(value, types) or isinstance(value, bool):
+                expected = " or ".join("None" if kind is NoneType else kind.__name__ for kind in types)
+                raise StudyError(
+                    f"Study: {name} must be a value of type {expected}, found {shown_value(value)}; "
+                    "Study.from_table and Study.from_toml make a study from plain values"
+                )
+        check_orders(self.orders)
+
     @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions that its surfaces need besides those that this package requires."""
@@ -170,6 +195,8 @@ class Study:
                 witness, proximity.
             folder: Folder in which relative paths start.
 
+        A pandas.DataFrame may stand where a list of tables does, such as for ``meshes`` of the source ``files``.
+
         Raises:
             StudyError: See `from_toml`.
 
@@ -186,13 +213,50 @@ class Study:
         """
         return cls._of(table, Path(folder))
 
+    def with_best_effort(self) -> Study:
+        """Return the study with the key ``best_effort`` of its accuracy set.
+
+        Raises:
+            StudyError: It has a lattice instead of an accuracy.
+
+        >>> import sobolev_batch as sb
+        >>> study = sb.Study.from_table({
+        ...     "study": {"name": "spheres"},
+        ...     "accuracy": {"rtol": 1e-3},
+        ...     "norm": {"orders": [-0.6]},
+        ...     "reference": {"source": "sphere"},
+        ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
+        ... })
+        >>> study.with_best_effort().accuracy.best_effort
+        True
+        """
+        if self.accuracy is None:
+            raise StudyError("a best effort is made for an [accuracy]; this study has a [lattice]")
+        return self.from_table(
+            {**self.table, "accuracy": {**self.table["accuracy"], "best_effort": True}}, folder=self.folder
+        )
+
     @classmethod
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
+        if not isinstance(table, Mapping):
+            raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
+        table = without_frames(table)
         require_modest(table)
+        values = _plain(table)
+        # Families and the reference are looked at even where sections are wrong: all offenders are named.
+        refused: list[str] = []
+        document: StudyDocument | None = None
         try:
-            document = StudyDocument.model_validate(dict(table))
+            document = StudyDocument.model_validate(values)
         except ValidationError as error:
-            raise StudyError(explain(error)) from error
+            refused += study_refusals(error, values, StudyDocument)
+        entries = values.get("family")
+        tables = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+        families = tuple(_families(tables, refused))
+        reference = _reference(values.get("reference"), tables, refused)
+        if document is None or reference is None or refused:
+            raise StudyError(joined(refused))
+        _require_distinct(families)
         if document.accuracy is not None and document.accuracy.memory_gb is not None:
             warnings.warn(
                 "the key memory_gb of [accuracy] is now called memory, as in memory = "
@@ -200,36 +264,77 @@ class Study:
                 DeprecationWarning,
                 stacklevel=3,
             )
-        families = tuple(_family(i, entry) for i, entry in enumerate(document.family))
-        _require_distinct(families)
-        reference = _reference(document.reference, families)
         if isinstance(reference, Source):
             families = tuple(replace(family, source=family.source.with_reference(reference)) for family in families)
-        try:
-            orders = distinct_orders(document.norm.orders)
-            return cls(
-                name=document.study.name,
-                title=document.study.title or document.study.name,
-                lattice=None if document.lattice is None else document.lattice.settings(),
-                accuracy=None if document.accuracy is None else document.accuracy.settings(),
-                transform=document.transform.settings(),
-                dtype=document.transform.dtype,
-                backend=document.transform.backend,
-                orders=orders,
-                pairs=document.norm.pairs,
-                families=families,
-                reference=reference,
-                scaling=_scaling(document),
-                witness=() if document.witness is None else document.witness.settings(orders),
-                proximity=None if document.proximity is None else document.proximity.points,
-                folder=folder,
-                octaves=0 if document.lattice is None else document.lattice.octaves,
-                table=json.loads(json.dumps(table, default=str)),
-            )
-        except StudyError:
-            raise
-        except InputError as error:
-            raise StudyError(str(error)) from error
+        with _in_section("lattice"):
+            lattice = None if document.lattice is None else document.lattice.settings()
+        with _in_section("accuracy"):
+            accuracy = None if document.accuracy is None else document.accuracy.settings()
+        with _in_section("transform"):
+            transform = document.transform.settings()
+        with _in_section("scaling"):
+            scaling = _scaling(document)
+        orders = document.norm.orders
+        return cls(
+            name=document.study.name,
+            title=document.study.title or document.study.name,
+            lattice=lattice,
+            accuracy=accuracy,
+            transform=transform,
+            dtype=document.transform.dtype,
+            backend=document.transform.backend,
+            orders=orders,
+            pairs=document.norm.pairs,
+            families=families,
+            reference=reference,
+            scaling=scaling,
+            witness=() if document.witness is None else document.witness.settings(orders),
+            proximity=None if document.proximity is None else document.proximity.points,
+            folder=folder,
+            octaves=0 if document.lattice is None else document.lattice.octaves,
+            table=json.loads(json.dumps(values, default=str)),
+        )
+
+
+@contextmanager
+def _in_section(name: str) -> Iterator[None]:
+    """Name the section whose values together are refused."""
+    try:
+        yield
+    except InputError as error:
+        raise StudyError(f"[{name}]: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    """Return tables as dictionaries, paths as texts, and arrays and numbers of NumPy as lists and numbers."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+# Types of what a study is made of, for those who make one without a table.
+_TYPES: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "title": (str,),
+    "lattice": (Lattice, NoneType),
+    "accuracy": (Accuracy, NoneType),
+    "transform": (TransformSettings,),
+    "dtype": (str, NoneType),
+    "backend": (str,),
+    "orders": (tuple,),
+    "pairs": (str,),
+    "families": (tuple,),
+    "reference": (Source, FamilyReference),
+    "scaling": (Scaling,),
+    "witness": (tuple,),
+    "proximity": (int, NoneType),
+    "folder": (Path,),
+    "table": (Mapping,),
+}
 
 
 def _require_distinct(families: tuple[Family, ...]) -> None:
@@ -243,30 +348,55 @@ def _require_distinct(families: tuple[Family, ...]) -> None:
         raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
 
 
-def _family(index: int, entry: dict[str, Any]) -> Family:
-    key = f"family {quoted(entry.get('name', index + 1))}"
-    parameters = {name: value for name, value in entry.items() if name != "name"}
-    try:
-        name = FamilyName.model_validate({name: entry[name] for name in ("name",) if name in entry}).name
-        return Family(name, parse_source(parameters))
-    except ValidationError as error:
-        raise StudyError(f"{key}: {explain(error)}") from error
-    except InputError as error:
-        raise StudyError(f"{key}: {error}") from error
+def _families(entries: list[dict[str, Any]], refused: list[str]) -> Iterator[Family]:
+    """Yield the families that can be read, and add what is wrong with the others to the refusals."""
+    for number, entry in enumerate(entries, 1):
+        place = f"[[family]] {number}"
+        if isinstance(entry.get("name"), str):
+            place += f" (named {quoted(entry['name'])})"
+        own = {key: entry[key] for key in FamilySection.model_fields if key in entry}
+        section = None
+        try:
+            section = FamilySection.model_validate(own)
+        except ValidationError as error:
+            refused += source_refusals(error, entry, place, FamilySection, StudyDocument)
+        source = _source({key: value for key, value in entry.items() if key not in own}, place, refused)
+        if section is not None and source is not None:
+            yield Family(section.name, source, section.order_by)
 
 
-def _reference(entry: dict[str, Any], families: tuple[Family, ...]) -> Source | FamilyReference:
+def _source(parameters: dict[str, Any], place: str, refused: list[str]) -> Source | None:
+    """Return the source of a table, or add what is wrong with it to the refusals."""
     try:
-        if entry.get("source") == "family":
-            section = FamilyReferenceSection.model_validate({k: v for k, v in entry.items() if k != "source"})
-            if section.family not in {family.name for family in families}:
-                raise StudyError(f"no family is named {quoted(section.family)}")
-            return FamilyReference(section.family, section.member)
-        return parse_source(entry)
+        return parse_source(parameters)
     except ValidationError as error:
-        raise StudyError(f"reference: {explain(error)}") from error
+        model = source_type_of(parameters["source"])
+        refused += source_refusals(error, parameters, place, model, StudyDocument)
     except InputError as error:
-        raise StudyError(f"reference: {error}") from error
+        refused.append(f"{place}: {error}")
+    return None
+
+
+def _reference(entry: object, families: list[dict[str, Any]], refused: list[str]) -> Source | FamilyReference | None:
+    """Return the reference, or add what is wrong with it to the refusals."""
+    if not isinstance(entry, dict):
+        return None
+    place = "[reference]"
+    if entry.get("source") != "family":
+        return _source(entry, place, refused)
+    parameters = {key: value for key, value in entry.items() if key != "source"}
+    try:
+        section = FamilyReferenceSection.model_validate(parameters)
+    except ValidationError as error:
+        refused += source_refusals(error, parameters, place, FamilyReferenceSection, StudyDocument)
+        return None
+    names = [str(family.get("name")) for family in families]
+    if section.family not in names:
+        similar = similar_name(section.family, names)
+        hint = f"; did you mean {quoted(similar)}?" if similar else f"; its families are {quoted(names)}"
+        refused.append(f"{place}: no family is named {quoted(section.family)}{hint}")
+        return None
+    return FamilyReference(section.family, section.member)
 
 
 def _scaling(document: StudyDocument) -> Scaling:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.fitting.derivative.objective import factors_of
-from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh, require_mesh
+from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
@@ -21,14 +21,17 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
     Operand,
-    check_surface,
+    OperandLike,
+    as_operand,
     common_lattice,
     field_of,
     field_values,
     quality_of,
+    refuse_points,
 )
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -48,8 +51,8 @@ _DIFFERENCE = 1e-4
 
 
 def gradient(
-    mesh: Mesh,
-    target: Operand,
+    mesh: MeshLike,
+    target: OperandLike,
     order: Orders,
     *,
     lattice: Lattice | None = None,
@@ -63,8 +66,8 @@ def gradient(
     derivative without the error in a third of the time.
 
     Args:
-        mesh: Mesh in units of length.
-        target: Surface, or a field from `fourier_transform` or a store.
+        mesh: Mesh in units of length, or what `as_mesh` makes one of.
+        target: Surface, what `as_mesh` makes one of, or a field from `fourier_transform` or a store.
         order: One order s < -1/2, or several.
         lattice: Lattice to compare on. A field brings its own.
         eps: Accuracy of transforms relative to the area. Default 1e-9.
@@ -95,7 +98,7 @@ def gradient(
     >>> bool(found["error"] < 0.2 * abs(found["gradient"]).sum())
     True
     """
-    require_mesh(mesh)
+    mesh, target = as_mesh(mesh), as_operand(target)
     orders = check_orders(order)
     settings = TransformSettings(eps)
     finer = TransformSettings(max(settings.eps / _REFINEMENT, FINEST_EPS["complex128"]))
@@ -143,11 +146,11 @@ class _Difference:
         settings: TransformSettings,
         execution: Execution,
     ) -> Self:
+        refuse_points(target)
         is_given = isinstance(target, xr.DataArray)
         if is_given or lattice is None:
             field = field_of(target, lattice, orders)
         else:
-            check_surface(target)
             field = fourier_transform(target, lattice, settings.eps, order=orders)
         own = Lattice.of(field)
         placed = MeshTransform.of(mesh, own, settings, execution).at(np.asarray(mesh.vertices))

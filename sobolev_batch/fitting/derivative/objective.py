@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh, require_mesh
+from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, field_values
+from sobolev_batch.spectral.metrics.inputs import OperandLike, common_lattice, field_of, field_values
 from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, thread_count
-from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 
 Reals = NDArray[np.float64]
 
@@ -54,8 +54,8 @@ class SquaredDistance:
     @classmethod
     def of(
         cls,
-        mesh: Mesh,
-        target: Operand,
+        mesh: MeshLike,
+        target: OperandLike,
         order: float,
         *,
         lattice: Lattice | None = None,
@@ -66,8 +66,8 @@ class SquaredDistance:
         """Return the function for a mesh and its target.
 
         Args:
-            mesh: Mesh whose vertices will move, in units of length.
-            target: Surface, or a field from `fourier_transform` or a store.
+            mesh: Mesh whose vertices will move, in units of length, or what `as_mesh` makes one of.
+            target: Surface, what `as_mesh` makes one of, or a field from `fourier_transform` or a store.
             order: Order s < -1/2.
             lattice: Lattice to compare on. A field brings its own.
             eps: Accuracy of transforms relative to the area. Default 1e-9.
@@ -80,7 +80,7 @@ class SquaredDistance:
             InputError: The mesh is none, there is no lattice, or settings are out of range.
             BackendError: "gpu", and no GPU is usable.
         """
-        require_mesh(mesh)
+        mesh = as_mesh(mesh)
         orders = (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)
         own = Lattice.of(field)

@@ -171,16 +171,6 @@ def _cubes(lattice: Lattice) -> NDArray[np.intp]:
     return np.maximum(np.maximum(x[:, None, None], y[:, None]), z)
 
 
-def require_mesh(mesh: object) -> None:
-    """Refuse a surface without vertices.
-
-    Raises:
-        InputError: It is no mesh.
-    """
-    if not isinstance(mesh, Mesh):
-        raise InputError(f"only the vertices of a Mesh can move, found {type(mesh).__name__}")
-
-
 def _whole(half: Complexes) -> Complexes:
     """Return the coefficients of a real function on the whole lattice, from those on its half that count twice."""
     inner = half[:, :, 1:] / 2

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.optimisation.descent import End, descend
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.smoothing import Smoothing
@@ -18,7 +19,6 @@ from sobolev_batch.surfaces.shapes.surface import is_finite_number
 
 Reals = NDArray[np.float64]
 
-DEFAULT_ORDER, DEFAULT_STEPS, DEFAULT_SMOOTHING = -2.0, 150, 0.25
 # Far away, very negative orders lead: their kernels are wide.
 _COARSE_ORDER = -4.0
 # Beyond this relative distance at the coarse order, a mesh is far from its target.

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.results.store_accessor import StoreAccessor
-from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.tables.groups import (
+    Families,
+    chosen_families,
+    chosen_orders,
+    complete_meshes,
+    families_of,
+    finished_group,
+    reference_of,
+)
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.shells import Orders
 
+Item = TypeVar("Item")
 Reals = NDArray[np.float64]
 
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
@@ -49,22 +58,26 @@ class Spectra:
     own: float
 
     @classmethod
-    def of(cls, tree: xr.DataTree, order: Orders | None = None, most: int = MOST_MESHES) -> Self | None:
+    def of(
+        cls, tree: xr.DataTree, order: Orders | None = None, most: int = MOST_MESHES, family: Families = None
+    ) -> Self | None:
         """Return the spectra of an open store; None where it has nothing to compare.
 
         Args:
             tree: Open store.
             order: One of its orders, or several; default all.
-            most: Number of meshes at most, evenly through the study.
+            most: Number of meshes at most, evenly through each family.
+            family: Families, by names or globs; default all.
         """
         orders = tuple(chosen_orders(finished_group(tree, "convergence"), order))
         reference, complete = reference_of(tree), complete_meshes(tree)
-        others = [label for label in complete if label != reference]
+        families, family_of = chosen_families(tree, family), families_of(tree)
+        others = [label for label in complete if label != reference and family_of[label] in families]
         if reference not in complete or not others:
             return None
         fields = tree["fourier"].to_dataset()["fourier"]
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
-        labels = spread(others, max(1, min(most, affordable)))
+        labels = _spread_over_families([(family_of[label], label) for label in others], max(1, min(most, affordable)))
         scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
             accessor = StoreAccessor(tree)
@@ -83,6 +96,11 @@ class Spectra:
         return cls(tuple(labels), len(others), orders, shares, longest, shortest, energies, errors, 1 / scale)
 
     @property
+    def omission(self) -> str:
+        """Note on the meshes that were not chosen; empty where all are there."""
+        return f"{len(self.labels)} of {self.total} meshes" if len(self.labels) < self.total else ""
+
+    @property
     def wavelengths(self) -> Reals:
         """Wavelength at the middle frequency of each band, in the study's unit."""
         return np.asarray(2 / (1 / self.longest + 1 / self.shortest))
@@ -96,6 +114,26 @@ class Spectra:
         )
 
 
-def spread(labels: Sequence[str], most: int) -> list[str]:
-    """Return so many labels at most: the first, the last, and others evenly between."""
-    return [labels[i] for i in np.unique(np.linspace(0, len(labels) - 1, min(most, len(labels))).round().astype(int))]
+def _spread_over_families(labels: Sequence[tuple[str, str]], most: int) -> list[str]:
+    """Return so many labels at most, of all families alike, in the order given.
+
+    Args:
+        labels: Family and label of each mesh.
+        most: Number of meshes at most; where it is below the number of families, some families have none.
+    """
+    members: dict[str, list[str]] = {}
+    for family, label in labels:
+        members.setdefault(family, []).append(label)
+    counts = dict.fromkeys(spread(list(members), most), 1)
+    left = most - len(counts)
+    while left > 0 and (growing := [name for name in counts if counts[name] < len(members[name])]):
+        for name in growing[:left]:
+            counts[name] += 1
+        left -= len(growing)
+    kept = {label for name, count in counts.items() for label in spread(members[name], count)}
+    return [label for _, label in labels if label in kept]
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """Return so many items at most: the first, the last, and others evenly between."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))]

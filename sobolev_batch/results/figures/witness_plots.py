@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,22 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.style import WIDTH_INCHES, escaped, new_axes, shortened, write_figures
+from sobolev_batch.results.figures.pictures import Output, write_figures
+from sobolev_batch.results.figures.plots import Selection
+from sobolev_batch.results.figures.style import (
+    EXTENDS,
+    WIDTH_INCHES,
+    Size,
+    escaped,
+    new_axes,
+    set_title,
+    shortened,
+)
 from sobolev_batch.results.meshes.render import Pictures, color_limits, render
+from sobolev_batch.results.meshes.viewpoint import COVERED_AREA, best_viewpoint
 from sobolev_batch.results.meshes.views import PICTURES, Axis, MeshView, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
-from sobolev_batch.results.tables.groups import chosen_orders, finished_group
+from sobolev_batch.results.tables.groups import chosen_order, chosen_orders, finished_group
 from sobolev_batch.surfaces.sources.names import file_stem
 
 _HEIGHT_INCHES = 5.0
@@ -40,7 +52,9 @@ def plot_witness(
 ) -> Axes:
     """Plot a mesh coloured by its witness function: red where it has area that the reference lacks, else blue.
 
-    The study makes the mesh again, and VTK draws it from the front and above; this needs the extra "vtk".
+    The study makes the mesh again, and VTK draws it; this needs the extra "vtk". It is seen from the front and above,
+    or from another side if that shows far more of the worst places; the title says which. Where a few values are far
+    larger than all others, the colours end below them: the colour bar has arrows, with at most 1 % of the area beyond.
 
     Args:
         store: Path, URL or opened DataTree of the store.
@@ -62,108 +76,151 @@ def plot_witness(
     >>> ax = sb.plot_witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
-    (order,) = chosen_orders(finished_group(tree, "convergence"), order)[:1]
+    order = chosen_order(tree, order)
     with fields_read(store):
         made = make_views(tree, folder, [mesh], PICTURES, up, [order])
-    if made.missing:
-        raise InputError(f"{mesh}: {made.missing[mesh]}")
+    if len(made.views) + len(made.missing) > 1:
+        raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
+    for label, reason in made.missing.items():
+        raise InputError(f"{label}: {reason}")
     (view,) = made.views
     ((picture,),) = render([view], 1)
     axes = ax or new_axes(_HEIGHT_INCHES)
     axes.set_axis_off()
     axes.imshow(picture)
-    axes.set_title(escaped(mesh), fontsize="medium")
-    _add_colorbar(axes.figure, axes, color_limits([view], common=False)[0][0], order)  # type: ignore[arg-type]
+    set_title(axes, escaped(mesh), _seen(view))
+    _add_colorbar(axes.figure, axes, [view], view.color_limits[0], 0)  # type: ignore[arg-type]
     return axes
 
 
 def write_witness_plots(
-    tree: xr.DataTree, output: str | Path, folder: str | Path = ".", meshes: Sequence[str] = (), up: Axis = "z"
+    tree: xr.DataTree,
+    output_folder: str | Path,
+    folder: str | Path = ".",
+    meshes: Sequence[str] = (),
+    up: Axis = "z",
+    selection: Selection | None = None,
+    output: Output | None = None,
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder.
 
-    Each mesh gets a file witness-*.png with colours of its own; several also stand beside each other in witness.png,
-    on one scale of colours, at the study's first order.
+    Each mesh gets a file witness-* with colours and a viewpoint of its own; several also stand beside each other in
+    the file witness, from one viewpoint and on one scale of colours, at the first order.
 
     Args:
         tree: Open store with tables.
-        output: Folder of the pictures.
+        output_folder: Folder of the pictures.
         folder: Folder where relative paths in the study start.
-        meshes: Labels; by default those that `make_views` chooses.
+        meshes: Labels, or patterns such as "scans/*"; by default those that `make_views` chooses.
         up: Axis that points upwards in the meshes' own coordinates.
+        selection: Orders, and families to choose from.
+        output: Formats and size of the pictures.
 
     Returns:
         Paths of the pictures, and the reason for each mesh without one.
 
     Raises:
-        InputError: A label is unknown, or too many are named.
+        InputError: A label, order or family is unknown, or too many meshes are named.
         StoreError: The folder cannot be written.
     """
-    made = make_views(tree, folder, meshes, PICTURES, up)
+    selection, output = selection or Selection(), output or Output()
+    orders = chosen_orders(finished_group(tree, "convergence"), selection.order)
+    made = make_views(tree, folder, meshes, PICTURES, up, orders, selection.family)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
-    compared = made.views[:_MOST_MESHES]
+    compared = _seen_alike(made.views[:_MOST_MESHES])
     try:
         rendered = render(made.views, MOST_ORDERS)
-        on_one_scale = render(compared, 1, common=True)
+        on_one_scale = render(compared, 1, common=True) if len(compared) > 1 else []
     except InputError as error:
         return (), {**made.missing, **{view.label: str(error) for view in made.views}}
-    figures = {
-        f"witness-{file_stem(numbers[view.label], view.label)}.png": witness_figure(view, pictures)
-        for view, pictures in zip(made.views, rendered, strict=True)
-    }
-    if len(compared) > 1:
-        figures["witness.png"] = _comparison_figure(compared, [pictures[0] for pictures in on_one_scale])
-    return write_figures(figures, Path(output)), made.missing
+    with output.drawing():
+        figures = {
+            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, pictures, output.size)
+            for view, pictures in zip(made.views, rendered, strict=True)
+        }
+        if on_one_scale:
+            pictures = [one_order for (one_order, *_) in on_one_scale]
+            figures["witness"] = _comparison_figure(compared, pictures, len(made.views), output.size)
+    return write_figures(figures, Path(output_folder), output), made.missing
 
 
-def witness_figure(view: MeshView, pictures: Pictures) -> Figure:
+def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:
     """Return a mesh seen from one side, with a panel for each order that was rendered."""
     columns = min(_PANELS_IN_A_ROW, len(pictures))
     rows = -(-len(pictures) // columns)
     _, height, width, _ = pictures.shape
     # Below each panel its colours, above all of them the name of the mesh.
     panel = min(WIDTH_INCHES / columns, _HEIGHT_INCHES * width / height)
-    figure = Figure(figsize=(WIDTH_INCHES, 0.3 + rows * (0.7 + panel * height / width)), layout="constrained")
+    own_size = (WIDTH_INCHES, 0.3 + rows * (0.7 + panel * height / width))
+    figure = Figure(figsize=size or own_size, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels:
         axes.set_axis_off()
-    (limits,) = color_limits([view], common=False)
-    for axes, order, largest, picture in zip(panels, view.orders, limits, pictures, strict=False):
+    for i, (axes, picture) in enumerate(zip(panels, pictures, strict=False)):
         axes.imshow(picture)
-        _add_colorbar(figure, axes, largest, order)
-    figure.suptitle(escaped(view.label), fontsize="medium")
+        _add_colorbar(figure, axes, [view], view.color_limits[i], i)
+    omission = f"{len(pictures)} of {len(view.orders)} orders" if len(pictures) < len(view.orders) else ""
+    figure.suptitle("\n".join(filter(None, (escaped(view.label), _seen(view), omission))), fontsize="medium")
     return figure
 
 
-def _comparison_figure(views: Sequence[MeshView], pictures: Sequence[np.ndarray]) -> Figure:
+def _seen(view: MeshView) -> str:
+    return str(view.viewpoint) and f"view {view.viewpoint}"
+
+
+def _seen_alike(views: Sequence[MeshView]) -> list[MeshView]:
+    """Return the views from the one side that shows most of the places which are worst at the first order."""
+    if not views:
+        return []
+    limits = color_limits(views, common=True)[0][:1]
+    viewpoint = best_viewpoint(np.sum([view.seen_of_worst(limits) for view in views], axis=0))
+    return [replace(view, viewpoint=viewpoint) for view in views]
+
+
+def _comparison_figure(
+    views: Sequence[MeshView], pictures: Sequence[np.ndarray], total: int, size: Size | None
+) -> Figure:
     """Return meshes beside each other, with their witness functions of the first order on one scale."""
     columns = min(_PANELS_IN_A_ROW, len(views))
     rows = -(-len(views) // columns)
+    omission = f"{len(views)} of {total} meshes" if len(views) < total else ""
+    notes = ", ".join(filter(None, (omission, _seen(views[0]))))
     tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
-    size = (WIDTH_INCHES, 0.8 + rows * (0.3 + tallest * WIDTH_INCHES / columns))
-    figure = Figure(figsize=size, layout="constrained")
+    own_size = (WIDTH_INCHES, 0.8 + 0.3 * bool(notes) + rows * (0.3 + tallest * WIDTH_INCHES / columns))
+    figure = Figure(figsize=size or own_size, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False)
     for axes in panels.ravel():
         axes.set_axis_off()
     for axes, view, picture in zip(panels.ravel(), views, pictures, strict=False):
         axes.imshow(picture)
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
-    _add_colorbar(figure, panels, color_limits(views, common=True)[0][0], views[0].orders[0])
+    if notes:
+        figure.suptitle(notes, fontsize="medium")
+    _add_colorbar(figure, panels, views, color_limits(views, common=True)[0][0], 0)
     return figure
 
 
-def _add_colorbar(figure: Figure, panels: Axes | np.ndarray, largest: float, order: float) -> None:
+def _add_colorbar(
+    figure: Figure, panels: Axes | np.ndarray, views: Sequence[MeshView], limit: float, index: int
+) -> None:
+    """Add the colours of some meshes at one of their orders, with arrows where values lie beyond them."""
     numbers = ScalarFormatter()
     numbers.set_powerlimits((-2, 3))
+    ends = (
+        min(view.values[index].min() for view in views) < -limit,
+        max(view.values[index].max() for view in views) > limit,
+    )
     bar = figure.colorbar(
-        ScalarMappable(Normalize(-largest, largest), "RdBu_r"),
+        ScalarMappable(Normalize(-limit, limit), "RdBu_r"),
         ax=panels,
         shrink=0.8,
         orientation="horizontal",
         ticks=MaxNLocator(4, symmetric=True),
         format=numbers,
         aspect=20 if isinstance(panels, Axes) else 50,
+        extend=EXTENDS[ends],
     )
-    bar.set_label(f"witness, order {order:g}", fontsize="small")
+    beyond = f"\narrows: up to {1 - COVERED_AREA:.0%} of the area" if any(ends) else ""
+    bar.set_label(f"witness, order {views[0].orders[index]:g}{beyond}", fontsize="small")
     bar.ax.tick_params(labelsize="x-small")
     bar.ax.xaxis.get_offset_text().set_fontsize("x-small")

@@ -2,7 +2,8 @@
 
 `render` runs it as ``python _render_process.py SCENE PICTURES``. It imports nothing of the package, whose path it does
 not know. SCENE holds the arrays ``count`` and ``side``, and for each mesh i ``vertices_i``, ``triangles_i``,
-``values_i`` (k, vertices) and the colour limits ``limits_i`` (k,). PICTURES gets ``picture_i`` (k, height, width, 3).
+``values_i`` (k, vertices), the colour limits ``limits_i`` (k,) and the direction to the viewer ``eye_i`` (3,). PICTURES
+gets ``picture_i`` (k, height, width, 3).
 """
 
 from __future__ import annotations
@@ -13,8 +14,6 @@ from typing import Any
 import numpy as np
 import pyvista
 
-# Direction to the viewer, from the front and above.
-_EYE = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
 _UP = (0.0, 0.0, 1.0)
 # Margin around the mesh, as a fraction of the picture's side.
 _MARGIN = 0.02
@@ -23,7 +22,7 @@ _LIGHT = (-0.5, 0.7, 1.5)
 _AMBIENT = 0.62
 # Angle in degrees; where two faces meet at a larger one, the edge is drawn sharp.
 _SHARP = 60.0
-_ARRAYS = ("vertices", "triangles", "values", "limits")
+_ARRAYS = ("vertices", "triangles", "values", "limits", "eye")
 
 
 def main(scene_path: str, pictures_path: str) -> None:
@@ -37,12 +36,12 @@ def main(scene_path: str, pictures_path: str) -> None:
     np.savez(pictures_path, **pictures)
 
 
-def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, *, side: int) -> Any:
+def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, eye: Any, *, side: int) -> Any:
     threes = np.full((len(triangles), 1), 3)
     mesh = pyvista.PolyData(vertices, np.hstack([threes, triangles]).ravel())
-    right = np.cross(_UP, _EYE)
+    right = np.cross(_UP, eye)
     right /= np.linalg.norm(right)
-    plane = np.stack([right, np.cross(_EYE, right)], axis=1)
+    plane = np.stack([right, np.cross(eye, right)], axis=1)
     projected = vertices @ plane
     low, high = projected.min(axis=0), projected.max(axis=0)
     scale = (1 - 2 * _MARGIN) * side / (high - low).max()
@@ -70,7 +69,7 @@ def _pictures(vertices: Any, triangles: Any, values: Any, limits: Any, *, side: 
         plotter.enable_parallel_projection()
         distance = 10 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
         plotter.camera.focal_point = center
-        plotter.camera.position = center + distance * _EYE
+        plotter.camera.position = center + distance * eye
         plotter.camera.up = _UP
         plotter.camera.parallel_scale = size[1] / (2 * scale)
         plotter.reset_camera_clipping_range()

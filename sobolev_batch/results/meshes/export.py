@@ -12,7 +12,7 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.results.meshes.files import SUFFIXES, VertexField
-from sobolev_batch.results.meshes.rebuild import MeshRebuilder, require_known
+from sobolev_batch.results.meshes.rebuild import MeshRebuilder, matching_labels
 from sobolev_batch.results.meshes.witness import witness_at_vertices
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.tables.groups import finished_group, reference_of
@@ -63,15 +63,18 @@ class Exporter:
     def labels(self, meshes: Sequence[str] = ()) -> tuple[str, ...]:
         """Return the meshes to export: by default all computed ones with triangles, without the reference.
 
+        Args:
+            meshes: Labels, or patterns such as "scans/*".
+
         Raises:
             InputError: The store lacks a label, or it is the reference's.
         """
         table = self.rebuilder.meshes
-        require_known(meshes, table)
-        if self.reference in meshes:
+        labels = matching_labels(meshes, table, self.reference)
+        if self.reference in labels:
             raise InputError(f"{self.reference!r} is the reference: its witness is zero everywhere")
-        if meshes:
-            return tuple(dict.fromkeys(meshes))
+        if labels:
+            return labels
         chosen = (table["status"] == "complete") & (table["triangles"] > 0) & (table["mesh"] != self.reference)
         return tuple(table["mesh"].values[chosen.values].tolist())
 

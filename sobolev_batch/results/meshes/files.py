@@ -25,12 +25,13 @@ class VertexField:
 
     Attributes:
         mesh: Mesh in its own unit of length.
-        values: Witness function (orders, vertices) in 1 / unit length of the study.
+        values: Witness function (orders, vertices) in 1 / unit length of the study or comparison.
         orders: Orders s.
-        unit: Study's unit of length, in that of the mesh.
-        label: Label of the mesh in its study.
+        unit: Unit of length of the study or comparison, in that of the mesh.
+        label: Label of the mesh.
         reference: Label of the reference.
-        study: Name of the study.
+        name: Name of the study or comparison.
+        context: Where the mesh was compared: a "study" or a "comparison".
     """
 
     mesh: Mesh
@@ -39,7 +40,8 @@ class VertexField:
     unit: float
     label: str
     reference: str
-    study: str
+    name: str
+    context: str = "study"
 
     def write(self, path: Path) -> None:
         """Write a file in the format of its suffix, one of `SUFFIXES`.
@@ -56,12 +58,12 @@ class VertexField:
 
     def notes(self) -> list[str]:
         """Return lines of ASCII that explain the numbers."""
-        label, reference, study = map(_ascii, (self.label, self.reference, self.study))
+        label, reference, name = map(_ascii, (self.label, self.reference, self.name))
         return [
-            f"witness function of the mesh {label} against {reference}, study {study}",
+            f"witness function of the mesh {label} against {reference}, {self.context} {name}",
             "positive where the mesh has area that the reference lacks, negative where it lacks area",
-            "in 1 / unit length of the study, orders " + ", ".join(map(_number, self.orders)),
-            f"coordinates are in the unit of the mesh; one unit of the study is {self.unit!r} of them",
+            f"in 1 / unit length of the {self.context}, orders " + ", ".join(map(_number, self.orders)),
+            f"coordinates are in the unit of the mesh; one unit of the {self.context} is {self.unit!r} of them",
         ]
 
     def _ply(self) -> bytes:

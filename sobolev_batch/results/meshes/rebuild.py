@@ -6,6 +6,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Self
 
@@ -18,6 +19,9 @@ from sobolev_batch.results.tables.groups import finished_group
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.registry import Member
+
+# Labels of which a message gives examples.
+_MOST_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class MeshRebuilder:
         if label not in self.members:
             raise InputError("the study makes no such mesh here")
         if not triangles:
-            raise InputError("a surface in closed form has no triangles")
+            raise InputError("a surface that is no mesh has no triangles")
         if triangles > most_triangles:
             raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
         own = self.members[label][1].load()
@@ -92,15 +96,40 @@ class MeshRebuilder:
         return RebuiltMesh(own, scaled)
 
 
-def require_known(labels: Sequence[str], meshes: xr.Dataset) -> None:
-    """Refuse labels that a store does not have.
+def matching_labels(names: Sequence[str], meshes: xr.Dataset, reference: str) -> tuple[str, ...]:
+    """Return the labels that are meant by names, each once.
+
+    Args:
+        names: Labels, or patterns of them with the wildcards ``*``, ``?`` and ``[...]``. A pattern stands for meshes
+            that are computed and have triangles.
+        meshes: Table of all meshes.
+        reference: Label of the reference, which no pattern stands for.
 
     Raises:
-        InputError: A label is unknown; the message suggests one of the store.
+        InputError: The store has no such label; the message suggests one of the store.
     """
-    known = meshes["mesh"].values.tolist()
-    for label in labels:
-        if label not in known:
-            similar = difflib.get_close_matches(label, known, n=1)
-            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {known[0]!r}"
-            raise InputError(f"the store has no mesh {label!r}, {remedy}")
+    known: list[str] = meshes["mesh"].values.tolist()
+    usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference)
+    candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
+    chosen: list[str] = []
+    for name in names:
+        if name in known:
+            chosen.append(name)
+            continue
+        is_pattern = any(character in name for character in "*?[")
+        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
+        if not matches:
+            similar = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
+            raise InputError(
+                f"the store has no computed mesh with triangles that matches {name!r}; "
+                f"its labels are such as {_listed(candidates or known)}"
+                if is_pattern
+                else f"the store has no mesh {name!r}, {remedy}"
+            )
+        chosen += matches
+    return tuple(dict.fromkeys(chosen))
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])

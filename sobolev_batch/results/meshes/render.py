@@ -37,7 +37,7 @@ def render(
     program: Path = _PROGRAM,
     timeout_seconds: float = 300.0,
 ) -> list[Pictures]:
-    """Draw each mesh from the front and above, once for each of its first orders.
+    """Draw each mesh from its viewpoint, once for each of its first orders.
 
     Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" between plus and
     minus `color_limits`.
@@ -64,6 +64,7 @@ def render(
     for i, (view, limits) in enumerate(zip(views, color_limits(views, common), strict=True)):
         scene |= {
             f"limits_{i}": limits[:orders],
+            f"eye_{i}": view.viewpoint.direction,
             f"vertices_{i}": view.vertices,
             f"triangles_{i}": view.triangles,
             f"values_{i}": view.values[:orders],
@@ -77,11 +78,9 @@ def render(
 
 
 def color_limits(views: Sequence[MeshView], common: bool) -> list[NDArray[np.float64]]:
-    """Return the largest modulus of each mesh, or of all of them, for each order."""
-    largest = [np.abs(view.values).max(axis=1) for view in views]
-    if common:
-        largest = [np.max(largest, axis=0)] * len(views)
-    return [np.where(limits > 0, limits, 1.0) for limits in largest]
+    """Return the end of the scale of colours for each order, of each mesh or the same for all of them."""
+    limits = [view.color_limits for view in views]
+    return [np.max(limits, axis=0)] * len(views) if common else limits
 
 
 def _draw(arguments: Sequence[str], folder: Path, timeout_seconds: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,10 +14,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.meshes.rebuild import MeshRebuilder, require_known
+from sobolev_batch.results.meshes.rebuild import MeshRebuilder, matching_labels
+from sobolev_batch.results.meshes.viewpoint import FRONT, Viewpoint, best_viewpoint, color_limit, seen_of_worst
 from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
 from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.groups import finished_group
+from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group, reference_of
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
@@ -49,7 +50,7 @@ class ViewLimits:
 
 
 # Beyond, a page would take long to load and to turn; values take 4 bytes each.
-PAGE = ViewLimits(meshes=4, triangles=12_000, values=500_000)
+PAGE = ViewLimits(meshes=4, triangles=8_000, values=300_000)
 # A picture has hardly more dots on a mesh; values take 8 bytes each, in memory.
 PICTURES = ViewLimits(meshes=100, triangles=200_000, values=50_000_000)
 
@@ -67,6 +68,7 @@ class MeshView:
         orders: Orders s.
         original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
             and more where it subdivides them.
+        viewpoint: Side from which pictures show it.
     """
 
     label: str
@@ -75,6 +77,16 @@ class MeshView:
     values: Reals
     orders: tuple[float, ...]
     original_triangles: int
+    viewpoint: Viewpoint = FRONT
+
+    @property
+    def color_limits(self) -> Reals:
+        """Ends (orders,) of scales of colours on which a few outliers do not make the rest white."""
+        return np.array([color_limit(self.vertices, self.triangles, values) for values in self.values])
+
+    def seen_of_worst(self, limits: Reals) -> Reals:
+        """Return how much of the places with the strongest colours each viewpoint shows; see `best_viewpoint`."""
+        return seen_of_worst(self.vertices, self.triangles, self.values[: len(limits)], limits)
 
 
 @dataclass(frozen=True)
@@ -97,29 +109,32 @@ def make_views(
     limits: ViewLimits = PAGE,
     up: Axis = "z",
     orders: Sequence[float] | None = None,
+    family: Families = None,
 ) -> Views:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
     Args:
         tree: Open store.
         folder: Folder where relative paths in the study start.
-        meshes: Labels; by default the closest mesh of each family at the first order, and the farthest ones.
+        meshes: Labels, or patterns such as "scans/*"; by default the closest mesh of each chosen family at the first
+            order, and the farthest ones.
         limits: Limits on the size of the views.
         up: Axis that points upwards in the meshes' own coordinates.
         orders: Orders s of the witness functions; default the store's.
+        family: Families to choose from, by names or globs; default all.
 
     Raises:
-        InputError: A label is unknown, or more meshes are named than may be shown.
+        InputError: A label or family is unknown, or more meshes are named than may be shown.
     """
-    require_known(meshes, finished_group(tree, "meshes"))
-    if len(meshes) > limits.meshes:
-        raise InputError(f"at most {limits.meshes} meshes can be shown, found {len(meshes)}")
-    labels = tuple(dict.fromkeys(meshes)) or tuple(_extremes(tree))
+    named = matching_labels(meshes, finished_group(tree, "meshes"), reference_of(tree))
+    if len(named) > limits.meshes:
+        raise InputError(f"at most {limits.meshes} meshes can be shown, found {len(named)}")
+    chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
+    labels = named or tuple(_extremes(tree, chosen[0], chosen_families(tree, family)))
     try:
         rebuilder = MeshRebuilder.of(tree, folder)
     except InputError as error:
         return Views((), dict.fromkeys(labels, str(error)))
-    chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
     # A closed mesh has half as many vertices as triangles.
     most_triangles = min(limits.triangles, 2 * limits.values // (max(1, len(labels)) * len(chosen)))
     views, missing = [], {}
@@ -132,12 +147,12 @@ def make_views(
     return Views(tuple(views), missing)
 
 
-def _extremes(tree: xr.DataTree) -> Iterator[str]:
-    """Yield the mesh of each family that is closest to the reference, then those that are farthest."""
-    frame = table(tree)
-    frame = frame[(frame["order"] == frame["order"].iloc[0]) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
-    families = [rows for _, rows in frame.groupby("family", sort=False)]
-    extremes = [rows["distance"].idxmin() for rows in families] + [rows["distance"].idxmax() for rows in families]
+def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Iterator[str]:
+    """Yield the mesh of each of some families that is closest to the reference, then those that are farthest."""
+    frame = table(tree, order)
+    frame = frame[frame["family"].isin(families) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
+    groups = [rows for _, rows in frame.groupby("family", sort=False)]
+    extremes = [rows["distance"].idxmin() for rows in groups] + [rows["distance"].idxmax() for rows in groups]
     yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
@@ -155,7 +170,8 @@ def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], 
         values = witness_at(tree, label, orders, vertices, dtype="complex64")
     # A cyclic permutation of the axes, which does not mirror the mesh.
     upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
-    return MeshView(label, upright, triangles, values, orders, len(corners))
+    view = MeshView(label, upright, triangles, values, orders, len(corners))
+    return replace(view, viewpoint=best_viewpoint(view.seen_of_worst(view.color_limits)))
 
 
 def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:

@@ -8,6 +8,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.store.comparison_records import ComparisonRecords
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.witness_array import Witnesses
+from sobolev_batch.results.open import source_of
 from sobolev_batch.results.tables.groups import reference_of
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.metrics.witness import witness
@@ -59,4 +63,15 @@ def _stored(tree: xr.DataTree, label: str, order: float, count: int) -> Reals | 
     stored = tree["witness"].to_dataset()["witness"]
     if label not in stored["mesh"].values or order not in stored["order"].values or stored.sizes["vertex"] < count:
         return None
-    return np.asarray(stored.sel(mesh=label, order=order).isel(vertex=slice(count)).to_numpy(), dtype=np.float64)
+    place = source_of(tree)
+    store = None if place is None else Store.open(place)
+    if store is None or not Witnesses(store).are_listed():
+        # Values that somebody else has put into the tree.
+        return np.asarray(stored.sel(mesh=label, order=order).isel(vertex=slice(count)).to_numpy(), dtype=np.float64)
+    # Held against their record: chunks of two meshes may have traded places.
+    row = store.labels().index(label)
+    record = ComparisonRecords(store, "witness").read_row(row)
+    if record is None or record.status != "complete":
+        return None
+    values: Reals = Witnesses(store).read(row, count, record.checksum)[stored["order"].values.tolist().index(order)]
+    return values

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from sobolev_batch.results.figures.embedding import Embedding, clustered_order
 from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.league.curves import Curve
+from sobolev_batch.results.league.league import League
+from sobolev_batch.results.league.plot import bars_of, mean_curve
 from sobolev_batch.results.meshes.views import MeshView, Views
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.tables.convergence import table
@@ -19,6 +23,7 @@ from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.formatting import minus
 from sobolev_batch.results.tables.groups import complete_meshes, families_of, finished_group, has_times, reference_of
 from sobolev_batch.results.tables.matrix import Matrix
+from sobolev_batch.results.tables.sizes import is_sequence, label_of
 
 Json = dict[str, Any]
 
@@ -30,6 +35,7 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits:
     """
     orders = finished_group(tree, "convergence")["order"].values.tolist()
     return {
+        "name": tree.attrs["study"]["table"]["study"]["name"],
         "orders": [minus(f"{order:g}") for order in orders],
         "families": list(dict.fromkeys(families_of(tree).values())),
         "reference": reference_of(tree),
@@ -42,10 +48,50 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits:
     }
 
 
+def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> Json:
+    """Return the data of the charts of a collection, which may have no league; see `chart_data`."""
+    return {
+        "name": name,
+        "orders": list(orders),
+        "families": list(leagues[0].scores.methods) if leagues else [],
+        "size": label_of(leagues[0].x) if leagues else "",
+        "league": [[_method(method, mean_curve(one, method)) for method in one.scores.methods] for one in leagues],
+    }
+
+
+def _method(method: str, curve: Curve) -> Json:
+    return {
+        "family": method,
+        "sizes": _numbers(np.exp(curve.sizes)),
+        "values": _numbers(np.exp(curve.values)),
+        "errors": _numbers(bars_of(curve), digits=2),
+    }
+
+
+def chart_omissions(tree: xr.DataTree, charts: Json, spectra: Spectra | None, views: Views) -> Iterator[str]:
+    """Yield what the charts of an open store leave out, for people."""
+    compared = len(set(complete_meshes(tree)) - {reference_of(tree)})
+    drawn = sum(len(family["labels"]) for order in charts["convergence"] for family in order)
+    if drawn < (total := len(_drawable(tree))):
+        yield f"the chart of convergence: only {drawn:,} of {total:,} distances are drawn"
+    if charts["matrix"] and len(charts["matrix"]["labels"]) < charts["matrix"]["total"]:
+        yield f"all pairs: only {len(charts['matrix']['labels'])} of {charts['matrix']['total']:,} meshes are shown"
+    if charts["evolution"] is None and has_times(tree):
+        yield "the chart of distances over time: they are too many"
+    if spectra is not None and spectra.omission:
+        yield f"spectra: only those of {spectra.omission} are shown"
+    if 0 < len(views.views) < compared:
+        yield f"witness functions: only {len(views.views)} of {compared:,} meshes are drawn; --witness chooses them"
+    for label, reason in views.missing.items():
+        yield f"the witness function of {label}: {reason}"
+    for view in views.views:
+        if len(view.triangles) < view.original_triangles:
+            yield f"triangles: {view.label} is drawn with {len(view.triangles):,} of {view.original_triangles:,}"
+
+
 def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list[Json]]:
     """Return for each order and family the points with their errors."""
-    frame = table(tree)
-    frame = frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
+    frame = _drawable(tree)
     return [
         [
             _family(str(family), rows.sort_values("edge_length"))
@@ -55,10 +101,16 @@ def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list
     ]
 
 
+def _drawable(tree: xr.DataTree) -> pd.DataFrame:
+    """Return the rows of `table` that have a place on logarithmic axes."""
+    frame = table(tree)
+    return frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
+
+
 def _family(family: str, rows: Any) -> Json:
     return {
         "family": family,
-        "joined": bool((rows["level"] >= 0).all()),
+        "joined": is_sequence(rows),
         "labels": rows["mesh"].tolist(),
         "triangles": rows["triangles"].tolist(),
         "sizes": _numbers(rows["edge_length"]),
@@ -134,12 +186,14 @@ def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> Json:
 
 
 def _view(view: MeshView) -> Json:
+    # Two bytes are enough for most indices.
+    index = "<u2" if len(view.vertices) <= 1 << 16 else "<i4"
     return {
         "label": view.label,
         "triangles": view.original_triangles,
         "shown": len(view.triangles),
         "points": [_packed(axis, "<f4") for axis in view.vertices.T],
-        "corners": [_packed(corner, "<i4") for corner in view.triangles.T],
+        "corners": [_packed(corner, index) for corner in view.triangles.T],
         "values": [_packed(values, "<f4") for values in view.values],
     }
 

@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import tomli_w
 import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
+from sobolev_batch.results.report.cells import Body, Cell, Heading, PageTable, TableRow
 from sobolev_batch.results.report.limits import ReportLimits
+from sobolev_batch.results.report.verdict import StudyVerdict
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import Column, shown_columns, shown_rows, table
+from sobolev_batch.results.tables.convergence import ERRORS, Column, shown_columns, shown_rows, table
+from sobolev_batch.results.tables.doubts import doubts_of
 from sobolev_batch.results.tables.formatting import duration, minus
 from sobolev_batch.results.tables.groups import finished_group, has_proximity
 from sobolev_batch.spectral.lattice import Lattice
@@ -23,81 +27,22 @@ _LONGEST_VALUE = 300
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One cell of a table.
-
-    Attributes:
-        text: Text as it is shown.
-        key: Number or text that the column is sorted by; None comes last.
-        mark: Short remark about the number.
-    """
-
-    text: str
-    key: float | str | None = None
-    mark: str = ""
-
-    @classmethod
-    def of_count(cls, value: int) -> Cell:
-        """Return the cell of a whole number."""
-        return cls(f"{value:,}", value)
-
-    @classmethod
-    def of_text(cls, text: str) -> Cell:
-        """Return the cell of a text, which may be empty."""
-        return cls(text, text or None)
-
-    @classmethod
-    def of_number(cls, value: float, text: str | None = None, mark: str = "") -> Cell:
-        """Return the cell of a number, empty for NaN."""
-        return cls(f"{value:.4g}" if text is None else text, value, mark) if math.isfinite(value) else cls("")
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """A mesh in a table.
-
-    Attributes:
-        label: Label of the mesh.
-        family: Number of its family, for its colour.
-        status: "complete", "failed" or "missing".
-        cells: Other columns.
-    """
-
-    label: str
-    family: int
-    status: str
-    cells: tuple[Cell, ...]
-
-
-@dataclass(frozen=True)
-class OrderTable:
-    """Convergence at one order.
-
-    Attributes:
-        order: Order as it is shown.
-        rows: Meshes.
-    """
-
-    order: str
-    rows: tuple[TableRow, ...]
-
-
-@dataclass(frozen=True)
 class Content:
     """Texts and tables of a report, none of them escaped.
 
     Attributes:
         title: Title of the study.
+        name: Name of the study, for names of files.
         reference: Label of its reference.
         settings: Settings of the study, by keyword.
         summary: Key figures, by keyword.
         orders: Orders as they are shown.
-        columns: Headings of the convergence tables, after that of the meshes.
-        tables: Convergence tables, one for each order.
+        verdict: Verdict on the study.
+        convergence: Convergence tables of all orders.
         meshes: Sizes and times of each mesh.
-        omitted: Number of meshes that the tables of convergence and of sizes leave out.
         failed: Reason for each mesh that failed or is missing.
         not_compared: Comparisons of each mesh that could not be made, and why.
+        doubtful: Why one doubts that a mesh can be compared with the reference.
         rtol: Accuracy that the study asks for, or None.
         has_proximity: True if the tables end with Hausdorff and Chamfer distances.
         run: Facts about the latest run, by keyword.
@@ -106,16 +51,17 @@ class Content:
     """
 
     title: str
+    name: str
     reference: str
     settings: Mapping[str, str]
     summary: Mapping[str, str]
     orders: tuple[str, ...]
-    columns: tuple[str, ...]
-    tables: tuple[OrderTable, ...]
-    meshes: tuple[TableRow, ...]
-    omitted: tuple[int, int]
-    failed: Mapping[str, str]
-    not_compared: Mapping[str, str]
+    verdict: StudyVerdict
+    convergence: PageTable
+    meshes: PageTable
+    failed: PageTable | None
+    not_compared: PageTable | None
+    doubtful: PageTable | None
     rtol: float | None
     has_proximity: bool
     run: Mapping[str, str]
@@ -133,26 +79,33 @@ class Content:
         attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
         families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
         orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
-        tables, omitted = _tables(tree, families, limits.convergence_rows)
-        rows = tuple(_mesh_rows(meshes, families))
+        frame, failed = table(tree), _failures(meshes)
         return cls(
             title=attributes["title"],
+            name=attributes["study"]["table"]["study"]["name"],
             reference=convergence.attrs["reference"],
             settings=dict(_settings(attributes, meshes)),
             summary=dict(_summary(meshes, convergence, orders)),
             orders=orders,
-            columns=tuple(column.heading for column in shown_columns(tree)),
-            tables=tables,
-            meshes=rows[: limits.mesh_rows],
-            omitted=(omitted, max(0, len(rows) - limits.mesh_rows)),
-            failed=_failures(meshes),
-            not_compared=status.not_compared,
+            verdict=StudyVerdict.of(frame, failed),
+            convergence=convergence_table(tree, frame, families, limits.convergence_rows // len(orders)),
+            meshes=_meshes_table(meshes, families, limits.mesh_rows),
+            failed=PageTable.of_reasons("failed", "mesh", failed),
+            not_compared=PageTable.of_reasons("lacking", "mesh", status.not_compared),
+            doubtful=PageTable.of_reasons("doubtful", "mesh", doubts_of(tree)),
             rtol=convergence.attrs.get("rtol"),
             has_proximity=has_proximity(tree),
-            run=dict(_run(status)),
+            run=dict(run_facts(status)),
             versions=attributes["versions"],
             study_text=study_text(attributes["study"]["table"]),
         )
+
+    @property
+    def omissions(self) -> tuple[str, ...]:
+        """Notes on what the tables leave out."""
+        tables = {"distances": self.convergence, "meshes and timings": self.meshes}
+        cut = (f"the table of {name}: {table.omitted:,} more meshes" for name, table in tables.items() if table.omitted)
+        return (*cut, *([f"verdict: only {self.verdict.omitted} are shown"] if self.verdict.omitted else []))
 
 
 def utc_text(time: str) -> str:
@@ -172,50 +125,77 @@ def _without_nulls(value: Any) -> Any:
     return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
 
 
-def _tables(tree: xr.DataTree, families: tuple[str, ...], most_rows: int) -> tuple[tuple[OrderTable, ...], int]:
-    """Return the table of each order, and how many meshes they leave out."""
-    groups = list(table(tree).groupby("order", sort=False))
-    most = max(1, most_rows // max(1, len(groups)))
-    columns = shown_columns(tree)
-    tables = tuple(
-        OrderTable(
-            minus(f"{order:g}"), tuple(_convergence_row(row, columns, families) for row in shown_rows(rows[:most]))
-        )
+def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:
+    """Return the convergence table of an open store, from the rows of `table`, with so many of each order."""
+    # The relative distance comes first: a narrow screen shows no more without scrolling.
+    columns = sorted(shown_columns(tree), key=lambda column: not column.is_marked)
+    headings = (
+        Heading("mesh", "mesh", "label"),
+        *(Heading(column.header, column.name, second=ERRORS.get(column.name, "")) for column in columns),
+    )
+    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
+    most = max(1, most)
+    bodies = tuple(
+        Body(tuple(_convergence_row(row, columns, families) for row in shown_rows(rows[:most])), order)
         for order, rows in groups
     )
-    return tables, max((len(rows) - most for _, rows in groups if len(rows) > most), default=0)
+    longest = max(len(rows) for _, rows in groups)
+    return PageTable("convergence", headings, bodies, omitted=max(0, longest - most))
 
 
-def _convergence_row(row: Mapping[str, Any], columns: Sequence[Column], families: tuple[str, ...]) -> TableRow:
+def _convergence_row(row: Mapping[str, Any], columns: Sequence[Column], families: Sequence[str]) -> TableRow:
+    family = families.index(row["family"])
     if row["status"] != "complete":
-        cells = [Cell(row["status"])]
-    else:
-        cells = [
-            Cell.of_number(row[column.name], column.page.format_map(row), row["mark"].page if column.is_marked else "")
-            for column in columns
-        ]
-    return TableRow(row["mesh"], families.index(row["family"]), row["status"], tuple(cells))
-
-
-def _mesh_rows(meshes: xr.Dataset, families: tuple[str, ...]) -> Iterator[TableRow]:
-    for row in meshes.reset_coords().to_dataframe().reset_index().to_dict(orient="records"):
-        counts = {
-            name: Cell.of_count(row[name]) if row["triangles"] > 0 else Cell("")
-            for name in ("vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges")
-        }
-        cells = (
-            counts["vertices"],
-            counts["triangles"],
-            Cell.of_number(row["seconds"], f"{row['seconds']:.2f}"),
-            Cell.of_text(row["backend"]),
-            Cell.of_number(row["area"]),
-            counts["boundary_edges"],
-            counts["nonmanifold_edges"],
-            counts["points"],
-            Cell.of_text(row["worker"]),
-            Cell.of_text(utc_text(row["finished"])),
+        return TableRow(row["mesh"], (Cell(row["status"]),), family, reasons="failed")
+    cells = (
+        Cell.of_number(
+            row[column.name],
+            column.cell(row),
+            row["mark"].page if column.is_marked else "",
+            row.get(ERRORS.get(column.name, ""), math.nan),
         )
-        yield TableRow(row["mesh"], families.index(row["family"]), row["status"], cells)
+        for column in columns
+    )
+    return TableRow(row["mesh"], tuple(cells), family)
+
+
+def _meshes_table(meshes: xr.Dataset, families: Sequence[str], most: int) -> PageTable:
+    headings = (
+        Heading("mesh", "mesh", "label"),
+        Heading("vertices", "vertices"),
+        Heading("triangles", "triangles"),
+        Heading("seconds", "seconds"),
+        Heading("backend", "backend", "text"),
+        Heading("area", "area"),
+        Heading("boundary edges", "boundary_edges"),
+        Heading("non-manifold", "nonmanifold_edges"),
+        Heading("quadrature points", "points"),
+        Heading("worker", "worker", "text"),
+        Heading("finished, UTC", "finished", "text"),
+    )
+    frame = meshes.reset_coords().to_dataframe().reset_index()
+    rows = tuple(_mesh_row(row, families) for row in frame[:most].to_dict(orient="records"))
+    return PageTable("meshes", headings, (Body(rows),), omitted=len(frame) - len(rows))
+
+
+def _mesh_row(row: Mapping[str, Any], families: Sequence[str]) -> TableRow:
+    counts = {
+        name: Cell.of_count(row[name]) if row["triangles"] > 0 else Cell("")
+        for name in ("vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges")
+    }
+    cells = (
+        counts["vertices"],
+        counts["triangles"],
+        Cell.of_number(row["seconds"], f"{row['seconds']:.2f}"),
+        Cell.of_text(row["backend"]),
+        Cell.of_number(row["area"]),
+        counts["boundary_edges"],
+        counts["nonmanifold_edges"],
+        counts["points"],
+        Cell.of_text(row["worker"]),
+        Cell.of_text(utc_text(row["finished"])),
+    )
+    return TableRow(row["mesh"], cells, families.index(row["family"]))
 
 
 def _failures(meshes: xr.Dataset) -> dict[str, str]:
@@ -231,11 +211,12 @@ def _summary(meshes: xr.Dataset, convergence: xr.Dataset, orders: tuple[str, ...
     done = int((status[others] == "complete").sum())
     yield "meshes compared", f"{done:,} of {int(others.sum()):,}"
     yield "orders" if len(orders) > 1 else "order", ", ".join(orders) if len(orders) < 5 else f"{len(orders)}"
-    yield "triangles in all", _large_count(int(meshes["triangles"].values.sum()))
+    yield "triangles in all", large_count(int(meshes["triangles"].values.sum()))
     yield "computing time", duration(float(np.nansum(meshes["seconds"].values)))
 
 
-def _large_count(count: int) -> str:
+def large_count(count: int) -> str:
+    """Return a count in words where it is large."""
     for size, unit in ((1e9, "billion"), (1e6, "million")):
         if count >= size:
             return f"{count / size:.3g} {unit}"
@@ -248,8 +229,8 @@ def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tup
     families = meshes["family"].values.tolist()
     for family in table["family"]:
         count = families.count(family["name"])
-        yield f"family {family['name']}", f"{count:,} {'mesh' if count == 1 else 'meshes'}: {_source_text(family)}"
-    reference = _source_text(table["reference"])
+        yield f"family {family['name']}", f"{count:,} {'mesh' if count == 1 else 'meshes'}: {source_text(family)}"
+    reference = source_text(table["reference"])
     yield "reference", reference if study["reference"] == REFERENCE_LABEL else f"{study['reference']}: {reference}"
     if "accuracy" in table:
         yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
@@ -291,7 +272,7 @@ def _similarity_text(similarity: Mapping[str, Any]) -> str:
     return minus(f"x ↦ {scale:.6g} (x - ({point})): one unit of length is {1 / scale:.6g} of the meshes' own")
 
 
-def _source_text(entry: Mapping[str, Any]) -> str:
+def source_text(entry: Mapping[str, Any]) -> str:
     """Return a source and its parameters on one line."""
     parameters = [f"{key} {_value_text(value)}" for key, value in entry.items() if key not in ("name", "source")]
     text = ", ".join([str(entry.get("source", "")), *parameters])
@@ -300,13 +281,14 @@ def _source_text(entry: Mapping[str, Any]) -> str:
 
 def _value_text(value: Any) -> str:
     if isinstance(value, Mapping):
-        return f"({_source_text(value)})"
+        return f"({source_text(value)})"
     if isinstance(value, list):
         return ", ".join(map(_value_text, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _run(status: Status) -> Iterator[tuple[str, str]]:
+def run_facts(status: Status) -> Iterator[tuple[str, str]]:
+    """Yield facts about the latest run, by keyword."""
     yield "store", status.store
     yield "surfaces", f"{status.complete} of {status.total} complete, {len(status.failed)} failed"
     if status.run is not None:

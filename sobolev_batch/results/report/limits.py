@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sobolev_batch.results.figures.plots import MOST_MESHES
+from sobolev_batch.results.figures.pair_plots import MOST_MESHES
 from sobolev_batch.results.figures.spectra import MOST_MESHES as MOST_SPECTRA
 
 
@@ -19,6 +19,7 @@ class ReportLimits:
         spectra: Meshes in the spectra.
         matrix_numbers: Numbers of all matrices together: 10 bytes each, on a page of up to 15 MB.
         points: Points of all convergence charts together.
+        reasons: Meshes of a collection that are missing, with their reasons.
     """
 
     convergence_rows: int = 10_000
@@ -27,3 +28,4 @@ class ReportLimits:
     spectra: int = MOST_SPECTRA
     matrix_numbers: int = 400_000
     points: int = 50_000
+    reasons: int = 2_000

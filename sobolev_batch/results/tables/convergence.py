@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import pandas as pd
 import xarray as xr
 
+from sobolev_batch.batch.collection_store import CollectionStore
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables.defaults import Format
+from sobolev_batch.results.tables.doubts import doubts_of
 from sobolev_batch.results.tables.formatting import Digits
-from sobolev_batch.results.tables.groups import chosen_orders, finished_group, has_proximity
-from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
+from sobolev_batch.results.tables.groups import finished_group, has_proximity, metadata_of
+from sobolev_batch.results.tables.orders import convergence_at, order_note
+from sobolev_batch.results.tables.sizes import with_rates
+from sobolev_batch.results.tables.text import machine_table, printed_table, prose
 from sobolev_batch.spectral.shells import Orders
 
-_ABOUT = ("family", "name", "level", "status", "reason", "triangles")
+_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
 _NUMBERS = (
     "edge_length",
     "distance",
@@ -37,12 +44,12 @@ _NUMBERS = (
 # Where the study asks for them.
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 _NOTE = """\
-The true distance lies within its error, the sum of truncation (frequencies beyond
-the highest one), aliasing (spacing of the lattice), discretisation (quadrature and
-NUFFT) and chance (random frequencies, if the study samples octaves). Lengths are in
-the study's unit. A distance marked * is not larger than its error, and gives no rate.
-The column "area" is the fraction of the squared distance that a change of total area
-alone explains."""
+Relative distances are fractions of the reference's norm. Errors are meant as bounds,
+the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
+lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, if the
+study samples octaves). Lengths are in the study's unit. A distance marked * is not
+larger than its error, and gives no rate. The column "area" is the share of the squared
+distance that a change of total area alone explains."""
 _PROXIMITY_NOTE = """\
 Hausdorff and Chamfer distances are for orientation, and the same at all orders.
 Hausdorff is a lower bound: the largest distance from any vertex or sampled point to
@@ -60,72 +67,97 @@ class Mark(NamedTuple):
     page: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The mesh that is nearest to the reference.
+
+    Attributes:
+        mesh: Its row of `table`.
+        rivals: Labels of meshes of which errors leave open whether they are nearer, the nearest first.
+    """
+
+    mesh: pd.Series
+    rivals: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Column:
     """A column of the text table and of the page of a report, beside the meshes; see `shown_rows` for its rows.
 
     Attributes:
         name: Number of a row that the column shows. Its cell is empty where that is NaN.
-        header: Header in text tables; without one they leave the column out.
-        heading: Heading on the page.
-        text: Template of cells in text tables.
-        page: Template of cells on the page.
+        header: Header of the column.
+        template: Template of its cells.
         is_marked: True where the mark of the distance follows the number.
         group: Group of the store that has the number; the column is shown if the store has the group.
     """
 
     name: str
     header: str
-    heading: str
-    text: str
-    page: str
+    template: str
     is_marked: bool = False
     group: str = "convergence"
 
-    def text_cell(self, row: dict[str, Any]) -> str:
+    def cell(self, row: Mapping[str, Any]) -> str:
+        """Return the cell of a mesh that is complete, without its mark."""
+        return "" if math.isnan(row[self.name]) else self.template.format_map(row)
+
+    def text_cell(self, row: Mapping[str, Any]) -> str:
         """Return the cell of a text table."""
         if row["status"] != "complete":
             return "missing"
-        # The number itself is not NaN here, but its error may be.
-        text = "" if math.isnan(row[self.name]) else self.text.format_map(row).replace("nan", "?")
-        return text + row["mark"].text if self.is_marked else text
+        return self.cell(row) + row["mark"].text if self.is_marked else self.cell(row)
 
 
-_DISTANCE = "{distance:.6e} ± {error:.0e}"
-_CHAMFER = "{chamfer:.4e} ± {chamfer_error:.0e}"
 _COLUMNS = (
-    Column("triangles", "triangles", "triangles", "{triangles:,}", "{triangles:,}"),
-    Column("edge_length", "edge", "mean edge", "{edge_length:.4g}", "{edge_length:.4g}"),
-    Column("distance", "distance ± error", "distance", _DISTANCE, "{digits[distance].value}", is_marked=True),
-    Column("error", "", "± error", "", "{digits[distance].error}"),
-    Column("relative", "relative", "relative distance", "{relative:.5e}", "{digits[relative].together}"),
-    Column("rate", "rate", "rate", "{rate:.3f} ± {rate_error:.0e}", "{digits[rate].together}"),
-    Column("area_fraction", "area", "area", "{area_percent:.1f} %", "{area_percent:.1f} %"),
-    Column("hausdorff", "Hausdorff ≥", "Hausdorff ≥", "{hausdorff:.2e}", "{hausdorff:.3g}", group="proximity"),
-    Column("chamfer", "Chamfer ± s.e.", "Chamfer", _CHAMFER, "{digits[chamfer].together}", group="proximity"),
+    Column("triangles", "triangles", "{triangles:,}"),
+    Column("edge_length", "edge", "{edge_length:.4g}"),
+    Column("relative", "relative", "{digits[relative].together}", is_marked=True),
+    Column("distance", "distance", "{digits[distance].together}"),
+    Column("rate", "rate", "{digits[rate].together}"),
+    Column("area_fraction", "area", "{area_percent:.0f} %"),
+    Column("hausdorff", "Hausdorff ≥", "{hausdorff:.3g}", group="proximity"),
+    Column("chamfer", "Chamfer ± s.e.", "{digits[chamfer].together}", group="proximity"),
 )
-_ERRORS = {"distance": "error", "relative": "relative_error", "rate": "rate_error", "chamfer": "chamfer_error"}
+# Errors that cells show beside their numbers, by the names of both.
+ERRORS = {"distance": "error", "relative": "relative_error", "rate": "rate_error", "chamfer": "chamfer_error"}
 
 
-def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
+def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length") -> pd.DataFrame:
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
-        store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders, or several; default all.
+        store: Path, URL or opened DataTree of the store. Of the store of a collection, the rows of all objects that
+            have tables follow each other, and the first column, object, names theirs.
+        order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
+            fields, which takes about as long as reading them.
+        x: Size of a mesh, a column of the table, in which rates are observed: "edge_length", "triangles", "vertices"
+            or "seconds" (spent on its Fourier field), or one of the metadata that the study gives its meshes.
 
     Returns:
-        Columns order, mesh, family, name, level, status, reason, triangles, edge_length (mean), distance (to the
-        reference), error and its parts truncation, aliasing, discretisation and statistical, relative and
-        relative_error (over the norm of the reference), area_part and shape_part (what a change of total area alone
-        explains of the distance, and the rest: their squares add up to its square), rate (observed order of convergence
-        in the edge length) and rate_error, resolved (the distance exceeds its error), within (the error is as small as
-        the study asks for); where the study asks for [proximity] also hausdorff, chamfer and chamfer_error. Lengths are
-        in the study's unit. Numbers of a mesh that failed are NaN; so are the parts in old stores that lack them. The
-        frame's ``attrs`` have the reference's label and the study's rtol, if it has one.
+        One row for each mesh and order. Lengths are in the study's unit. The columns:
+
+        - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
+          decides on it (level, triangles, names or time);
+        - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
+          study gives its meshes;
+        - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
+          relative and relative_error (over the norm of the reference);
+        - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their
+          squares add up to its square;
+        - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
+          for another x, since the others grow;
+        - resolved (the distance exceeds its error) and within (the error is as small as the study asks for);
+        - where the study asks for [proximity]: hausdorff, chamfer and chamfer_error.
+
+        Numbers of a mesh that failed are NaN; so are those that an old store lacks. The frame's ``attrs`` have the
+        reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
+        ``computed`` the orders that were computed from the fields.
 
     Raises:
-        InputError: The store has no tables yet, or lacks an order.
+        InputError: The store has no tables yet, or its meshes have no such size.
+        OrderError: An order is not below -1/2.
+        DamageError: An order is to be computed, and a field is not what was stored.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb
@@ -135,41 +167,129 @@ def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.found(Location.of(store))
+    if collection is not None:
+        return _joined(tables_of(collection.begun, order, x=x))
     tree = as_tree(store)
-    convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
+    convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
     labels = convergence["mesh"].values
     others = labels != convergence.attrs["reference"]
-    columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in _ABOUT}}
+    about = [key for key in (*_ABOUT, *metadata_of(tree)) if key in meshes]
+    columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in about}}
     nearness = {}
     if has_proximity(tree):
-        proximity = finished_group(tree, "proximity")
-        nearness = {key: proximity[key].values[others] for key in _PROXIMITIES}
+        proximity = finished_group(tree, "proximity").sel(mesh=labels[others])
+        nearness = {key: proximity[key].values for key in _PROXIMITIES}
     frames = []
-    for s in chosen_orders(convergence, order):
+    for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = convergence.sel(order=s)
         numbers = {key: row[key].values[others] if key in row else math.nan for key in _NUMBERS}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
     frame = pd.concat(frames, ignore_index=True)
-    frame.attrs = {key: convergence.attrs[key] for key in ("reference", "rtol") if key in convergence.attrs}
-    return frame
+    kept = ("reference", "rtol", "computed")
+    frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
+    if known := metadata_of(tree):
+        frame.attrs["metadata"] = known
+    return frame if x == "edge_length" else with_rates(frame, x)
 
 
-def format_table(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of several objects after each other, named in the first column."""
+    return pd.concat(frames, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
+
+
+def tables_of(
+    stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = "edge_length"
+) -> dict[str, pd.DataFrame]:
+    """Return the rows of `table` of each object that has any, by its name.
+
+    Raises:
+        InputError: No object has tables, or one that has lacks a size.
+        OrderError: An order is not below -1/2.
+        StoreError: A location has no store, or it is damaged.
+    """
+    trees = {name: as_tree(place) for name, place in stores.items()}
+    finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
+    if not finished:
+        raise InputError("no object has tables yet: run the study to its end")
+    return {name: table(tree, order, x=x) for name, tree in finished.items()}
+
+
+def format_table(
+    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, x: str = "edge_length"
+) -> str:
     """Return the convergence table of an open store as text; see `table`."""
-    frame = table(tree, orders)
+    frame = table(tree, orders, x=x)
     if style in ("csv", "json"):
         return machine_table(frame, style)
-    columns = [column for column in shown_columns(tree) if column.header]
-    headers = ["mesh", *(column.header for column in columns)]
+    return "\n\n".join(
+        [*_tables(tree, frame, style), prose("\n".join(_notes(tree, frame, x)), style), *_remarks(tree, frame, style)]
+    )
+
+
+def format_tables(
+    stores: Mapping[str, AnyStore], style: Format = "text", orders: Sequence[float] | None = None, *, x: str
+) -> str:
+    """Return the convergence tables of several objects as text, one after the other; see `table`."""
+    trees = {name: as_tree(place) for name, place in stores.items()}
+    frames = tables_of(trees, orders, x=x)
+    if style in ("csv", "json"):
+        return machine_table(_joined(frames), style)
+    sections: list[str] = []
+    for name, frame in frames.items():
+        tree = trees[name]
+        sections += [prose(f"Object {name}", style), *_tables(tree, frame, style), *_remarks(tree, frame, style)]
+    return "\n\n".join([*sections, prose("\n".join(_notes(tree, frame, x)), style)])
+
+
+def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
+    """Return the table of each order with its caption, and that of other distances where there are any."""
     sections = []
     for order, rows in frame.groupby("order", sort=False):
-        cells = [[row["mesh"], *(column.text_cell(row) for column in columns)] for row in shown_rows(rows)]
-        caption = prose(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", style)
-        separator = "\n" if style == "latex" else "\n\n"
-        sections.append(f"{caption}{separator}{printed_table(cells, headers, style)}")
-    sections.append(prose("\n".join(_notes(tree, frame)), style))
-    failures = "\n".join(_failures(tree, frame))
-    return "\n\n".join([*sections, prose(failures, style)] if failures else sections)
+        caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
+        sections.append(_section(caption, rows, "convergence", style, _nearest(rows)))
+    if has_proximity(tree):
+        once = frame[frame["order"] == frame["order"].iloc[0]]
+        sections.append(_section("Other distances, the same at all orders", once, "proximity", style))
+    return sections
+
+
+def _remarks(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
+    """Return what failed and what is doubtful, as one paragraph, or nothing."""
+    remarks = [*_failures(tree, frame), *(f"{mesh}: {doubt}" for mesh, doubt in doubts_of(tree).items())]
+    return [prose("\n".join(remarks), style)] if remarks else []
+
+
+def _section(caption: str, frame: pd.DataFrame, group: str, style: Format, sentence: str = "") -> str:
+    """Return a caption, the table of one order with the columns of a group, and a sentence."""
+    columns = [column for column in _COLUMNS if column.group == group]
+    headers = ["mesh", *(column.header for column in columns)]
+    cells = [[row["mesh"], *(column.text_cell(row) for column in columns)] for row in shown_rows(frame)]
+    parts = [prose(caption, style), printed_table(cells, headers, style), prose(sentence, style) if sentence else ""]
+    return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
+def nearest(frame: pd.DataFrame) -> Nearest | None:
+    """Return the nearest mesh among rows of `table` of one order; None where no distance is above its error."""
+    rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
+    resolved = rows[rows["resolved"].astype(bool)]
+    if not len(resolved):
+        return None
+    best = resolved.iloc[0]
+    others = rows[rows["mesh"] != best["mesh"]]
+    rivals = others[others["distance"] - others["error"] < best["distance"] + best["error"]]
+    return Nearest(best, tuple(rivals["mesh"]))
+
+
+def _nearest(frame: pd.DataFrame) -> str:
+    """Return a sentence about the mesh that is nearest to the reference at one order."""
+    found = nearest(frame)
+    if found is None:
+        return ""
+    best, rivals = found.mesh, found.rivals
+    amount = Digits.percent(best["relative"], best["relative_error"]).together
+    doubt = f"; its errors leave open whether {rivals[0]} is nearer" if rivals else ""
+    return f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."
 
 
 def shown_columns(tree: xr.DataTree) -> list[Column]:
@@ -184,16 +304,19 @@ def shown_rows(frame: pd.DataFrame) -> list[dict[str, Any]]:
         fraction = _area_fraction(row)
         row.update(triangles=row["triangles"] or math.nan, area_fraction=fraction, area_percent=100 * fraction)
         row["mark"] = _mark(row)
-        row["digits"] = {name: Digits.of(row[name], row[error]) for name, error in _ERRORS.items() if name in row}
+        row["digits"] = {name: Digits.of(row[name], row[error]) for name, error in ERRORS.items() if name in row}
+        row["digits"]["relative"] = Digits.percent(row["relative"], row["relative_error"])
     return rows
 
 
-def _notes(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
-    notes = [_NOTE]
+def _notes(tree: xr.DataTree, frame: pd.DataFrame, x: str) -> list[str]:
+    notes = [_NOTE, *([] if x == "edge_length" else [f"Rates are those of distance ~ ({x})^-rate."])]
     if has_proximity(tree):
         notes.append(_PROXIMITY_NOTE)
     if "rtol" in frame.attrs:
         notes.append(_ACCURACY_NOTE.format(rtol=frame.attrs["rtol"]))
+    if "computed" in frame.attrs:
+        notes.append(order_note(tree, frame.attrs["computed"]))
     return notes
 
 

@@ -12,15 +12,16 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
 from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
 from sobolev_batch.results.tables.formatting import concise
-from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
-from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
+from sobolev_batch.results.tables.groups import complete_meshes, finished_group, reference_of
+from sobolev_batch.results.tables.orders import convergence_at
+from sobolev_batch.results.tables.text import machine_table, printed_table, prose
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
-from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import quoted
 
-# A mesh that is so many times as far away as at its first time is worth a new one.
-REMESHING_FACTOR = 2.0
+_NUMBERS = ("distance", "error", "relative", "relative_error")
 _NOTE = """\
 Digits in brackets are the error in units of the last digit. If a new mesh of as many
 triangles would be as near as the first one, it pays once the distance has certainly
@@ -34,20 +35,21 @@ def evolution(
 
     Args:
         store: Path, URL or opened DataTree of a store whose meshes have times.
-        order: One order s < -1/2 of the store, or several; default all.
+        order: One order s < -1/2, or several; default all of the store.
         truth: Family of the true surface at the same times, if it moves; default the study's reference.
         factor: Growth of the distance at which a new mesh pays, larger than 1.
 
     Returns:
         Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
-        length, and `growth`, the distance over that of the family's first time with a distance, NaN if that is not
-        larger than its error. Over `family` and `order` it has `remesh_time`, the first time at which the distance has
-        certainly grown by the factor; later it may fall again. NaN where a family has no mesh of a time, where no time
-        is late enough, and without a growth.
+        length, `relative` and `relative_error` (over the norm of the true surface), and `growth`, the distance over
+        that of the family's first time with a distance, NaN if that is not larger than its error. Over `family` and
+        `order` it has `remesh_time`, the first time at which the distance has certainly grown by the factor; later it
+        may fall again. NaN where a family has no mesh of a time, where no time is late enough, and without a growth.
 
     Raises:
-        InputError: The store has no tables yet, no mesh with a time, no such order or family, or the factor is not
-            larger than 1.
+        InputError: The store has no tables yet, no mesh with a time or no such family, or the factor is not larger
+            than 1.
+        OrderError: An order is not below -1/2.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb
@@ -67,8 +69,10 @@ def evolution(
     if not factor > 1:
         raise InputError(f"the factor must be larger than 1, found {factor!r}")
     tree = as_tree(store)
-    convergence, meshes = finished_group(tree, "convergence"), finished_group(tree, "meshes")
-    orders = list(dict.fromkeys(chosen_orders(convergence, order)))
+    # Distances to a surface that moves are computed for each time.
+    convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
+    orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
+    meshes = finished_group(tree, "meshes")
     labels = _labels_by_time(meshes)
     if not labels:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
@@ -83,7 +87,7 @@ def evolution(
     complete = set(complete_meshes(tree))
     times = sorted({time for family in labels.values() for time in family})
     shape = (len(labels), len(times), len(orders))
-    distances, errors = np.full(shape, np.nan), np.full(shape, np.nan)
+    numbers = {name: np.full(shape, np.nan) for name in _NUMBERS}
     for i, family in enumerate(labels.values()):
         for time, label in family.items():
             if truth is None:
@@ -93,8 +97,9 @@ def evolution(
             else:
                 continue
             place = i, times.index(time)
-            distances[place], errors[place] = found["distance"].values, found["error"].values
-    return _dataset(list(labels), times, orders, distances, errors, factor)
+            for name, values in numbers.items():
+                values[place] = found[name].values
+    return _dataset(list(labels), times, orders, numbers, factor)
 
 
 def format_evolution(
@@ -108,8 +113,9 @@ def format_evolution(
     """Return the distances of moving meshes as text; see `evolution`."""
     found = evolution(tree, orders, truth=truth, factor=factor)
     if style in ("csv", "json"):
-        frame: pd.DataFrame = found[["distance", "error", "growth"]].to_dataframe().dropna(how="all").reset_index()
-        return machine_table(frame[["order", "family", "time", "distance", "error", "growth"]], style)
+        columns = [*_NUMBERS, "growth"]
+        frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
+        return machine_table(frame[["order", "family", "time", *columns]], style)
     families = found["family"].values.tolist()
     sections = []
     for order in found["order"].values.tolist():
@@ -118,7 +124,7 @@ def format_evolution(
             [_time(time), *(_cell(rows.sel(family=family, time=time)) for family in families)]
             for time in rows["time"].values.tolist()
         ]
-        caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time"
+        caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
         moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
         separator = "\n" if style == "latex" else "\n\n"
         table = printed_table(cells, ["time", *families], style)
@@ -146,13 +152,12 @@ def _dataset(
     families: list[str],
     times: list[float],
     orders: list[float],
-    distances: np.ndarray,
-    errors: np.ndarray,
+    numbers: Mapping[str, np.ndarray],
     factor: float,
 ) -> xr.Dataset:
     dims = ("family", "time", "order")
     found = xr.Dataset(
-        {"distance": (dims, distances, VARIABLES["distance"]), "error": (dims, errors, VARIABLES["error"])},
+        {name: (dims, values, VARIABLES[name]) for name, values in numbers.items()},
         coords={
             "family": ("family", families, described("family of meshes")),
             "time": ("time", times, VARIABLES["time"]),
@@ -173,7 +178,7 @@ def _dataset(
 
 
 def _cell(found: xr.Dataset) -> str:
-    text = concise(found["distance"].item(), found["error"].item())
+    text = concise(100 * found["relative"].item(), 100 * found["relative_error"].item())
     growth = found["growth"].item()
     return f"{text}  {growth:5.2f} ×" if np.isfinite(growth) else text
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.surfaces.sources.names import quoted
+
+# Names of families, or globs of names; None is all of them.
+Families = str | Sequence[str] | None
 
 
 def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
@@ -38,6 +45,15 @@ def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
     return chosen
 
 
+def chosen_order(tree: xr.DataTree, order: float | None) -> float:
+    """Return one of the orders of an open store; its first by default.
+
+    Raises:
+        InputError: The store has no tables yet, or lacks the order.
+    """
+    return chosen_orders(finished_group(tree, "convergence", load=False), order)[0]
+
+
 def has_proximity(tree: xr.DataTree) -> bool:
     """Return True if the store has Hausdorff and Chamfer distances."""
     return "proximity" in tree.children
@@ -54,9 +70,33 @@ def families_of(tree: xr.DataTree) -> dict[str, str]:
     return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
 
 
+def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
+    """Return the families that names or globs choose, in the order of the study; all of them by default.
+
+    Raises:
+        InputError: A name or glob fits no family.
+    """
+    known = list(dict.fromkeys(families_of(tree).values()))
+    if family is None:
+        return known
+    chosen: set[str] = set()
+    for pattern in [family] if isinstance(family, str) else family:
+        # A name may have characters that mean something else in a glob.
+        fitting = [pattern] if pattern in known else [name for name in known if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
+        chosen.update(fitting)
+    return [name for name in known if name in chosen]
+
+
 def has_times(tree: xr.DataTree) -> bool:
     """Return True if any mesh of the store has a time."""
     return "time" in finished_group(tree, "meshes", load=False).coords
+
+
+def metadata_of(tree: xr.DataTree) -> list[str]:
+    """Return the names of the metadata that the study gives its meshes."""
+    return list(finished_group(tree, "meshes", load=False).attrs.get("metadata", ()))
 
 
 def complete_meshes(tree: xr.DataTree) -> list[str]:

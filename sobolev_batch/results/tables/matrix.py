@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,21 +13,24 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables.formatting import concise
+from sobolev_batch.results.tables.defaults import Format
+from sobolev_batch.results.tables.formatting import concise, middle_cut
 from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
-from sobolev_batch.results.tables.text import Format, machine_table, printed_table, prose
+from sobolev_batch.results.tables.orders import distances_at, order_note, reference_norm_at
+from sobolev_batch.results.tables.text import LINE_LENGTH, machine_table, printed_table, prose
+from sobolev_batch.spectral.errors.budget import quotients
+from sobolev_batch.spectral.shells import check_orders
 
 Reals = NDArray[np.float64]
 
 _COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 # A longer printed matrix cannot be read.
 _MOST_MESHES = 20
-_LINE_LENGTH = 100
 _LONGEST_LABEL = 30
 _NOTE = """\
-Digits in brackets are the error in units of the last digit: 1.234(5)e-02 is
-0.01234 ± 0.00005, and the true distance lies within that. The columns have the
-numbers of the rows; the matrix is symmetric. Lengths are in the study's unit."""
+Digits in brackets are the error, meant as a bound, in units of the last digit:
+1.234(5) is 1.234 ± 0.005. The columns have the numbers of the rows; the matrix is
+symmetric."""
 
 
 @dataclass(frozen=True)
@@ -47,20 +50,23 @@ class Matrix:
     errors: Reals
 
     @classmethod
-    def of(cls, tree: xr.DataTree, order: float, most: int | None = None) -> Matrix | None:
+    def of(
+        cls, tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
+    ) -> Matrix | None:
         """Return the matrix of an open store; None where the study asks for distances to the reference alone.
 
         Args:
             tree: Open store.
             order: One of its orders.
             most: Number of meshes to keep: the first ones and the reference; default all.
+            among: Labels to keep beside the reference; default all.
         """
         distances = finished_group(tree, "distances", load=False)
         (order,) = chosen_orders(distances, order)
         if distances.sizes["other"] != distances.sizes["mesh"]:
             return None
         reference, complete = reference_of(tree), complete_meshes(tree)
-        others = [label for label in complete if label != reference]
+        others = [label for label in complete if label != reference and (among is None or label in among)]
         kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
         chosen = distances.sel(order=order, mesh=kept, other=kept).load()
         return cls(order, tuple(kept), chosen["distance"].values, chosen["error"].values)
@@ -75,7 +81,7 @@ def matrix(
 
     Args:
         store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders.
+        order: Order s < -1/2. One that the store lacks is computed from the stored fields of all meshes.
         values: Content of the matrix: the distances, their errors, or a part of the errors.
 
     Returns:
@@ -84,7 +90,8 @@ def matrix(
         mesh failed. The frame's ``attrs`` have the order and the reference's label.
 
     Raises:
-        InputError: The store has no tables yet, or lacks the order.
+        InputError: The store has no tables yet.
+        OrderError: The order is not below -1/2.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb
@@ -97,23 +104,26 @@ def matrix(
     'reference'
     """
     tree = as_tree(store)
-    distances = finished_group(tree, "distances", load=False)
+    (order,) = check_orders(order)
+    distances = distances_at(tree, order)
     if values not in _columns_of(distances):
         raise InputError(f"values must be one of {', '.join(_columns_of(distances))}, found {values!r}")
-    (order,) = chosen_orders(distances, order)
     frame: pd.DataFrame = distances[values].sel(order=order).transpose("mesh", "other").to_pandas()
     frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
     return frame
 
 
-def matrix_frame(tree: xr.DataTree, order: float) -> pd.DataFrame:
+def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
     """Return the distances of one order in long form: one row for each pair of meshes.
 
     Columns order, mesh, other, distance, error, truncation, aliasing, discretisation, statistical.
+
+    Args:
+        distances: Table of the distances of an open store.
+        order: One of its orders.
     """
-    distances = finished_group(tree, "distances", load=False)
     columns = _columns_of(distances)
-    chosen = distances[columns].sel(order=chosen_orders(distances, order)[0]).load()
+    chosen = distances[columns].sel(order=order).load()
     frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
     return frame[["order", "mesh", "other", *columns]]
 
@@ -127,12 +137,13 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     """Return the distance matrices of an open store as text.
 
     Raises:
-        InputError: The store has no tables yet, lacks an order, or has more meshes than a printed matrix can show.
+        InputError: The store has no tables yet, or has more meshes than a printed matrix can show.
+        OrderError: An order is not below -1/2.
     """
-    distances = finished_group(tree, "distances", load=False)
-    chosen = chosen_orders(distances, orders)
+    distances = distances_at(tree, orders)
+    chosen = list(dict.fromkeys(distances["order"].values.tolist()))
     if style in ("csv", "json"):
-        return machine_table(pd.concat([matrix_frame(tree, order) for order in chosen]), style)
+        return machine_table(pd.concat([matrix_frame(distances, order) for order in chosen]), style)
     count = distances.sizes["mesh"]
     if count > _MOST_MESHES:
         raise InputError(
@@ -141,11 +152,24 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
         )
     sections = []
     for order in chosen:
-        rows = _Rows.of(distances.sel(order=order).load())
-        caption = prose(f"Sobolev distances of order {order:g}", style)
+        values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
+        rows = _Rows.of(distances, values, errors)
+        caption = prose(f"Sobolev distances of order {order:g}, {unit}", style)
         tables = [rows.table(columns, style) for columns in rows.column_groups(style)]
         sections.append("\n\n".join([caption, *tables]))
-    return "\n\n".join([*sections, prose(_NOTE, style)])
+    notes = [_NOTE, *([order_note(tree, distances.attrs["computed"])] if "computed" in distances.attrs else [])]
+    return "\n\n".join([*sections, prose("\n".join(notes), style)])
+
+
+def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:
+    """Return the distances of one order, their errors, and the unit of both: the reference if it has a norm."""
+    values, errors = distances["distance"].values, distances["error"].values
+    if "norms" in tree.children:
+        norm = reference_norm_at(tree, distances["order"].item())
+        relative, bounds = quotients((values, errors), (norm["norm"].values, norm["error"].values))
+        if norm["norm"].notnull():
+            return 100 * relative, 100 * bounds, f"in % of the norm of {reference_of(tree)}"
+    return values, errors, "in the square root of a unit length"
 
 
 @dataclass(frozen=True)
@@ -165,17 +189,14 @@ class _Rows:
     is_symmetric: bool
 
     @classmethod
-    def of(cls, distances: xr.Dataset) -> _Rows:
+    def of(cls, distances: xr.Dataset, numbers: Reals, errors: Reals) -> _Rows:
+        """Return the rows of numbers between the meshes of some distances."""
         labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
         symmetric = labels == others
-        values, errors = distances["distance"].values.tolist(), distances["error"].values.tolist()
-        names = [
-            f"{i} {label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + '…'}"
-            for i, label in enumerate(labels, 1)
-        ]
+        names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
         cells = [
             [
-                "" if symmetric and i <= j else concise(values[i][j], errors[i][j]) or "missing"
+                "" if symmetric and i <= j else concise(float(numbers[i, j]), float(errors[i, j])) or "missing"
                 for j in range(len(others))
             ]
             for i in range(len(labels))
@@ -189,7 +210,7 @@ class _Rows:
             return [columns]
         name_width = max(map(len, self.names)) + 2
         cell_width = max(len(row[j]) for row in self.cells for j in columns) + 2
-        count = max(1, (_LINE_LENGTH - name_width) // cell_width)
+        count = max(1, (LINE_LENGTH - name_width) // cell_width)
         return [columns[start : start + count] for start in range(0, len(columns), count)]
 
     def table(self, columns: Sequence[int], style: Format) -> str:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.special import betainc
 
-from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
 from sobolev_batch.spectral.errors.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,
@@ -38,6 +37,8 @@ _LARGER_PILOT_M = 128
 _HIGHEST_FREQUENCY = 1e4
 # Surfaces end this much short of the period.
 _CLEARANCE = 1.001
+# Surfaces may be as small as a point, but the kernel is a unit of length wide.
+_LEAST_WIDTH = 0.01
 # An accuracy called reachable must hold when it is asked for, on a pilot that differs a little.
 _REACHABLE_MARGIN = 1.5
 _STEP = 1.04
@@ -112,7 +113,7 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
         label: Name of the pair in messages.
 
     Returns:
-        A lattice at least as fine and as large as the smaller one.
+        A lattice at least as fine and as large as the smaller one. A best effort takes the largest one at last.
 
     Raises:
         AccuracyError: The lattice does not fit into the memory; the message gives the reachable rtol.
@@ -130,18 +131,16 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
     larger = accumulate(repeat(_STEP), mul, initial=lattice.xi_max)
     candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
     highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
+    if highest is None and accuracy.best_effort:
+        return lattice_of(_HIGHEST_FREQUENCY, period, most)
     if highest is None:
         excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
         worst = int(np.argmax(excess))
-        reachable = rounded_up(_REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol)
-        advice = f"about {reachable:g} can be reached; ask for that, allow more memory, or take"
-        if reachable >= 1:
-            advice = "not even one digit can be reached; allow more memory or take"
-        raise AccuracyError(
-            f"{label}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g}: within "
-            f"{accuracy.allowed_bytes / 1e9:.3g} GB (M <= {most}) {advice} a more negative order",
+        raise unreachable(
+            f"{label}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g} within "
+            f"{accuracy.allowed_bytes / 1e9:.3g} GB of memory (M <= {most}; more memory permits a larger one)",
             accuracy.rtol,
-            reachable,
+            _REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol,
         )
     return lattice_of(highest, period, most)
 
@@ -183,10 +182,4 @@ def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) ->
     def suffices(period: float) -> bool:
         return period > farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
 
-    return next(filter(suffices, accumulate(repeat(1.01), mul, initial=float(widths.max()))))
-
-
-def rounded_up(value: float) -> float:
-    """Round up to two digits: an estimate has no more."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return math.ceil(value / unit) * unit
+    return next(filter(suffices, accumulate(repeat(1.01), mul, initial=max(float(widths.max()), _LEAST_WIDTH))))

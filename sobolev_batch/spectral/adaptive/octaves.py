@@ -9,11 +9,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, rounded_up
+from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate, aliased, change_of_root, sums_of_shells
+from sobolev_batch.spectral.adaptive.values import SurfaceValues
+from sobolev_batch.spectral.errors.budget import aliased, change_of_root, sums_of_shells
+from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
@@ -27,7 +27,8 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among
+from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -53,8 +54,6 @@ _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
 _GROWTH = 4.0
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
-# An accuracy called reachable must hold when it is asked for.
-_REACHABLE_MARGIN = 1.3
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -83,7 +82,7 @@ class Core:
     def of(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
         """Return the core of a problem; the step ends at the cutoff."""
         samples = problem.samples(lattice)
-        values = ESTIMATE_CAUTION * estimate(samples, problem.orders)
+        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate(samples, problem.orders))
         problem.require_above_rounding(values)
         # The octaves' values have errors of their own.
         target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
@@ -125,63 +124,73 @@ class MeasuredOctave:
         return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
 
 
-def solve_in_octaves(problem: Problem, seed: int, acceptable: Accuracy | None = None) -> Solution:
+def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, *, pairs: bool = True) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     Args:
         problem: Surfaces, orders and accuracy.
         seed: Seed of the random frequencies. The same seed gives the same result.
-        acceptable: Accuracy that will do where that of the problem is out of reach.
+        aim: Fraction of the rtol to aim at.
+        pairs: True to use the distances between points of clouds, which the values in octaves do not tell.
 
     Returns:
-        The first solution that meets the accuracy; else the last one, if it is acceptable.
+        The first solution that meets the aim; else the last one that can be sampled in some minutes.
 
     Raises:
-        AccuracyError: The accuracy lies below the rounding of fields, or would take too many samples.
+        AccuracyError: The accuracy lies below the rounding of fields.
     """
-    search = _Search.begin(problem, seed)
+    aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
+    search = _Search.begin(aimed, seed, pairs=pairs)
     for rounds_left in reversed(range(_ROUNDS)):
         search.measure_outwards()
         solution = search.solution()
-        if np.all(problem.accuracy.met(solution.estimate)):
-            return solution
-        if not (rounds_left and search.refine()):
+        if np.all(aimed.accuracy.met(solution.estimate)) or not (rounds_left and search.refine()):
             break
-    if acceptable is not None and np.all(acceptable.met(solution.estimate)):
+    if np.all(problem.accuracy.met(solution.estimate)):
         return solution
-    raise _out_of_reach(problem, solution.estimate)
+    limits = "with as many frequencies as can be sampled in some minutes"
+    return replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits))
 
 
 class _Search:
     """Octaves that are added and refined until the accuracy is met."""
 
-    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator) -> None:
+    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator, *, pairs: bool) -> None:
         self.problem = problem
         self.core = core
         self.cutoff = cutoff
         self.rng = rng
         self.octaves: list[MeasuredOctave] = []
         self.seconds = 0.0
+        self.spectra: dict[float, PointSpectrum | None] = {}
         self.sizes = [SurfaceSize.of(surface) for surface in problem.surfaces]
         self.normals = FaceNormals.of(problem.surfaces)
-        self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
+        self.clouds = clouds_among(problem.surfaces)
+        # What the points of clouds add beyond so many octaves follows from their distances.
+        self.pairs = PointPairs.where_few(self.clouds, cutoff) if self.clouds and pairs else None
+        self.octaves_with_points = 0 if self.pairs is None else self.pairs.octaves_from(cutoff)
+        limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
+        self.limit = limit.with_points(self.pairs)
 
     @classmethod
-    def begin(cls, problem: Problem, seed: int) -> Self:
+    def begin(cls, problem: Problem, seed: int, *, pairs: bool) -> Self:
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
-        return cls(problem, Core.of(problem, lattice, lattice.xi_max), lattice.xi_max, np.random.default_rng(seed))
+        core = Core.of(problem, lattice, lattice.xi_max)
+        return cls(problem, core, lattice.xi_max, np.random.default_rng(seed), pairs=pairs)
 
     @property
     def squares(self) -> Reals:
         """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
         tail = self._tail()
-        return np.asarray(self.core.squares + tail.octaves + np.maximum(tail.beyond - tail.uncertainty, 0.0))
+        known = tail.octaves + np.maximum(tail.beyond - tail.uncertainty, 0.0)
+        # Octaves may hold negative products of a surface and points, before what the points add is known.
+        return np.asarray(self.core.squares + np.maximum(known, 0.0))
 
     @property
     def tail_changes(self) -> Reals:
         """Largest permitted error of the squares by the tail (orders,)."""
         parts = np.array([self.problem.accuracy.truncation_part(order) for order in self.problem.orders])
-        return np.asarray(2 * parts * self.squares)
+        return np.asarray(2 * parts * np.maximum(self.squares, self.problem.accuracy.floor**2))
 
     @property
     def permitted_variances(self) -> Reals:
@@ -201,14 +210,17 @@ class _Search:
         core, orders = self.core, self.problem.orders
         squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
         found = self._tail().estimate(core.squares, core.images, np.sqrt(squares))
-        samplings = tuple(octave.sampling for octave in self.octaves)
-        return Solution(found, core.lattice, core.fields, samplings)
+        values = tuple(
+            SurfaceValues(field, tuple(octave.values[number] for octave in self.octaves))
+            for number, field in enumerate(core.fields)
+        )
+        return Solution(found, core.lattice, values, has_tail=bool(self.octaves) or self._has_only_points)
 
     def refine(self) -> bool:
         """Take more samples where they are needed most; tell whether any could be taken."""
         refined = False
         accuracy = self.problem.accuracy
-        values = np.sqrt(self.squares)
+        values = accuracy.scale(np.sqrt(self.squares))
         if np.any(change_of_root(self.squares, self.core.images) > accuracy.aliasing_part * values):
             lattice = self.core.lattice
             larger = good_intervals(FINER_LATTICE * lattice.M)
@@ -234,20 +246,45 @@ class _Search:
         return refined
 
     def _knows_the_rest(self) -> bool:
-        # Where faces repeat, the energy may jump from one octave to the next.
-        if len(self.octaves) < (_FEWEST_OCTAVES_OF_FACES if self.normals else 1):
+        if len(self.octaves) < self._fewest_octaves:
             return False
+        if self._has_only_points:
+            return True
         return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
+
+    @property
+    def _fewest_octaves(self) -> int:
+        """Number of octaves that are needed before anything is known of what lies beyond."""
+        if self._has_only_points:
+            return self.octaves_with_points
+        # Where faces repeat, the energy may jump from one octave to the next.
+        return max(_FEWEST_OCTAVES_OF_FACES if self.normals else 1, self.octaves_with_points)
+
+    @property
+    def _has_only_points(self) -> bool:
+        """True for clouds without another surface: all that lies beyond some octaves is known."""
+        return self.pairs is not None and not self.limit.value
 
     def _tail(self) -> Tail:
         octaves = [octave.sampling.octave for octave in self.octaves]
         sums = [octave.sums for octave in self.octaves]
-        return Tail.of(octaves, sums, self.limit, self.problem.orders, self.core.energies)
+        limit = self.limit
+        if self.pairs is None and self.clouds and octaves:
+            limit = limit.with_points(self._spectrum(octaves[-1].highest))
+        tail = Tail.of(octaves, sums, limit, self.problem.orders, self.core.energies)
+        # Nothing is known of the octaves between the last measured one and those that pairs of points tell of.
+        has_gap = len(octaves) < self.octaves_with_points
+        return replace(tail, uncertainty=tail.uncertainty + np.inf) if has_gap else tail
+
+    def _spectrum(self, start: float) -> PointSpectrum | None:
+        if start not in self.spectra:
+            self.spectra[start] = PointSpectrum.of(self.clouds, start)
+        return self.spectra[start]
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
         self.seconds += self._seconds(sampling, known.sampling if known else None)
-        values = np.sqrt(self.squares)
+        values = problem.accuracy.scale(np.sqrt(self.squares))
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
         settings = settings_for(target)
@@ -260,12 +297,15 @@ class _Search:
             for number, surface in enumerate(problem.surfaces)
         )
         squares = squared_moduli(_difference([one.values for one in found]))
+        if self.pairs is not None and sampling.octave.index > self.octaves_with_points:
+            # What points add is known there. Two clouds have no octaves so far out.
+            for own, surface in zip(found, problem.surfaces, strict=True):
+                squares -= squared_moduli(own.values) if isinstance(surface, PointCloud) else 0.0
         return MeasuredOctave(found, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
 
     def _first_sampling(self, octave: Octave) -> OctaveSampling:
         """Return the sampling that is predicted to be the cheapest one."""
-        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
-        energy = min(_GROWTH * energy, max(self.limit.value, energy))
+        energy = self._predicted_energy(octave)
         orders = self.problem.orders
         inside = np.array([window_integral(octave, order) for order in orders])
         outside = np.array([tail_integral(octave.highest, order) for order in orders])
@@ -287,6 +327,16 @@ class _Search:
             affordable = _DRAWS_FRACTION * seconds / self._draw_seconds
             beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
         return OctaveSampling(octave, (lattice,), self._drawn(octave, beside, _UNIFORM_BESIDE_LATTICE))
+
+    def _predicted_energy(self, octave: Octave) -> float:
+        """Predict the energy of the next octave: where pairs of points tell theirs, the rest of it."""
+        if self.pairs is None:
+            energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
+            return _GROWTH * energy if self.clouds else min(_GROWTH * energy, max(self.limit.value, energy))
+        points = 4 * np.pi * octave.highest**2 * self.pairs.squares
+        if octave.index <= self.octaves_with_points:
+            return points + 2 * self.problem.area
+        return self.limit.value + 2 * float(np.sqrt(self.limit.value * points))
 
     def _finer_sampling(self, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
         """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
@@ -337,24 +387,6 @@ class _Search:
         """Return the frequency up to which all surfaces can be transformed."""
         smooth = [surface.area for surface in self.problem.surfaces if isinstance(surface, Smooth)]
         return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
-
-
-def _out_of_reach(problem: Problem, found: NormEstimate) -> AccuracyError:
-    """Return the error that says what can be reached."""
-    relative = found.errors / found.values
-    worst = int(np.argmax(relative))
-    order, rtol = problem.orders[worst], problem.accuracy.rtol
-    reachable = _REACHABLE_MARGIN * float(relative[worst])
-    reachable = rounded_up(reachable) if np.isfinite(reachable) else reachable
-    advice = f"about {reachable:g} can be reached; ask for that, or take a more negative order"
-    if reachable >= 1:
-        advice = "not even one digit can be reached; take a more negative order"
-    return AccuracyError(
-        f"{problem.label}: rtol {rtol:g} is out of reach at order {order:g} with as many frequencies as can be "
-        f"sampled in some minutes; {advice}",
-        rtol,
-        reachable,
-    )
 
 
 def _difference(values: Sequence[NDArray[np.complexfloating]]) -> NDArray[np.complexfloating]:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
+from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support
+from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
-from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
+from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.sampling import OctaveSampling
-from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.octaves.values import SampledOctave
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among, without_common_points
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -36,6 +39,8 @@ _ROUNDING = 1e-13
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 _OFF_CENTER = 1e-3
 _PAIR = 2
+# An accuracy called reachable must hold when it is asked for.
+_REACHABLE_MARGIN = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,8 @@ class Problem:
         support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
         label: Name of the norm or distance in messages.
         threads: Threads to compute with.
+        pair: Surfaces that a distance is between, with the triangles that they share; empty for a norm.
+        signs: Signs of the surfaces in the difference.
     """
 
     surfaces: Sequence[Surface]
@@ -57,6 +64,8 @@ class Problem:
     support: Support
     label: str
     threads: int = 1
+    pair: Sequence[Surface] = ()
+    signs: Sequence[int] = (1, -1)
 
     @classmethod
     def of(
@@ -64,20 +73,37 @@ class Problem:
     ) -> Self:
         """Return the problem for surfaces alone, moved together to the centre of the lattice's period.
 
-        Triangles that both surfaces have cancel, and are left out; none may remain.
+        Triangles or points that both surfaces have cancel, and are left out; none may remain.
         """
-        surfaces = _without_shared_triangles(surfaces)
-        if not surfaces:
+        pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
+        different = _without_common_parts(surfaces)
+        if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
-        surfaces = _centered(surfaces)
-        extent = Extent.union([surface.extent for surface in surfaces])
-        area = np.array(sum(surface.area for surface in surfaces))
-        return cls(surfaces, orders, accuracy, Support(area, extent.widths, extent.reach), label, threads)
+        move = centering(list(different.values()))
+        is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
+        surfaces = tuple(move.apply(surface) for surface in different.values())
+        pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
+        return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different))
+
+    def support_on(self, lattice: Lattice) -> Support:
+        """Return the support, with what points of clouds add beyond a lattice."""
+        points = PointSpectrum.of(clouds_among(self.surfaces), lattice.xi_max)
+        return self.support if points is None else replace(self.support, point_levels=points.highest)
 
     @property
     def area(self) -> float:
         """Area of the surfaces together."""
         return float(self.support.areas)
+
+    @property
+    def execution(self) -> Execution:
+        """Threads to compute with, and memory that transforms may take."""
+        return Execution(threads=self.threads, allowed_bytes=self.accuracy.allowed_bytes)
+
+    @property
+    def is_whole(self) -> bool:
+        """True if the surfaces are those that a distance is between: they share no triangles."""
+        return self.surfaces is self.pair
 
     @property
     def inexact_count(self) -> int:
@@ -103,8 +129,10 @@ class Problem:
         """Refuse an accuracy of norms or distances (orders,) that lies below the rounding of fields.
 
         Raises:
-            AccuracyError: The accuracy lies below rounding; the message gives the reachable rtol.
+            AccuracyError: The accuracy lies below rounding, and is no best effort.
         """
+        if self.accuracy.best_effort:
+            return
         parts, floor = _discretisation_parts(self.orders, self.accuracy), self.rounding
         # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
         below = (parts * values < floor) & (values > floor)
@@ -114,10 +142,26 @@ class Problem:
             reachable = 2 * rtol * floor / float(parts[worst] * values[worst])
             raise AccuracyError(
                 f"{self.label}: rtol {rtol:g} of about {values[worst]:.2g} at order {self.orders[worst]:g} is below "
-                f"the rounding of double precision; about {reachable:.1g} can be reached",
+                f"the rounding of double precision; about {reachable:.1g} can be reached; ask for that, or for a best "
+                "effort",
                 rtol,
                 reachable,
             )
+
+    def out_of_reach(self, found: NormEstimate, limits: str) -> AccuracyError:
+        """Return the error that says what can be reached instead of the accuracy.
+
+        Args:
+            found: Nearest that was reached, (orders,).
+            limits: What limits it.
+        """
+        relative = found.errors / found.values
+        worst = int(np.argmax(relative))
+        return unreachable(
+            f"{self.label}: rtol {self.accuracy.rtol:g} is out of reach at order {self.orders[worst]:g} {limits}",
+            self.accuracy.rtol,
+            _REACHABLE_MARGIN * float(relative[worst]),
+        )
 
 
 def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:
@@ -130,29 +174,49 @@ def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
     return np.array([accuracy.discretisation_part(order) for order in orders])
 
 
-def _without_shared_triangles(surfaces: Sequence[Surface]) -> Sequence[Surface]:
-    """Return one surface, or what two do not have in common: both of them, one of them, or nothing."""
-    if len(surfaces) < _PAIR or not all(isinstance(surface, Mesh) for surface in surfaces):
-        return surfaces
-    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+def support_of(surfaces: Sequence[Surface]) -> Support:
+    """Return the area of some surfaces, and the sizes of all of them together."""
+    extent = Extent.union([surface.extent for surface in surfaces])
+    return Support(np.array(sum(surface.area for surface in surfaces)), extent.widths, extent.reach)
+
+
+def are_equal(a: Surface, b: Surface) -> bool:
+    """Return whether two meshes have the same triangles, or two clouds the same points, in whatever order."""
+    if isinstance(a, Mesh) and isinstance(b, Mesh) and len(a.triangles) != len(b.triangles):
+        return False
+    return not _without_common_parts((a, b))
+
+
+def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
+    """Return one surface, or what two do not have in common, by their signs in the difference."""
+    rests: Sequence[Surface | None] = surfaces
+    match surfaces:
+        case (Mesh(), Mesh()):
+            rests = _without_shared_triangles(*surfaces)
+        case (PointCloud(), PointCloud()):
+            rests = without_common_points(*surfaces)
+    return {sign: rest for sign, rest in zip((1, -1), rests, strict=False) if rest is not None}
+
+
+def _without_shared_triangles(*meshes: Mesh) -> Sequence[Mesh | None]:
+    """Return two meshes without the triangles that both have; None for one of which nothing remains."""
     shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
     if not shared[0].any():
-        return surfaces
+        return meshes
     rests = [
         Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
         for mesh, in_both in zip(meshes, shared, strict=True)
     ]
-    return [mesh for mesh in rests if len(mesh.triangles) and mesh.area > 0]
+    return [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in rests]
 
 
-def _centered(surfaces: Sequence[Surface]) -> Sequence[Surface]:
-    """Return the surfaces moved together to the centre of a lattice's period, which changes no distance."""
+def centering(surfaces: Sequence[Surface]) -> Similarity:
+    """Return the move of surfaces together to the centre of a lattice's period, which changes no distance."""
     lowest, highest = Extent.union([surface.extent for surface in surfaces]).box
     if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
-        return surfaces
+        return Similarity()
     x, y, z = ((lowest + highest) / 2).tolist()
-    move = Similarity(1.0, (x, y, z))
-    return [move.apply(surface) for surface in surfaces]
+    return Similarity(1.0, (x, y, z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +226,16 @@ class Solution:
     Attributes:
         estimate: Numbers with their errors, each (orders,).
         lattice: Lattice of the fields; None where nothing had to be computed.
-        fields: Fields of the surfaces.
-        octaves: Octaves that were measured beyond the lattice, as they were sampled.
+        values: Values of each surface on the lattice and in octaves beyond it.
+        shortfall: Why the numbers miss the accuracy; None if they do not.
+        has_tail: True where all that lies beyond the lattice was measured or is known, and the lattice ends in a step.
     """
 
     estimate: NormEstimate
     lattice: Lattice | None = None
-    fields: tuple[Field, ...] = ()
-    octaves: tuple[OctaveSampling, ...] = ()
+    values: tuple[SurfaceValues, ...] = ()
+    shortfall: AccuracyError | None = None
+    has_tail: bool = False
 
     @classmethod
     def zero(cls, orders: Sequence[float]) -> Self:
@@ -177,18 +243,24 @@ class Solution:
         return cls(NormEstimate(*np.zeros((5, len(orders)))))
 
     @property
+    def octaves(self) -> tuple[SampledOctave, ...]:
+        """Octaves that were measured beyond the lattice."""
+        return tuple(one.octave for one in self.values[0].octaves) if self.values else ()
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Settings that the numbers were computed with, as attributes."""
         if self.lattice is None:
             return {}
-        settings = [field.settings for field in self.fields]
+        fields = [one.field for one in self.values]
+        settings = [field.settings for field in fields]
         return {
             "xi_max": self.lattice.xi_max,
             "M": self.lattice.M,
             "octaves": len(self.octaves),
-            "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
+            "highest_frequency": max([self.lattice.xi_max, *(one.sampling.octave.highest for one in self.octaves)]),
             "dtype": settings[0].dtype,
             "eps": [setting.eps for setting in settings],
             "tolerance": [setting.tolerance for setting in settings],
-            "points": [field.points for field in self.fields],
+            "points": [field.points for field in fields],
         }

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +15,12 @@ from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, lar
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
-from sobolev_batch.spectral.errors.budget import Sums, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.samples import Sample, estimate
-from sobolev_batch.spectral.fields import field_for
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.samples import Sample, estimate, exact_transform_of
+from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
@@ -28,10 +32,14 @@ Reals = NDArray[np.float64]
 _ROUNDS = 4
 # From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.
 _OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
+# What a best effort aims at where more is out of reach.
+_COARSER = (1e-1, 1e-2, 1e-3, _OCTAVES_AT_ALL)
 # Below this order what lies beyond a lattice is next to nothing.
 _LOW_ORDER = -3.5
 # The error of a pair is divided evenly between its two fields.
 _PAIR = 2
+# Where surfaces that agree on a lattice are compared again, in frequencies of the lattice.
+_BEYOND = (4.0, 16.0, 64.0, 256.0)
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -95,22 +103,74 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
         seed: Seed of the random frequencies of octaves.
 
     Returns:
-        The solution of the first of a few rounds that meets the accuracy, or of the last.
+        The first solution that meets the accuracy; for a best effort else the nearest one.
 
     Raises:
-        AccuracyError: The accuracy lies below the rounding of fields, or is out of reach.
+        AccuracyError: The accuracy lies below the rounding of fields, or is out of reach, and is no best effort.
     """
     if not problem.surfaces:
         return Solution.zero(problem.orders)
-    step = _first_step(problem)
-    if prefers_octaves(problem) and not _near_duplicates(problem, step.lattice).any():
-        return solve_in_octaves(problem, seed)
-    try:
-        return _solve_on_lattices(problem, step)
-    except AccuracyError:
-        if not permits_octaves(problem.accuracy):
-            raise
-    return solve_in_octaves(problem, seed)
+    strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))
+    step = _first_step(strict)
+    attempts = [partial(_solve_on_lattices, strict, step)]
+    seem_equal = bool(_near_duplicates(problem, step.lattice).any())
+    if seem_equal and _differ_beyond(problem, step.lattice):
+        # No lattice would show it.
+        attempts = [partial(solve_in_octaves, strict, seed)]
+    elif permits_octaves(problem.accuracy):
+        octaves_first = prefers_octaves(problem) and not seem_equal
+        attempts.insert(0 if octaves_first else 1, partial(solve_in_octaves, strict, seed))
+    nearest, refusals = [], []
+    for attempt in attempts:
+        try:
+            solution = attempt()
+        except AccuracyError as refusal:
+            refusals.append(refusal)
+            continue
+        if solution.shortfall is None:
+            return solution
+        nearest.append(solution)
+        refusals.append(solution.shortfall)
+    if not problem.accuracy.best_effort:
+        raise min(refusals, key=attrgetter("reachable"))
+    nearest = nearest or [_solve_on_lattices(problem, step)]
+    if min(map(_largest_share, nearest)) > _OCTAVES_AT_ALL:
+        nearest += _in_coarser_octaves(strict, seed)
+    return min(nearest, key=_largest_share)
+
+
+def _largest_share(solution: Solution) -> float:
+    """Return the largest error of a solution, relative to its number."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.nan_to_num(solution.estimate.errors / solution.estimate.values, nan=np.inf).max())
+
+
+def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
+    """Return what octaves reach that aim at less than a problem asks for.
+
+    With the same number of samples they come nearer than octaves that aim too high: these stop far below the
+    frequencies that matter.
+    """
+    found = []
+    for rtol in coarser_than(problem.accuracy.rtol):
+        try:
+            solution = solve_in_octaves(replace(problem, accuracy=replace(problem.accuracy, rtol=rtol)), seed)
+        except AccuracyError:
+            break
+        limits = "with as many frequencies as can be sampled in some minutes"
+        found.append(replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits)))
+        if solution.shortfall is not None:
+            break
+    return found
+
+
+def coarser_than(rtol: float) -> list[float]:
+    """Return what a best effort may aim at in place of an rtol, from the easiest on.
+
+    >>> coarser_than(5e-3)
+    [0.1, 0.01]
+    """
+    return [coarser for coarser in _COARSER if coarser > rtol]
 
 
 def prefers_octaves(problem: Problem) -> bool:
@@ -137,7 +197,23 @@ def _near_duplicates(problem: Problem, lattice: Lattice) -> NDArray[np.bool_]:
     return is_small & (estimate(samples, problem.orders) <= problem.rounding)
 
 
+def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
+    """Tell whether surfaces that agree on a lattice differ at higher frequencies, as two shifts of a fine grid do."""
+    draws = problem.samples(lattice)[0].draws
+    frequencies = np.concatenate([factor * draws.frequencies for factor in _BEYOND])
+    first, *others = (exact_transform_of(surface, frequencies) for surface in problem.surfaces)
+    difference = np.abs(first - others[0]) if others else np.abs(first)
+    # Rounding of coordinates turns the phases at high frequencies.
+    phases = 2 * np.pi * problem.support.reach * np.linalg.norm(frequencies, axis=1)
+    return bool(np.any(difference > problem.rounding * (1 + phases)))
+
+
 def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
+    """Return the first solution that meets the accuracy, else the last of a few rounds or of the largest lattice.
+
+    Raises:
+        AccuracyError: The accuracy is out of reach, and no best effort.
+    """
     values: Reals | None = None
     # Their fields may differ by a little more.
     equal = _near_duplicates(problem, step.lattice)
@@ -151,10 +227,14 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
         solution, sums = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
         values = solution.estimate.values
         has_no_digit = equal | (values <= problem.rounding)
-        if not rounds_left or np.all(problem.accuracy.met(solution.estimate) | has_no_digit):
+        is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
+        if is_met or not rounds_left:
             break
-        step = _next_step(problem, step, sums)
-    return _not_below_rounding(problem, solution)
+        step, before = _next_step(problem, step, sums), step
+        if step == before and problem.accuracy.best_effort:
+            break
+    shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
+    return _not_below_rounding(problem, replace(solution, shortfall=shortfall))
 
 
 def _not_below_rounding(problem: Problem, solution: Solution) -> Solution:
@@ -193,9 +273,9 @@ def _next_step(problem: Problem, step: _Step, sums: Sums) -> _Step:
     """Return the step on the lattice that the sums of a step call for, or on a larger pilot's."""
     weights = SobolevWeights(step.lattice, problem.orders)
     try:
-        lattice = refined(sums, weights, problem.support, problem.accuracy, problem.label)
+        lattice = refined(sums, weights, problem.support_on(step.lattice), problem.accuracy, problem.label)
     except AccuracyError:
-        larger = larger_pilot(step.lattice, problem.accuracy) if step.is_pilot else None
+        larger = larger_pilot(step.lattice, problem.accuracy)
         if larger is None:
             raise
         return _Step(larger, is_pilot=True)
@@ -211,12 +291,17 @@ def _compute(
         field_for(surface, lattice, target, settings, execution, sample=sample)
         for surface, sample in zip(problem.surfaces, samples, strict=True)
     )
+    found, sums = difference_on(problem, lattice, fields)
+    return Solution(found, lattice, tuple(map(SurfaceValues, fields))), sums
+
+
+def difference_on(problem: Problem, lattice: Lattice, fields: Sequence[Field]) -> tuple[NormEstimate, Sums]:
+    """Return the norm of the only field, or of the difference of two, and the sums that it follows from."""
     weights = SobolevWeights(lattice, problem.orders)
     difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
-    found = estimate_norms(sums, weights, problem.support, errors)
-    return Solution(found, lattice, fields), sums
+    return estimate_norms(sums, weights, problem.support_on(lattice), errors), sums
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:

@@ -22,8 +22,9 @@ from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, rule_ranges, typical_errors
 from sobolev_batch.spectral.transform.settings import COARSEST_EPS, FINEST_EPS, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ def choose_settings(
     """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
 
     Args:
-        surface: Surface of the field, a mesh or a parametrised one.
+        surface: Surface of the field, a mesh, a parametrised one or a point cloud.
         lattice: FrequencyLattice of the field.
         target: Largest permitted error.
         settings: Settings whose dtype and quadrature are kept.
@@ -85,7 +86,8 @@ def choose_settings(
         InputError: Fields of this kind of surface have no such settings.
     """
     raise InputError(
-        f"settings follow from an accuracy for meshes and parametrised surfaces, found {type(surface).__name__}"
+        "settings follow from an accuracy for meshes, parametrised surfaces and point clouds, found "
+        f"{type(surface).__name__}"
     )
 
 
@@ -107,8 +109,17 @@ def _(
     return replace(settings, eps=eps, tolerance=float(np.min(rest / (surface.area * np.sqrt(masses)))))
 
 
+@choose_settings.register
+def _(
+    surface: PointCloud, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+) -> TransformSettings:
+    # As many points of equal weights have this sum of squares.
+    points = surface.area**2 / float(surface.weights @ surface.weights)
+    return replace(settings, eps=_nufft_eps(surface.area, points, lattice, target, settings))
+
+
 def _nufft_eps(
-    area: float, points: int, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+    area: float, points: float, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> float:
     """Return the largest eps with which the NUFFT of so many points keeps to its fraction of a target."""
     masses = _weight_masses(lattice, target.orders)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import exprel, gammaln, kve
 
+from sobolev_batch.spectral.errors.point_spectrum import octave_masses
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 
@@ -73,11 +74,14 @@ class Support:
         areas: Area of the surface, or of both together, (...).
         widths: Widths of all surfaces together along `DIRECTIONS`, (13,).
         reach: Largest |coordinate| of them; lattices are chosen by it.
+        point_levels: Largest mean |field|² by points of clouds, in octaves from ``xi_max`` on and beyond them,
+            (octaves + 1, ...); see `PointSpectrum`. None without clouds.
     """
 
     areas: Reals
     widths: Reals
     reach: float = 0.0
+    point_levels: Reals | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,10 @@ class NormEstimate:
         """Total error: the true value differs from the reported one by no more."""
         return self.truncation + self.aliasing + self.discretisation + self.statistical
 
+    def relative_to(self, norms: NormEstimate) -> tuple[Reals, Reals]:
+        """Return the values over some norms, and bounds on the errors; see `quotients`."""
+        return quotients((self.values, self.errors), (norms.values, norms.errors))
+
     def named(self, name: str) -> dict[str, Reals]:
         """Return the values under a name, the error and its parts under theirs."""
         return {
@@ -117,6 +125,18 @@ class NormEstimate:
             "discretisation": self.discretisation,
             "statistical": np.broadcast_to(self.statistical, np.shape(self.values)),
         }
+
+
+def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:
+    """Return values over norms, and bounds on the errors, from both with their errors.
+
+    The bound is NaN where a norm is not larger than its error.
+    """
+    (value, error), (norm, norm_error) = values, norms
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = value / norm
+        errors = (error + relative * norm_error) / (norm - norm_error)
+    return relative, np.where(norm_error < norm, errors, np.nan)
 
 
 def add_sums(sums: Sequence[Sums]) -> Sums:
@@ -175,6 +195,7 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
     The energy on |ξ| = r grows like r^p until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated
     surfaces. Between two surfaces closer than the wavelength, p is 2. The energy oscillates with the
     inverse width of the surfaces; if ξ_max covers few of these periods, the outer ranges may lie in a trough.
+    What the points of clouds add does not end there, but follows from their distances.
     """
     lattice = weights.lattice
     inner, outer = sums.outer
@@ -198,9 +219,15 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
         growth = outer * (middles[1] * lattice.xi_max) ** -power * start**exponent * np.log(saturated / start)
         growing = growth * exprel(exponent * np.log(saturated / start))
         flat = ceiling * saturated ** (order + 0.5) / (-order - 0.5)
-        tails.append(np.where(outer > 0, (growing + flat) / (2 * ratio), 0.0))
+        # Of lattices that reach next to nothing the tail is unknown.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tails.append(np.where(outer > 0, (growing + flat) / (2 * ratio), 0.0))
     periods = float(support.widths.max()) * lattice.xi_max
-    return TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails)
+    bounds: Reals = TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails)
+    if support.point_levels is None:
+        return bounds
+    count, above = len(support.point_levels), max(highest or 0.0, lattice.xi_max)
+    return bounds + np.tensordot(octave_masses(lattice.xi_max, count, weights.orders, above), support.point_levels, 1)
 
 
 def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:

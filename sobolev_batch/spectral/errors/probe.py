@@ -22,7 +22,7 @@ from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# Draws of a small mesh, of a huge one, and pairs of a triangle and a frequency in between.
+# Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 # Standard errors by which the mean of few draws, some of which may carry it, is raised. Of 720 errors of NUFFTs of
 # smooth surfaces, five exceeded the mean by six of them, two by eight.
@@ -100,9 +100,9 @@ def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Re
     return norms_of_draws(weights * squares)
 
 
-def draw_count(triangles: int) -> int:
-    """Return the number of frequencies to probe a mesh at: fewer where each costs more."""
-    return int(np.clip(_PAIRS // triangles, _FEWEST_DRAWS, _MOST_DRAWS))
+def draw_count(terms: int) -> int:
+    """Return the number of frequencies to probe so many triangles or points at: fewer where each costs more."""
+    return int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
 
 
 def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, seed: int) -> Draws:

@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.probe import Draws, Probe, draw, draw_count, join, measure, uniform_probe
+from sobolev_batch.spectral.exact.points import point_transform
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolution_of
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -53,6 +55,18 @@ def _(surface: Smooth, frequencies: Reals) -> NDArray[np.complex128]:
     return exact_values(surface, frequencies)
 
 
+@exact_transform_of.register
+def _(surface: PointCloud, frequencies: Reals) -> NDArray[np.complex128]:
+    return point_transform(surface.points, surface.weights, frequencies)
+
+
+def term_count(surface: Surface) -> int:
+    """Return the number of triangles or points that an exact transform adds up; 1 for other surfaces."""
+    if isinstance(surface, PointCloud):
+        return len(surface.points)
+    return len(surface.triangles) if isinstance(surface, Mesh) else 1
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Exact transform of a surface at drawn frequencies.
@@ -80,9 +94,9 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
         orders: Orders s.
         degree: Lowest degree of the triangle rules in use.
     """
-    triangles = max(len(surface.triangles) if isinstance(surface, Mesh) else 1 for surface in surfaces)
+    terms = max(map(term_count, surfaces))
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
-    return draw(lattice, orders, degree, draw_count(triangles), seed)
+    return draw(lattice, orders, degree, draw_count(terms), seed)
 
 
 def probe_block(

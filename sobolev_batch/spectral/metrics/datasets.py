@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.errors.reference import ReferenceEstimate
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.shells import Orders, Reals
 
@@ -22,7 +24,8 @@ def described(long_name: str, units: str = "", **others: str) -> dict[str, str]:
     return {"long_name": long_name, **({"units": units} if units else {}), **others}
 
 
-# Attributes of variables by name, in the results of functions and in stores.
+# Attributes of variables by name, in the results of functions and in stores. The tables of a store have no others, so
+# that the metadata of meshes may have any other name.
 VARIABLES: Mapping[str, Mapping[str, str]] = {
     "mesh": described("label of the mesh"),
     "other": described("label of the other mesh"),
@@ -47,6 +50,13 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "area_part": described("distance explained by a change of total area alone", NORM),
     "shape_part": described("rest of the distance", NORM, description="the squares of both parts add up"),
     "area_share": described("share of the squared distance explained by a change of total area", NUMBER),
+    "area_share_error": described("bound on the error of that share", NUMBER),
+    "moved": described("move of the reference that is like the distance", NUMBER, description="over its radius"),
+    "moved_error": described("error of the move", NUMBER),
+    "noise": described("noise of the reference that is like the distance", NUMBER, description="over its radius"),
+    "noise_error": described("error of the noise", NUMBER),
+    "decimated": described("triangles of the reference, decimated, that is like the distance", NUMBER),
+    "decimated_error": described("error of the number of triangles", NUMBER),
     "excess": described("relative excess of area over the reference", NUMBER),
     "rate": described("observed order of convergence in the edge length", NUMBER),
     "rate_error": described("bound on the error of the rate", NUMBER),
@@ -56,6 +66,26 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "edge_length_mean": described("mean edge length", LENGTH),
     "edge_length_max": described("largest edge length", LENGTH),
     "area": described("area", AREA),
+    "family": described("family of the mesh"),
+    "name": described("name of the mesh in its family"),
+    "level": described("refinement level; -1 without levels", NUMBER),
+    "rank": described("place in the family, from coarse to fine where it has such an order", NUMBER),
+    "ordered_by": described("what orders the family: level, triangles, names or time"),
+    "row": described("number of the mesh in /fourier", NUMBER),
+    "status": described("complete, failed or missing"),
+    "reason": described("reason of a failure"),
+    "vertices": described("number of vertices", NUMBER),
+    "triangles": described("number of triangles", NUMBER),
+    "boundary_edges": described("number of edges of one triangle", NUMBER),
+    "nonmanifold_edges": described("number of edges of more than two triangles", NUMBER),
+    "duplicate_triangles": described("number of triangles that are there already", NUMBER),
+    "zero_area_triangles": described("number of triangles without area", NUMBER),
+    "digest": described("SHA-256 of vertices and triangles"),
+    "key": described("SHA-256 of all that the field depends on"),
+    "points": described("number of quadrature points", NUMBER),
+    "worker": described("address of the worker"),
+    "backend": described("backend of the NUFFT"),
+    "finished": described("time of the end, in UTC"),
     "seconds": described("time spent in tasks", "s"),
     "hausdorff": described("Hausdorff distance, a lower bound", LENGTH),
     "chamfer": described("Chamfer distance", LENGTH),
@@ -87,6 +117,25 @@ def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str
     axis = order_axis(order)
     variables = {name: (axis[0], np.asarray(value).reshape(axis[1].shape)) for name, value in values.items()}
     return describe(xr.Dataset(variables, coords={"order": axis}, attrs={"kernel": KERNEL, **attributes}))
+
+
+def labelled_distances(
+    order: Orders,
+    distances: NormEstimate,
+    reference: ReferenceEstimate,
+    attributes: Mapping[str, object] | None = None,
+) -> xr.Dataset:
+    """Return distances and what they are relative to the reference, in the form of `labelled`."""
+    relative, relative_errors = distances.relative_to(reference.norms)
+    shares, share_errors = reference.area_shares(distances)
+    columns = {
+        "relative": relative,
+        "relative_error": relative_errors,
+        "area_share": shares,
+        "area_share_error": share_errors,
+        "excess": reference.excesses,
+    }
+    return labelled(order, {**distances.named("distance"), **columns}, attributes or {})
 
 
 def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import xarray as xr
 
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import labelled, lattice_attributes
-from sobolev_batch.spectral.metrics.inputs import Operand, pair_of, read_blocks
-from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.spectral.metrics.inputs import OperandLike, pair_of, shells_against
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Proportion:
             excess = product / norm**2
         # Rounding may make the projection longer than what it projects.
         area = np.minimum(area, np.sqrt(square))
-        return cls(area, np.sqrt(square - area**2), excess)
+        return cls(area, np.sqrt(np.maximum(square - area**2, 0.0)), excess)
 
 
-def proportion(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
+def proportion(a: OperandLike, b: OperandLike, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
     """Return the distance ||a - b||_s split into a pure change of total area and the rest.
 
     Of all multiples of b, c b with c = <a, b>_s/<b, b>_s is nearest to a. Then a - b = (c - 1) b + (a - c b),
@@ -91,12 +91,7 @@ def proportion(a: Operand, b: Operand, order: Orders, *, lattice: Lattice | None
     orders = check_orders(order)
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.of(first), orders)
-    squares, products, reference = np.zeros((3, weights.lattice.shell_count))
-    for block, (values, others) in read_blocks(weights.lattice, first, second):
-        difference = values - others
-        squares += shell_sums(difference, None, weights.lattice, block)
-        products += shell_sums(difference, others, weights.lattice, block)
-        reference += shell_sums(others, None, weights.lattice, block)
+    squares, products, reference = shells_against(first, second, weights.lattice)
     area, shape, excess = Proportion.of_shells(squares, products, reference, weights)
     distance = np.sqrt(weights.per_shell @ squares)
     with np.errstate(invalid="ignore"):

@@ -10,22 +10,36 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import exact_transform_of
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.shells import Complexes, Reals, shell_sums
+from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, require_finite_norm
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Operand = Surface | xr.DataArray
+# What people pass as an operand: see `as_mesh`.
+OperandLike = SurfaceLike | xr.DataArray
 
 # Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
 BLOCK_SAMPLES = 1 << 22
 
 
-def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
+def as_operand(a: OperandLike, orders: Sequence[float] = ()) -> Operand:
+    """Return a field as it is, and anything else as a surface.
+
+    Raises:
+        OrderError: See `as_surface`.
+        InputError: It is neither; or see `as_mesh`.
+    """
+    return a if isinstance(a, xr.DataArray) else as_surface(a, orders)
+
+
+def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
     """Return a field as it is, or transform a surface on a lattice.
 
     Raises:
+        OrderError: The norm of a point cloud is infinite for one of the orders.
         LatticeError: The field has other dimensions, or the surface does not fit into the lattice.
         InputError: The argument is neither a field nor a surface, a field is not complex, or a surface comes without a
             lattice.
@@ -37,14 +51,17 @@ def field_of(a: Operand, lattice: Lattice | None, orders: Sequence[float]) -> xr
             raise LatticeError(
                 f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
             )
+        quality = quality_of(a)
+        if quality is not None and quality.points is not None:
+            require_finite_norm(orders)
         return a
-    check_surface(a)
+    surface = as_surface(a, orders)
     if lattice is None:
         raise InputError(
-            f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
+            f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
             "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
         )
-    return fourier_transform(a, lattice, order=orders)
+    return fourier_transform(surface, lattice, order=orders)
 
 
 def field_values(field: xr.DataArray) -> Complexes:
@@ -60,7 +77,7 @@ def field_values(field: xr.DataArray) -> Complexes:
 
 
 def pair_of(
-    a: Operand, b: Operand, lattice: Lattice | None, orders: Sequence[float]
+    a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Return both as fields on one lattice; a surface beside a field is transformed on the field's lattice.
 
@@ -72,7 +89,7 @@ def pair_of(
     return field_of(a, common, orders), field_of(b, common, orders)
 
 
-def common_lattice(operands: Sequence[Operand], lattice: Lattice | None) -> Lattice | None:
+def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> Lattice | None:
     """Return the lattice of the fields among some operands, or the given one; None if there is neither.
 
     Raises:
@@ -102,17 +119,15 @@ def point_array(values: ArrayLike, name: str) -> Reals:
     return points
 
 
-def check_surface(a: object) -> None:
-    """Refuse anything but a surface.
+def refuse_points(target: Operand) -> None:
+    """Refuse a point cloud as the target of a fit.
 
     Raises:
-        InputError: The argument is no surface of a known kind.
+        InputError: It is a point cloud, or its field.
     """
-    if exact_transform_of.dispatch(type(a)) is exact_transform_of.dispatch(object):
-        raise InputError(
-            "expected a Mesh, a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a Fourier "
-            f"field, found {type(a).__name__}"
-        )
+    quality = quality_of(target) if isinstance(target, xr.DataArray) else None
+    if isinstance(target, PointCloud) or (quality is not None and quality.points is not None):
+        raise InputError("meshes are fitted to surfaces and not to points; take a mesh of the points as the target")
 
 
 def quality_of(field: xr.DataArray) -> Quality | None:
@@ -128,6 +143,19 @@ def read_blocks(
     for block in lattice.split(largest):
         places = dict(zip(AXES, lattice.place(block), strict=True))
         yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
+
+
+def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> Reals:
+    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, lattice.shell_count)."""
+    sums = np.zeros((3, lattice.shell_count))
+    for block, (values, others) in read_blocks(lattice, a, b):
+        difference = values - others
+        sums += [
+            shell_sums(difference, None, lattice, block),
+            shell_sums(difference, others, lattice, block),
+            shell_sums(others, None, lattice, block),
+        ]
+    return sums
 
 
 def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:

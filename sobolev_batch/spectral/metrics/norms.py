@@ -10,29 +10,36 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.parameters import byte_count
-from sobolev_batch.spectral.adaptive.problem import Problem
+from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
+from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.backends.machine import available
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
+from sobolev_batch.spectral.errors.reference import ReferenceEstimate
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import LENGTH, VARIABLES, labelled, lattice_attributes
+from sobolev_batch.spectral.metrics.datasets import LENGTH, VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
-    Operand,
-    check_surface,
+    OperandLike,
+    as_operand,
     field_of,
     pair_of,
     quality_of,
     read_blocks,
+    shells_against,
     shells_of,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.surfaces.formats.objects import as_surface
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 
@@ -44,23 +51,25 @@ _CLOSED_FORM_ACCURACY = 1e-13
 
 
 def norm(
-    a: Operand,
+    a: OperandLike,
     order: Orders,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
     memory: float | str | None = None,
+    best_effort: bool = False,
     seed: int = 0,
 ) -> xr.Dataset:
     """Return the Sobolev norm ||a||_s of a surface's area measure, with its error.
 
     Args:
-        a: Field from `fourier_transform` or a store, or a surface. The norm of a sphere without a lattice
-            is a closed form.
-        order: One order s < -1/2, or several.
+        a: Field from `fourier_transform` or a store, or a surface; a mesh in any form that `as_mesh` takes. The norm
+            of a sphere without a lattice is a closed form.
+        order: One order s < -1/2, or several; s < -3/2 for point clouds.
         lattice: Lattice to transform a surface on. A field brings its own.
         rtol: Largest relative error, in place of a lattice; see `distance`.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
+        best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
             A whole number from 0 on.
 
@@ -69,12 +78,13 @@ def norm(
         (frequencies beyond the highest one; without octaves it can only add to the norm), `aliasing`,
         `discretisation` and `statistical` (zero without octaves). All are float64, in the square root of a unit
         length. The error is NaN for fields without the attribute `quality`. A single order has no dimension.
-        Attributes hold the lattice and the kernel.
+        Attributes hold the lattice and the kernel. With rtol, `within` is True where the error is below rtol times
+        the norm.
 
     Raises:
-        OrderError: An order is not below -1/2.
+        OrderError: An order is not below -1/2, or for point clouds -3/2.
         InputError: A surface comes without a lattice or an rtol, or with both.
-        AccuracyError: The rtol is out of reach within the memory.
+        AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
     >>> from sobolev_batch import Lattice, Sphere, icosphere, norm
     >>> f"{norm(Sphere(), -2.0)['norm'].item():.6f}"
@@ -85,19 +95,21 @@ def norm(
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _to_accuracy("norm", (a,), order, lattice, _accuracy(rtol, memory), seed)
-    _refuse_memory(memory)
+        accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
+        return to_accuracy("norm", (a,), order, lattice, accuracy, seed)[0]
+    _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if isinstance(a, Sphere) and lattice is None:
         values = np.array([sphere_norm(a, s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.of(field), orders)
-    return _from_fields("norm", order, weights, shells_of(field, None, weights.lattice), [field])
+    estimate = _estimate(weights, shells_of(field, None, weights.lattice), [field])
+    return _dataset("norm", order, estimate, lattice_attributes(weights.lattice, field))
 
 
 def inner_product(
-    a: Operand,
-    b: Operand,
+    a: OperandLike,
+    b: OperandLike,
     order: Orders,
     *,
     lattice: Lattice | None = None,
@@ -108,9 +120,9 @@ def inner_product(
     """Return the Sobolev inner product <a, b>_s of two surfaces' area measures, which is real.
 
     Args:
-        a: Field, or a surface. The inner product of two spheres without a lattice is a closed form.
+        a: Field, or a surface; see `norm`. The inner product of two spheres without a lattice is a closed form.
         b: Field on the same lattice, or a surface.
-        order: One order s < -1/2, or several.
+        order: One order s < -1/2, or several; s < -3/2 for point clouds.
         lattice: Lattice to transform surfaces on. A field brings its own.
         rtol: Largest error relative to ||a||_s ||b||_s, in place of a lattice; the inner product itself may be zero.
         memory: Memory that a transform may take with rtol; see `distance`.
@@ -121,7 +133,7 @@ def inner_product(
         dimension. Attributes hold the lattice and the kernel. With rtol there is also the `error`, in units of length.
 
     Raises:
-        OrderError: An order is not below -1/2.
+        OrderError: An order is not below -1/2, or for point clouds -3/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
         InputError: A surface comes without a lattice or an rtol, or with both.
         AccuracyError: The rtol is out of reach.
@@ -132,8 +144,11 @@ def inner_product(
     """
     orders = check_orders(order)
     if rtol is not None:
-        return _inner_product_to_accuracy((a, b), order, lattice, _accuracy(rtol, memory), seed)
-    _refuse_memory(memory)
+        accuracy = accuracy_of(rtol, memory)
+        # Converted once, as three numbers are computed of them.
+        operands = as_operand(a, orders), as_operand(b, orders)
+        return _inner_product_to_accuracy(operands, order, lattice, accuracy, seed)
+    _refuse_settings_of_rtol(memory)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         products = np.array([sphere_inner_product(a, b, s) for s in orders])
         return labelled(order, {"inner_product": products}, {})
@@ -147,94 +162,138 @@ def inner_product(
 
 
 def distance(
-    a: Operand,
-    b: Operand,
+    a: OperandLike,
+    b: OperandLike,
     order: Orders,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
     memory: float | str | None = None,
+    best_effort: bool = False,
     seed: int = 0,
 ) -> xr.Dataset:
     """Return the Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
     Args:
-        a: Field, or a surface. The distance of two spheres without a lattice is a closed form.
+        a: Field, or a surface; see `norm`. The distance of two spheres without a lattice is a closed form.
         b: Field on the same lattice, or a surface.
-        order: One order s < -1/2, or several.
+        order: One order s < -1/2, or several; s < -3/2 for point clouds.
         lattice: Lattice to transform surfaces on. A field brings its own.
         rtol: Largest error of the distance relative to it, in place of a lattice. Lattice, triangle rules,
             eps and dtype are then chosen, and chosen again where the error of the result is too large. The
             attributes of the dataset hold the last choice.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
+        best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
             A whole number from 0 on.
 
     Returns:
-        Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. With
-        rtol, `within` is True where the error is below rtol times the distance.
+        Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. `relative` is the
+        distance over the norm of b, `relative_error` its error, `area_share` the share of the squared distance that a
+        change of total area explains (see `proportion`), `area_share_error` its error, and `excess` the relative
+        change of area that does so. All are float64, NaN where they are unknown. With rtol, `within` is True where the
+        error is below rtol times the distance.
 
     Raises:
-        OrderError: An order is not below -1/2.
+        OrderError: An order is not below -1/2, or for point clouds -3/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
         InputError: A surface comes without a lattice, or an rtol with a lattice or a field.
-        AccuracyError: The rtol is out of reach within the memory; the message gives the reachable one.
+        AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
     >>> from sobolev_batch import Sphere, distance, icosphere
     >>> f"{distance(Sphere(), Sphere(0.9), -2.0)['distance'].item():.6f}"
     '2.205136'
     >>> near = distance(icosphere(2), Sphere(), -5.0, rtol=1e-2)
-    >>> f"{near['distance'].item():.2f}", near["within"].item()
-    ('0.09', True)
+    >>> f"{near['relative'].item():.1%}", f"{near['area_share'].item():.0%}", near["within"].item()
+    ('2.8%', '8%', True)
     """
     orders = check_orders(order)
+    a, b = as_operand(a, orders), as_operand(b, orders)
     if rtol is not None:
-        return _to_accuracy("distance", (a, b), order, lattice, _accuracy(rtol, memory), seed)
-    _refuse_memory(memory)
+        accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
+        return to_accuracy("distance", (a, b), order, lattice, accuracy, seed)[0]
+    _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
         values = np.array([sphere_distance(a, b, s) for s in orders])
-        squares = np.array([sphere_norm(a, s) ** 2 + sphere_norm(b, s) ** 2 for s in orders])
-        return _dataset("distance", order, _closed_form(values, squares))
+        norms = np.array([sphere_norm(b, s) for s in orders])
+        squares = np.array([sphere_norm(a, s) ** 2 for s in orders]) + norms**2
+        products = np.array([sphere_inner_product(a, b, s) for s in orders]) - norms**2
+        reference = ReferenceEstimate(_closed_form(norms, norms**2), products, _CLOSED_FORM_ACCURACY * squares)
+        return labelled_distances(order, _closed_form(values, squares), reference)
+    has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
+    if lattice is not None and not has_fields and are_equal(a, b):
+        settings = {"xi_max": lattice.xi_max, "M": lattice.M}
+        return labelled_distances(
+            order, Solution.zero(orders).estimate, ReferenceEstimate.of_equal(len(orders)), settings
+        )
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.of(first), orders)
-    return _from_fields("distance", order, weights, shells_of(first, second, weights.lattice), [first, second])
+    squares, products, own = shells_against(first, second, weights.lattice)
+    distances, of_second = _estimate(weights, squares, [first, second]), _estimate(weights, own, [second])
+    reference = ReferenceEstimate.on_lattice(
+        sums_of_shells(products, weights), distances, of_second, weights, _widths([first, second])
+    )
+    return labelled_distances(order, distances, reference, lattice_attributes(weights.lattice, first, second))
 
 
-def _accuracy(rtol: float, memory: float | str | None) -> Accuracy:
-    return Accuracy(rtol) if memory is None else Accuracy(rtol, byte_count(memory))
+def accuracy_of(rtol: float, memory: float | str | None, *, best_effort: bool = False) -> Accuracy:
+    """Return the accuracy that parameters of the public functions ask for."""
+    accuracy = Accuracy(rtol, best_effort=best_effort)
+    return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
 
 
-def _refuse_memory(memory: float | str | None) -> None:
+def check_seed(seed: object) -> None:
+    """Refuse anything but a whole number from 0 on.
+
+    Raises:
+        InputError: It is none.
+    """
+    if not is_whole_number(seed) or seed < 0:
+        raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
+
+
+def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool = False) -> None:
     if memory is not None:
         raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
+    if best_effort:
+        raise InputError("a best effort is made for an rtol; pass an rtol with it, or leave best_effort out")
 
 
-def _to_accuracy(
-    name: str, operands: Sequence[Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
-) -> xr.Dataset:
-    """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen."""
-    surfaces = [operand for operand in operands if not isinstance(operand, xr.DataArray)]
+def to_accuracy(
+    name: str, operands: Sequence[OperandLike], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
+) -> tuple[xr.Dataset, Reference | None]:
+    """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen.
+
+    Returns:
+        The dataset, and the reference of a distance between surfaces that are not equal.
+    """
+    orders = check_orders(order)
+    surfaces = [as_surface(operand, orders) for operand in operands if not isinstance(operand, xr.DataArray)]
     if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
-    for surface in surfaces:
-        check_surface(surface)
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
-    solution = solve(Problem.of(surfaces, check_orders(order), accuracy, f"the {name}", os.cpu_count() or 1), seed)
+    check_seed(seed)
+    problem = Problem.of(surfaces, orders, accuracy, f"the {name}", os.cpu_count() or 1)
+    solution = solve(problem, seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
-    dataset = _dataset(name, order, solution.estimate, attributes)
+    reference = None
+    if name == "norm":
+        dataset = _dataset(name, order, solution.estimate, attributes)
+    else:
+        reference = Reference.of(problem, solution, seed) if problem.surfaces else None
+        estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate()
+        dataset = labelled_distances(order, solution.estimate, estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
-    return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"]))
+    return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"])), reference
 
 
 def _inner_product_to_accuracy(
-    operands: tuple[Operand, Operand], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
+    operands: tuple[OperandLike, OperandLike], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
 ) -> xr.Dataset:
     """Compute an inner product from both norms and the distance: 2 <a, b> = ||a||² + ||b||² - ||a - b||²."""
 
-    def measured(name: str, some: Sequence[Operand], fraction: float) -> tuple[Reals, Reals]:
+    def measured(name: str, some: Sequence[OperandLike], fraction: float) -> tuple[Reals, Reals]:
         part = replace(accuracy, rtol=fraction * accuracy.rtol)
-        dataset = _to_accuracy(name, some, np.atleast_1d(order).tolist(), lattice, part, seed)
+        dataset, _ = to_accuracy(name, some, np.atleast_1d(order).tolist(), lattice, part, seed)
         return dataset[name].to_numpy(), dataset["error"].to_numpy()
 
     norms = [measured("norm", (operand,), _PART_OF_PRODUCT) for operand in operands]
@@ -253,19 +312,24 @@ def _inner_product_to_accuracy(
     return dataset
 
 
-def _from_fields(
-    name: str, order: Orders, weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray]
-) -> xr.Dataset:
+def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray]) -> NormEstimate:
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities."""
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
-    complete = len(qualities) == len(fields)
     areas = np.array(sum(quality.area for quality in qualities))
-    widths = Extent.union([quality.extent for quality in qualities]).widths if complete else np.zeros(len(DIRECTIONS))
     errors = np.sum([quality.probe.norms(weights) for quality in qualities], axis=0)
-    estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, widths), errors)
-    if not complete:
-        estimate = NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)
-    return _dataset(name, order, estimate, lattice_attributes(weights.lattice, *fields))
+    points = reduce(PointSpectrum.between, (quality.points for quality in qualities), None)
+    support = Support(areas, _widths(fields), point_levels=None if points is None else points.highest)
+    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors)
+    if len(qualities) == len(fields):
+        return estimate
+    return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)
+
+
+def _widths(fields: Sequence[xr.DataArray]) -> Reals:
+    """Return the widths of the surfaces of some fields together, see `Support`; zero where they are unknown."""
+    qualities = [quality for quality in map(quality_of, fields) if quality is not None]
+    is_complete = len(qualities) == len(fields)
+    return Extent.union([one.extent for one in qualities]).widths if is_complete else np.zeros(len(DIRECTIONS))
 
 
 def _closed_form(values: Reals, squares: Reals) -> NormEstimate:

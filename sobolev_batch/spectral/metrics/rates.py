@@ -1,17 +1,20 @@
-"""Observed orders of convergence between the levels of a family."""
+"""Observed orders of convergence between the meshes of a family."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 Reals = NDArray[np.float64]
 
+# Of the sizes of two meshes between which a rate is formed.
+_LEAST_RATIO = 1.1
+
 
 def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
-    """Return the observed order p in distance ~ size^p between each mesh and the next coarser one, with its error.
+    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
+
+    The coarser one is the next whose size is larger by a tenth at least: between nearly equal sizes chance decides.
 
     Args:
         distances: Distances to the reference (n,), NaN where missing.
@@ -20,8 +23,7 @@ def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals
 
     Returns:
         log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each, in the order of the arguments. NaN for the
-        coarsest mesh, for meshes without a distance or size, for distances below their error, and between
-        neighbours of the same size.
+        coarsest meshes, for meshes without a distance or size, and for distances below their error.
 
     >>> sizes = np.array([0.4, 0.2, 0.1])
     >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
@@ -30,8 +32,10 @@ def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals
     rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
     usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
     by_size = usable[np.argsort(-sizes[usable], kind="stable")]
-    for coarse, fine in pairwise(by_size):
-        if sizes[coarse] > sizes[fine]:
+    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
+    for fine, count in zip(by_size, coarser_counts, strict=True):
+        if count:
+            coarse = by_size[count - 1]
             span = np.log(sizes[coarse] / sizes[fine])
             rates[fine] = np.log(distances[coarse] / distances[fine]) / span
             # The widest that both distances allow.

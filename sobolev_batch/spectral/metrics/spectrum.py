@@ -21,7 +21,7 @@ from sobolev_batch.spectral.metrics.datasets import (
     lattice_attributes,
     order_axis,
 )
-from sobolev_batch.spectral.metrics.inputs import Operand, field_of, pair_of, shells_of
+from sobolev_batch.spectral.metrics.inputs import OperandLike, field_of, pair_of, shells_of
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 
@@ -30,8 +30,8 @@ _ON_EDGE = 1e-12
 
 
 def spectrum(
-    a: Operand,
-    b: Operand | None,
+    a: OperandLike,
+    b: OperandLike | None,
     order: Orders,
     *,
     bands: int | Sequence[float] | None = None,

@@ -9,13 +9,13 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.backends.machine import available
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import KERNEL, LENGTH, described, lattice_attributes, order_axis
-from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, Operand, pair_of, point_array, read_blocks
+from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, OperandLike, pair_of, point_array, read_blocks
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
@@ -29,8 +29,8 @@ _SAMPLE_BYTES = 72
 
 
 def witness(
-    a: Operand,
-    b: Operand,
+    a: OperandLike,
+    b: OperandLike,
     order: Orders,
     points: ArrayLike,
     *,
@@ -81,7 +81,7 @@ def witness(
     """
     orders = check_orders(order)
     settings = TransformSettings(eps, dtype)
-    allowed_bytes = None if memory is None else byte_count(memory)
+    allowed_bytes = None if memory is None else available(memory)
     coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
     lattice = Lattice.of(first)

@@ -76,7 +76,12 @@ class OctaveWeights:
         return np.asarray(self.by_order[:-1] @ products)
 
     def sums(self, squares: Reals) -> OctaveSums:
-        """Return the integrals of |field|² with their variances, from its values at all samples (n,)."""
+        """Return the integrals of |field|², or of products of two fields, with their variances.
+
+        Args:
+            squares: Values of |field|² or of the products at all samples (n,). What is known of the integrals
+                otherwise may have been subtracted.
+        """
         sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), [0, 0]
         for part in self.quadrature.parts:
             if part.samples.start == part.samples.stop:
@@ -87,7 +92,7 @@ class OctaveWeights:
                 groups = terms if part.starts is None else np.add.reduceat(terms, part.starts)
                 sums[i] += groups.sum()
                 # A single sample may stand for others like it that were not met.
-                variances[kind, i] += len(groups) * groups.var(ddof=1) + terms.max() ** 2
+                variances[kind, i] += len(groups) * groups.var(ddof=1) + np.abs(terms).max() ** 2
             degrees[kind] += len(groups) - 1
         deviation = float(np.sqrt(variances[:, -1].sum())) / self.width
         energy = float(sums[-1]) / self.width

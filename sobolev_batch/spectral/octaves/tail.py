@@ -44,13 +44,12 @@ class Tail:
     ) -> Self:
         """Return the tail by the sums over octaves and the limit of the energy; see `beyond`.
 
-        Without octaves nothing is known of it.
+        Without octaves nothing is known of it, except of point clouds.
         """
-        if not octaves:
-            none = np.zeros(len(orders))
-            return cls(none, none, none, none + np.inf)
-        measured = np.sum([one.squares for one in sums], axis=0)
-        return cls(measured, statistical_errors(sums), *beyond(octaves, sums, limit, orders, inner))
+        none = np.zeros(len(orders))
+        measured = np.sum([one.squares for one in sums], axis=0) if sums else none
+        errors = statistical_errors(sums) if sums else none
+        return cls(measured, errors, *beyond(octaves, sums, limit, orders, inner))
 
     @classmethod
     def stacked(cls, tails: Sequence[Tail]) -> Self:
@@ -81,7 +80,7 @@ class Tail:
             images: Bound on its change by the lattice's spacing.
             discretisation: Norms of the errors of all values.
         """
-        squares = np.maximum(core, 0.0) + self.squares
+        squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
         return NormEstimate(
             np.sqrt(squares),
             change_of_root(squares, self.uncertainty),

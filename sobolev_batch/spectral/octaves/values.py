@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
 from sobolev_batch.spectral.errors.probe import norms_of_checks
-from sobolev_batch.spectral.errors.samples import exact_transform_of
+from sobolev_batch.spectral.errors.samples import exact_transform_of, term_count
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
@@ -30,7 +30,7 @@ Complexes = NDArray[np.complex128]
 Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 
 # Values on a lattice are checked at so many samples: for small meshes, for huge ones, and in between as many as make so
-# many pairs of a triangle and a frequency.
+# many pairs of a triangle (or point) and a frequency.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
 
 
@@ -158,8 +158,7 @@ def check_count(surface: Surface) -> int:
     """Return the number of comparisons on each lattice: fewer where each costs more; none for closed forms."""
     if isinstance(surface, Sphere):
         return 0
-    triangles = len(surface.triangles) if isinstance(surface, Mesh) else 1
-    return int(np.clip(_PAIRS // triangles, _FEWEST_CHECKS, _MOST_CHECKS))
+    return int(np.clip(_PAIRS // term_count(surface), _FEWEST_CHECKS, _MOST_CHECKS))
 
 
 def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:

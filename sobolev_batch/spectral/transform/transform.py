@@ -21,9 +21,10 @@ from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 # Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
 # computed again instead of being compared with new ones.
@@ -78,7 +79,7 @@ def transform_block(
         InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
             the surface is of an unknown kind.
     """
-    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere):
+    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere | PointCloud):
         require_inside(surface, lattice)
     return _transform(surface, _Target(lattice, block, settings, execution, plan))
 
@@ -129,7 +130,8 @@ def _(surface: Sphere, target: _Target) -> Transformed:
 
 @_transform.register(Mesh)
 @_transform.register(Smooth)
-def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
+@_transform.register(PointCloud)
+def _(surface: Mesh | Smooth | PointCloud, target: _Target) -> Transformed:
     lattice, execution = target.lattice, target.execution
     plan = target.plan or target.settings.plan(surface, lattice)
     low, high = surface.bounds

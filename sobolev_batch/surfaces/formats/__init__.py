@@ -1,4 +1,5 @@
 """Formats: readers of mesh files that check every count before they believe it.
 
-In: the path of a PLY, OBJ, STL, OFF, glTF or GIFTI file. Out: a `Mesh`, or an error that names the file.
+In: the path of a PLY, OBJ, STL, OFF, glTF, VTK, GIFTI or FreeSurfer file, or a mesh of another library. Out: a `Mesh`,
+or an error that names the file or the type.
 """

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -39,11 +42,43 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     Raises:
         MeshError: There are no vertices or faces, or the counts do not fit the contents.
     """
+    header = _checked_header(data, "vertices and faces", "vertex", "face")
+    with _opened(data, header) as source:
+        del data
+        ply = _read_checked(source, header)
+    vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
+    return vertices, _triangles(ply["face"])
+
+
+def parse_ply_points(data: bytes, weight: str | None) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
+    """Return the vertices of a PLY file as points, and one of their properties as weights, if it is named.
+
+    Raises:
+        MeshError: There are no vertices, no property has this name, or the counts do not fit the contents.
+    """
+    header = _checked_header(data, "vertices", "vertex")
+    with _opened(data, header) as source:
+        del data
+        vertices = _read_checked(source, header)["vertex"]
+    names = [one.name for one in vertices.properties]
+    if weight is not None and weight not in names:
+        raise MeshError(f"the PLY vertices have no property {weight!r}; theirs are {', '.join(names)}")
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    return points, None if weight is None else vertices[weight]
+
+
+def _checked_header(data: bytes, what: str, *needed: str) -> _Header:
+    """Return the header of a file whose contents can have the counts that it announces."""
     start = data.find(_END, 0, HEADER_BYTES)
     header, length = _Header.parsed(data[: max(start, 0)]), len(data) - start - len(_END)
     counts = header.counts
-    if start < 0 or "vertex" not in counts or "face" not in counts:
-        raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
+    if counts.get("vertex") and "face" in needed and not counts.get("face"):
+        raise MeshError(
+            f"the PLY file has {counts['vertex']} vertices and no faces: read it as points, by read_points or the "
+            "source points of a study"
+        )
+    if start < 0 or not set(needed) <= set(counts):
+        raise MeshError(f"no PLY header announces {what} in the first {HEADER_BYTES} bytes")
     # The library would reserve memory for any count.
     if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
@@ -51,21 +86,34 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if header.text else entries
     if lines != entries:
         raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
-    # A real file for binary data: the library reads other streams row by row.
+    return header
+
+
+@contextmanager
+def _opened(data: bytes, header: _Header) -> Iterator[bytes | IO[bytes]]:
+    """Yield a text as it is, and a real file of binary data: the library reads other streams row by row."""
+    if header.text:
+        yield data
+        return
     with TemporaryFile() as stream:
-        source, total = (data, 0) if header.text else (stream, stream.write(data))
+        stream.write(data)
         del data
-        try:
-            # Reads all faces at once; the library refuses where one of them is no triangle.
-            ply = _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
-        except (PlyElementParseError, KeyError):
-            ply = _read(source, {})
-        # The lines of a text were counted above.
-        unread = 0 if header.text else total - stream.tell()
+        yield stream
+
+
+def _read_checked(source: bytes | IO[bytes], header: _Header) -> PlyData:
+    """Return a PLY file with no more data than its header announces."""
+    try:
+        # Reads all faces at once; the library refuses where one of them is no triangle.
+        ply = _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
+    except (PlyElementParseError, KeyError):
+        ply = _read(source, {})
+    # The lines of a text were counted before.
+    read = 0 if isinstance(source, bytes) else source.tell()
+    unread = 0 if isinstance(source, bytes) else source.seek(0, os.SEEK_END) - read
     if unread:
-        raise MeshError(f"the PLY header announces {counts}, but {unread} bytes more follow")
-    vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
-    return vertices, _triangles(ply["face"])
+        raise MeshError(f"the PLY header announces {header.counts}, but {unread} bytes more follow")
+    return ply
 
 
 def announced_sizes(header: bytes) -> tuple[int, int, bool]:

@@ -25,16 +25,30 @@ def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArr
     """
     if not len(sizes):
         raise MeshError("the file has no faces")
-    short = np.flatnonzero(sizes < 3)
-    if short.size:
-        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+    _check_sizes(sizes)
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
-    starts = np.cumsum(sizes) - sizes
-    polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
-    rank = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
-    first = starts[polygon]
+    first, rank = _places(sizes)
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
+
+
+def triangle_strips(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cut each strip of triangles into these, all turned the same way.
+
+    Args:
+        corners: Vertex indices of all strips, one after the other.
+        sizes: Number of corners of each strip.
+
+    Returns:
+        Vertex indices of triangles (m, 3), int64.
+
+    Raises:
+        MeshError: A strip has fewer than three corners.
+    """
+    _check_sizes(sizes)
+    first, rank = _places(sizes)
+    start, odd = first + rank, rank % 2
+    return np.stack([corners[start + odd], corners[start + 1 - odd], corners[start + 2]], axis=1)
 
 
 def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
@@ -54,3 +68,17 @@ def merge_coincident(
         return vertices, triangles
     merged, indices = np.unique(vertices, axis=0, return_inverse=True)
     return merged, indices.reshape(-1)[triangles]
+
+
+def _check_sizes(sizes: NDArray[np.int64]) -> None:
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+
+
+def _places(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return, for each triangle of polygons or strips, the place of the first corner and its rank among them."""
+    starts = np.cumsum(sizes) - sizes
+    polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
+    rank = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    return starts[polygon], rank

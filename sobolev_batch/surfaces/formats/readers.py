@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import shlex
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.formats.freesurfer import is_freesurfer_name, parse_freesurfer
 from sobolev_batch.surfaces.formats.gifti import parse_gifti
 from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply
@@ -24,11 +26,14 @@ from sobolev_batch.surfaces.formats.raw_files import (
 )
 from sobolev_batch.surfaces.formats.stl import parse_stl
 from sobolev_batch.surfaces.formats.text_formats import parse_obj, parse_off
+from sobolev_batch.surfaces.formats.vtk.legacy import parse_vtk
+from sobolev_batch.surfaces.formats.vtk.xml import parse_vtk_xml
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
 
 _LONGEST_REASON = 250
+_FREESURFER = "freesurfer"
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
 # Smallest possible sizes of a vertex and a face in a PLY file.
@@ -46,22 +51,26 @@ _BYTES_PER_TRIANGLE = {
     ".gltf": (18, 190),
     ".glb": (18, 190),
     ".gii": (10, 90),
+    ".vtk": (22, 290),
+    ".vtp": (10, 215),
+    ".vtu": (10, 215),
+    _FREESURFER: (18, 80),
 }
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB or GIFTI file, gzipped or not.
+    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB, GIFTI, VTK or FreeSurfer file, gzipped or not.
 
-    The format follows from the name. Coordinates keep the precision of the file. Polygons are cut into fans
-    of triangles, which is exact for convex ones. STL and glTF repeat vertices, so those that coincide exactly
-    are merged; vertices of other formats stay as they are.
+    The format follows from the name: FreeSurfer's are such as lh.pial, VTK's end in .vtk, .vtp or .vtu. Coordinates
+    keep the precision of the file. Polygons are cut into fans of triangles, which is exact for convex ones. STL and
+    glTF repeat vertices, so those that coincide exactly are merged; vertices of other formats stay as they are.
 
     Args:
         path: Path of the file.
 
     Raises:
-        MeshError: The file is missing, of no known format, damaged, or holds no valid mesh; the message
-            starts with the path.
+        MeshError: The file is missing, of no known format, damaged, or holds no valid mesh. The message
+            starts with the path, and says how to convert files of formats that are known, but not read.
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
@@ -76,7 +85,7 @@ def read_mesh(path: str | Path) -> Mesh:
     path = Path(path)
     suffix = mesh_format(path).removesuffix(".gz")
     if suffix not in _PARSERS:
-        raise MeshError(f"{path}: no mesh format has this name; known are {', '.join(_PARSERS)}, each also with .gz")
+        raise MeshError(f"{path}: {_how_to_convert(path)}")
     data = [read_unpacked(path)]
     try:
         # Numbers that overflow become infinite, which the mesh refuses.
@@ -92,7 +101,9 @@ def read_mesh(path: str | Path) -> Mesh:
         raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
     except Exception as error:
         # On damaged input parsers raise anything from struct.error to RecursionError.
-        raise MeshError(f"{path}: not a readable {suffix} file: {type(error).__name__}: {_shortened(error)}") from error
+        raise MeshError(
+            f"{path}: not a readable {suffix.removeprefix('.')} file: {type(error).__name__}: {_shortened(error)}"
+        ) from error
 
 
 def expected_size(path: Path) -> tuple[int, float]:
@@ -134,14 +145,44 @@ def _announced_size(header: bytes, length: int) -> tuple[int, float]:
 
 
 def mesh_format(path: Path) -> str:
-    """Return the suffix in lower case, .gz included, which decides on the parser."""
-    name = path.name.lower()
-    return Path(name.removesuffix(".gz")).suffix + (".gz" if name.endswith(".gz") else "")
+    """Return the suffix in lower case or "freesurfer", with .gz where it has that: it decides on the parser."""
+    name, packing = _unpacked_name(path).lower(), ".gz" if is_gzipped(path) else ""
+    suffix = Path(name).suffix
+    is_other = suffix in _PARSERS or suffix in _COMMANDS or suffix in _REPLACEMENTS
+    return (_FREESURFER if not is_other and is_freesurfer_name(name) else suffix) + packing
+
+
+def is_mesh_name(path: Path) -> bool:
+    """Return whether a file has the name of a mesh, in a format that is read or that can be converted."""
+    suffix = mesh_format(path).removesuffix(".gz")
+    return suffix in _PARSERS or suffix in _COMMANDS
 
 
 def mesh_stem(path: Path) -> str:
-    """Return the name of a file without its format and compression."""
-    return Path(path.name[: -len(".gz")] if is_gzipped(path) else path.name).stem
+    """Return the name of a file without its format and compression; FreeSurfer's names are all stem."""
+    name = _unpacked_name(path)
+    return name if mesh_format(path).startswith(_FREESURFER) else Path(name).stem
+
+
+def _unpacked_name(path: Path) -> str:
+    return path.name[: -len(".gz")] if is_gzipped(path) else path.name
+
+
+def _how_to_convert(path: Path) -> str:
+    """Return why a file's name names no format that is read, and what to do."""
+    suffix = mesh_format(path).removesuffix(".gz")
+    if suffix in _REPLACEMENTS:
+        return f"{suffix} files hold {_REPLACEMENTS[suffix]}"
+    if suffix in _COMMANDS:
+        old, new = _unpacked_name(path), Path(_unpacked_name(path)).stem
+        command = _COMMANDS[suffix].format(old=shlex.quote(old), new=shlex.quote(new))
+        unpack = f"gunzip {shlex.quote(path.name)}; " if is_gzipped(path) else ""
+        return f"{suffix} files are not read; convert it, for example by: {unpack}{command}"
+    known = ", ".join(name for name in _PARSERS if name != _FREESURFER)
+    return (
+        f"no mesh format has this name; known are {known} and FreeSurfer's names such as lh.pial, each also with .gz. "
+        "MeshLab and ParaView open many others and save them as .ply"
+    )
 
 
 def companion_files(path: Path) -> list[Path]:
@@ -174,4 +215,50 @@ _PARSERS: dict[str, Callable[[bytes, Path], Raw]] = {
     ".gltf": parse_gltf,
     ".glb": parse_gltf,
     ".gii": parse_gifti,
+    ".vtk": parse_vtk,
+    ".vtp": lambda data, _: parse_vtk_xml(data, "PolyData"),
+    ".vtu": lambda data, _: parse_vtk_xml(data, "UnstructuredGrid"),
+    _FREESURFER: parse_freesurfer,
+}
+
+# Commands that make a readable file of those of other formats: {old} is its name, {new} that of the new one without its
+# ending.
+_ASSIMP, _GMSH = "assimp export {old} {new}.ply", "gmsh {old} -2 -o {new}.stl"
+_MESHIO = "meshio convert {old} {new}.vtu"
+_PYMESHLAB = (
+    "python -c 'import pymeshlab, sys; meshes = pymeshlab.MeshSet(); meshes.load_new_mesh(sys.argv[1]); "
+    "meshes.generate_by_merging_visible_meshes(); meshes.save_current_mesh(sys.argv[2])' {old} {new}.ply"
+)
+_PYVISTA = (
+    "python -c 'import pyvista, sys; pyvista.read(sys.argv[1]){0}.triangulate().save(sys.argv[2])' {{old}} {{new}}.vtp"
+)
+_BLENDER = (
+    "blender --background{0} --python-expr 'import bpy, sys; {1}bpy.ops.wm.ply_export(filepath=sys.argv[-1])' -- "
+    "{{old}} {{new}}.ply"
+)
+_OPEN_USD = "bpy.ops.wm.read_factory_settings(use_empty=True); bpy.ops.wm.usd_import(filepath=sys.argv[-2]); "
+_COMMANDS: dict[str, str] = {
+    **dict.fromkeys((".fbx", ".lwo"), _ASSIMP),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep"), _GMSH),
+    **dict.fromkeys((".msh", ".mesh", ".inp", ".bdf", ".xdmf"), _MESHIO),
+    **dict.fromkeys((".3ds", ".3mf", ".ctm", ".dae", ".wrl", ".x3d"), _PYMESHLAB),
+    **dict.fromkeys((".vtm", ".pvd"), _PYVISTA.format(".combine().extract_surface()")),
+    ".pvtp": _PYVISTA.format(""),
+    ".pvtu": _PYVISTA.format(".extract_surface()"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _BLENDER.format("", _OPEN_USD)),
+    ".blend": _BLENDER.format(" {old}", ""),
+    ".drc": "draco_decoder -i {old} -o {new}.ply",
+    ".asc": "mris_convert {old} {new}.gii",
+}
+# What other files hold that no command makes a surface of.
+_REPLACEMENTS: dict[str, str] = {
+    **dict.fromkeys((".csv", ".txt", ".xyz"), "points: read them by read_points or by the source points of a study"),
+    **dict.fromkeys(
+        (".annot", ".label", ".mgh"),
+        "values at the vertices of a surface: give the surface, such as lh.pial",
+    ),
+    **dict.fromkeys(
+        (".dcm", ".mgz", ".mha", ".mhd", ".nii", ".nrrd", ".vti"),
+        "a volume: make the surface in it a mesh first, such as by skimage.measure.marching_cubes",
+    ),
 }

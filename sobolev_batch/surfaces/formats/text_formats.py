@@ -112,6 +112,15 @@ def parsed_numbers(words: list[str], owner: str) -> list[float]:
         raise MeshError(f"{owner} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
 
 
+def parsed_integers(words: list[str], owner: str) -> list[int]:
+    """Return words as integers.
+
+    Raises:
+        MeshError: A word is no integer; the message starts with the owner, such as "the section POLYGONS".
+    """
+    return [_integer(word, owner) for word in words]
+
+
 def _integer(word: str, owner: str) -> int:
     if len(word) > _MOST_DIGITS or "_" in word:
         raise MeshError(f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}")

@@ -15,24 +15,25 @@ import trimesh
 from plyfile import PlyData, PlyElement
 
 from sobolev_batch.errors import InputError, MeshError
+from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Seventeen digits give every double back.
 _DIGITS = "%.17g"
 
 
-def write_mesh(mesh: Mesh, path: str | Path) -> None:
+def write_mesh(mesh: MeshLike, path: str | Path) -> None:
     """Write a mesh to a file in the format of its suffix: .ply, .obj, .off or .stl.
 
     Coordinates keep all digits, except in STL, which has single precision and no shared vertices.
 
     Args:
-        mesh: Mesh to write.
+        mesh: Mesh to write, or what `as_mesh` makes one of.
         path: File to write; it replaces one of the same name once it is whole.
 
     Raises:
         InputError: The suffix is none of these, or the path is a folder or a device.
-        MeshError: The file cannot be written.
+        MeshError: The file cannot be written; or see `as_mesh`.
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -43,7 +44,7 @@ def write_mesh(mesh: Mesh, path: str | Path) -> None:
     Mesh(42 vertices, 80 triangles)
     """
     path = require_writable(path)
-    data = _FORMATS[path.suffix.lower()](mesh)
+    data = _FORMATS[path.suffix.lower()](as_mesh(mesh))
     # The old file stays until the new one is whole: a disk may be full.
     with _new_file_beside(path) as file:
         file.write(data)

@@ -1,4 +1,4 @@
-"""Shapes: meshes and surfaces given by formulas, with their extents and similarity transforms.
+"""Shapes: meshes, spheres and point clouds, with their extents and similarity transforms.
 
-In: arrays of vertices and triangles, or parameters. Out: frozen surfaces that everything else reads.
+In: arrays of vertices and triangles, of points and areas, or a radius. Out: frozen surfaces that everything else reads.
 """

@@ -15,6 +15,8 @@ Reals = NDArray[np.float64]
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
 # The axes, the diagonals of the faces and those of the cube: unit vectors (13, 3).
 DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
+# Points that are measured at a time: their temporaries stay in cache.
+_BATCH = 1 << 14
 _AXES = [int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3)]
 
 
@@ -35,6 +37,16 @@ class Extent:
         """Return the extent of several surfaces together."""
         lowest = np.min([extent.lowest for extent in extents], axis=0)
         highest = np.max([extent.highest for extent in extents], axis=0)
+        return cls(tuple(lowest.tolist()), tuple(highest.tolist()))
+
+    @classmethod
+    def of_points(cls, coordinates: Reals) -> Self:
+        """Return the extent of points (3, n), n > 0, one contiguous row an axis."""
+        lowest, highest = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
+        for start in range(0, coordinates.shape[1], _BATCH):
+            along = DIRECTIONS @ coordinates[:, start : start + _BATCH]
+            np.minimum(lowest, along.min(axis=1), out=lowest)
+            np.maximum(highest, along.max(axis=1), out=highest)
         return cls(tuple(lowest.tolist()), tuple(highest.tolist()))
 
     @property

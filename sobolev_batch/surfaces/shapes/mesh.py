@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
+from sobolev_batch.errors import InputError, MeshError
+from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts, boundary_and_nonmanifold_edges, duplicate_triangles
 from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point
 
@@ -55,7 +55,7 @@ class Mesh:
     triangles: NDArray[np.int64]
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
-        checked_vertices = _checked_vertices(vertices)
+        checked_vertices = checked_points(vertices, "vertices")
         checked_triangles = _checked_triangles(triangles, len(checked_vertices))
         object.__setattr__(self, "vertices", checked_vertices)
         object.__setattr__(self, "triangles", checked_triangles)
@@ -125,13 +125,7 @@ class Mesh:
     @cached_property
     def extent(self) -> Extent:
         """Extent of the `used_coordinates` along `DIRECTIONS`."""
-        coordinates = self.used_coordinates
-        lowest, highest = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
-        for start in range(0, coordinates.shape[1], _BATCH):
-            along = DIRECTIONS @ coordinates[:, start : start + _BATCH]
-            np.minimum(lowest, along.min(axis=1), out=lowest)
-            np.maximum(highest, along.max(axis=1), out=highest)
-        return Extent(tuple(lowest.tolist()), tuple(highest.tolist()))
+        return Extent.of_points(self.used_coordinates)
 
     @property
     def bounding_sphere(self) -> tuple[Point, float]:
@@ -194,6 +188,56 @@ class Mesh:
             digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
         return digest.hexdigest()
 
+    def to_trimesh(self) -> Any:
+        """Return a new ``trimesh.Trimesh`` of the same vertices and triangles, all digits kept."""
+        import trimesh
+
+        # Without processing it merges and drops nothing.
+        return trimesh.Trimesh(np.array(self.vertices), np.array(self.triangles), process=False)
+
+    def to_pyvista(self) -> Any:
+        """Return a new ``pyvista.PolyData`` of the same vertices and triangles, all digits kept.
+
+        Raises:
+            InputError: PyVista is not installed (the extra ``vtk``).
+        """
+        try:
+            import pyvista
+        except ImportError as error:
+            raise _missing("PyVista", "'sobolev-batch[vtk]'") from error
+        return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
+
+    def to_meshio(self) -> Any:
+        """Return a new ``meshio.Mesh`` of the same vertices and triangles, all digits kept.
+
+        Raises:
+            InputError: meshio is not installed.
+        """
+        try:
+            import meshio
+        except ImportError as error:
+            raise _missing("meshio", "meshio") from error
+        return meshio.Mesh(np.array(self.vertices), [("triangle", np.array(self.triangles))])
+
+    def to_open3d(self) -> Any:
+        """Return a new ``open3d.geometry.TriangleMesh`` of the same vertices and triangles, all digits kept.
+
+        For Open3D's tensors pass it to ``open3d.t.geometry.TriangleMesh.from_legacy``, which keeps single precision
+        unless its ``vertex_dtype`` is float64.
+
+        Raises:
+            InputError: Open3D is not installed.
+        """
+        try:
+            import open3d
+        except ImportError as error:
+            raise _missing("Open3D", "open3d") from error
+        # Its indices have 32 bits.
+        vertices, triangles = np.array(self.vertices), self.triangles.astype(np.int32)
+        return open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
+        )
+
     def _zero_areas(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Yield, for each batch of triangles, the areas below which rounding hides whether they are zero."""
         for number, edges in enumerate(self._edges()):
@@ -230,6 +274,10 @@ class Mesh:
         return Mesh, (self.vertices, self.triangles)
 
 
+def _missing(name: str, requirement: str) -> InputError:
+    return InputError(f"{name} is not installed: pip install {requirement}")
+
+
 def _areas(edges: _Edges) -> NDArray[np.float64]:
     (ux, uy, uz), (vx, vy, vz) = edges
     return np.asarray(0.5 * np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
@@ -263,17 +311,22 @@ def _array(values: ArrayLike, name: str) -> NDArray[Any]:
         raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
 
 
-def _checked_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
-    array = _array(vertices, "vertices")
+def checked_points(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return coordinates as a read-only float64 array (n, 3) that nobody else can change.
+
+    Raises:
+        MeshError: They are not real and finite, or not (n, 3); the message calls them ``name``.
+    """
+    array = _array(values, name)
     if array.dtype.kind not in "fiu":
-        raise MeshError(f"vertices must be real numbers, found dtype {array.dtype}")
+        raise MeshError(f"{name} must be real numbers, found dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:
-        raise MeshError(f"vertices must have shape (n, 3), found {array.shape}")
+        raise MeshError(f"{name} must have shape (n, 3), found {array.shape}")
     with np.errstate(over="ignore"):
         converted = _owned(array, np.float64)
     bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
     if bad.size:
-        raise MeshError(f"{bad.size} of {len(array)} vertices have NaN or infinite coordinates: {_listed(bad, array)}")
+        raise MeshError(f"{bad.size} of {len(array)} {name} have NaN or infinite coordinates: {_listed(bad, array)}")
     return _frozen(converted)
 
 

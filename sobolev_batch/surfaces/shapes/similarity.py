@@ -45,8 +45,15 @@ class Similarity:
 
         The bounding sphere lies around the centre of the bounding box and reaches the farthest point.
         Flat meshes have one too.
+
+        Raises:
+            InputError: It is a single point, or no surface, such as the path of a mesh that is still to be read.
         """
+        if not hasattr(surface, "bounding_sphere"):
+            raise InputError(f"a surface is needed, such as read_mesh({str(surface)[:50]!r}), found {type(surface)}")
         center, radius = surface.bounding_sphere
+        if not radius > 0:
+            raise InputError("a single point has no size to scale a study by; give the scaling, or another reference")
         return cls(1 / radius, center)
 
     @property

@@ -20,7 +20,7 @@ LARGEST_LENGTH = 1e150
 
 
 class Surface(Protocol):
-    """A surface in three-dimensional space, in the user's unit of length: a `Mesh`, a `Sphere` or a `Smooth` one."""
+    """A surface in three-dimensional space, in the user's unit of length: a mesh, a formula or a point cloud."""
 
     @property
     def area(self) -> float:

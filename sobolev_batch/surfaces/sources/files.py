@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
 from dataclasses import dataclass
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.fingerprints import file_digest
 from sobolev_batch.surfaces.sources.globs import expand
-from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, label_problem, quoted
+from sobolev_batch.surfaces.sources.mesh_lists import MOST_MESHES, ListedMesh, checked_list, read_mesh_list
+from sobolev_batch.surfaces.sources.names import (
+    caseless_key,
+    duplicate_names,
+    label_problem,
+    natural_key,
+    numbers_in,
+    quoted,
+)
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, at_most, checked_times
-
-_MOST_PATHS = 100_000
-_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 
 
 def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None:
@@ -32,7 +36,7 @@ def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None
         if value == "names":
             return "names"
         raise ValueError('must be a list of numbers, or "names" for the numbers in the names of the files')
-    return checked_times(value, _MOST_PATHS)
+    return checked_times(value, MOST_MESHES)
 
 
 class FileSource(Source):
@@ -42,26 +46,48 @@ class FileSource(Source):
         paths: Paths or globs (``**`` crosses folders), relative to the study file. A path may lie anywhere,
             and its file must exist when its mesh is computed. A glob must match a file at once, and matches
             none outside the folder that it names: see `globs.expand`.
+        meshes: Instead of paths, a list of meshes with what is known of them: a CSV file, or tables of the study. See
+            `mesh_lists`.
         distribution: Installed Python distribution. Paths are then those of files that it recorded at its
             installation, without wildcards. It is not imported.
         times: Times of the meshes if they are states of one that moves: a list with one for each file, in the order of
             the numbers in their names, or "names" for the last number in the name of each file.
     """
 
-    paths: Annotated[
-        tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(_MOST_PATHS)
-    ]
+    paths: (
+        Annotated[
+            tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(MOST_MESHES)
+        ]
+        | None
+    ) = None
+    meshes: Annotated[str | tuple[ListedMesh, ...] | None, BeforeValidator(checked_list)] = None
     distribution: Annotated[str, Field(min_length=1)] | None = None
     times: Annotated[tuple[float, ...] | Literal["names"] | None, BeforeValidator(_checked_times)] = None
 
+    @model_validator(mode="after")
+    def _paths_or_meshes(self) -> Self:
+        if (self.paths is None) == (self.meshes is None):
+            raise ValueError(
+                'either paths, such as ["a.ply", "scans/*.obj"], or a list of meshes is needed, and not both'
+            )
+        if self.meshes is not None and (self.distribution is not None or self.times is not None):
+            raise ValueError("distribution and times belong to paths; a list of meshes gives each its time")
+        return self
+
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member per file, sorted by path or time, and named by the file's stem where that is unique."""
+        """Return one member per file, sorted by path or time, and named by the file's stem where that is unique.
+
+        The meshes of a list keep its order.
+        """
+        if self.meshes is not None:
+            return _listed_members(self.meshes, folder)
+        given = self.paths or ()
         if self.distribution is not None:
-            paths = sorted({_recorded_file(self.distribution, path) for path in self.paths})
+            paths = sorted({_recorded_file(self.distribution, path) for path in given})
         else:
-            paths = sorted({match for path in self.paths for match in _matches(folder, path)})
+            paths = sorted({match for path in given for match in matching_files(folder, path)})
         times = dict.fromkeys(paths) if self.times is None else _times(paths, self.times)
-        names = dict(zip(paths, _names(paths), strict=True))
+        names = dict(zip(paths, names_of_files(paths), strict=True))
         # Absolute, since a worker may have been started in another folder.
         return tuple(FileMember(names[path], -1, path.absolute(), time=time) for path, time in times.items())
 
@@ -71,6 +97,7 @@ class FileMember(Member):
     """A mesh file."""
 
     path: Path
+    is_quickly_loaded: ClassVar[bool] = True
 
     def load(self) -> Surface:
         """Read the file."""
@@ -84,6 +111,23 @@ class FileMember(Member):
     def expected_size(self) -> ExpectedSize:
         """Return the size that the header announces, or that the length of the file suggests."""
         return ExpectedSize(*expected_size(self.path))
+
+
+def _listed_members(meshes: str | tuple[ListedMesh, ...], folder: Path) -> tuple[Member, ...]:
+    """Return one member for each mesh of a list, by the name that it gives or the stem of its file."""
+    if isinstance(meshes, str):
+        folder, meshes = (folder / meshes).parent, read_mesh_list(folder / meshes)
+    paths = [folder / mesh.path for mesh in meshes]
+    unnamed = list(dict.fromkeys(path for path, mesh in zip(paths, meshes, strict=True) if mesh.name is None))
+    stems = dict(zip(unnamed, names_of_files(unnamed), strict=True))
+    names = [stems[path] if mesh.name is None else mesh.name for path, mesh in zip(paths, meshes, strict=True)]
+    repeated = duplicate_names(names)
+    if repeated:
+        raise StudyError(f"meshes: several are named {quoted(repeated[0][0])}; give each a name of its own")
+    return tuple(
+        FileMember(name, -1, path.absolute(), time=mesh.time, metadata=mesh.metadata)
+        for name, path, mesh in zip(names, paths, meshes, strict=True)
+    )
 
 
 def _recorded_file(name: str, path: str) -> Path:
@@ -100,7 +144,7 @@ def _recorded_file(name: str, path: str) -> Path:
     raise StudyError(f"the distribution {name!r} {distribution(name).version} contains no file {path!r}")
 
 
-def _matches(folder: Path, path: str) -> list[Path]:
+def matching_files(folder: Path, path: str) -> list[Path]:
     """Return the files that a path or glob names."""
     if "\0" in path:
         raise StudyError(f"paths: no file can have the name {quoted(path)}, which holds the character NUL")
@@ -118,7 +162,7 @@ def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> di
     if given == "names":
         times = {path: _last_number(path) for path in paths}
     elif len(given) == len(paths):
-        times = dict(zip(sorted(paths, key=_natural_key), given, strict=True))
+        times = dict(zip(sorted(paths, key=lambda path: natural_key(path.as_posix())), given, strict=True))
     else:
         raise StudyError(f"times: {len(given)} times are given for {len(paths)} files; give one for each")
     repeated = [time for time, count in Counter(times.values()).items() if count > 1]
@@ -128,20 +172,13 @@ def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> di
 
 
 def _last_number(path: Path) -> float:
-    numbers = _NUMBER.findall(mesh_stem(path))
+    numbers = numbers_in(mesh_stem(path))
     if not numbers:
         raise StudyError(f"times: the name of the file {quoted(path.name)} has no number; list the times instead")
-    return float(numbers[-1])
+    return numbers[-1]
 
 
-def _natural_key(path: Path) -> list[tuple[str, float]]:
-    """Return a key that sorts paths by the numbers in them: 2 before 10."""
-    parts = _NUMBER.split(path.as_posix())
-    numbers = [*map(float, _NUMBER.findall(path.as_posix())), 0.0]
-    return list(zip(parts, numbers, strict=True))
-
-
-def _names(paths: list[Path]) -> list[str]:
+def names_of_files(paths: list[Path]) -> list[str]:
     """Return stems; file names where stems collide, and whole paths where these collide with any other name."""
     stems = [mesh_stem(path) for path in paths]
     names = [stem if alone else path.name for stem, path, alone in zip(stems, paths, _unique(stems), strict=True)]

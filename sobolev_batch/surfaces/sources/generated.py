@@ -14,11 +14,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.ellipsoid import Ellipsoid
 from sobolev_batch.surfaces.shapes.icosphere import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.shapes.torus import MOST_TRIANGLES, Torus
+from sobolev_batch.surfaces.smooth.ellipsoid import Ellipsoid
+from sobolev_batch.surfaces.smooth.torus import MOST_TRIANGLES, Torus
 from sobolev_batch.surfaces.sources.fingerprints import installed_version
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 _LONGEST_LABEL = 1000
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 # Printable to Python, yet invisible: joiners, fillers, variation selectors, the empty Braille cell.
 _INVISIBLE = frozenset(
     "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
@@ -35,6 +36,15 @@ def quoted(value: object, longest: int = 80) -> str:
     except ValueError:
         return f"a {type(value).__name__} that holds an integer of too many digits"
     return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def legible(name: str) -> str:
+    r"""Return a name as it is, or quoted where it holds what a terminal would take as a command or not show.
+
+    >>> legible("a.ply"), legible("a\x1b[31m.ply")
+    ('a.ply', "'a\\x1b[31m.ply'")
+    """
+    return name if name.isprintable() else quoted(name)
 
 
 def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
@@ -66,6 +76,16 @@ def label_problem(name: str) -> str | None:
 def caseless_key(name: str) -> str:
     """Return a key that is equal for names that differ only in case and the encoding of accents (Unicode's D145)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
+
+
+def numbers_in(text: str) -> list[float]:
+    """Return the numbers in a name, from left to right."""
+    return [*map(float, _NUMBER.findall(text))]
+
+
+def natural_key(text: str) -> list[tuple[str, float]]:
+    """Return a key that sorts names by the numbers in them: 2 before 10."""
+    return list(zip(_NUMBER.split(text), [*numbers_in(text), 0.0], strict=True))
 
 
 def file_stem(number: int, label: str) -> str:

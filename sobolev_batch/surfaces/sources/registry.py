@@ -8,20 +8,23 @@ names a subclass of `Source`.
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from sobolev_batch.errors import StudyError
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import quoted
 
@@ -31,6 +34,7 @@ MOST_ENTRIES = 1000
 _GROUP = "sobolev_batch.sources"
 
 Fingerprint = Mapping[str, Any]
+Metadata = tuple[tuple[str, float | str], ...]
 
 
 class Source(BaseModel, ABC):
@@ -91,8 +95,10 @@ class ExpectedSize:
     """The predicted size of a surface.
 
     Attributes:
-        triangles: Approximate number of triangles; 0 for a closed form.
+        triangles: Approximate number of triangles; 0 for a closed form or a point cloud.
         projected_bytes: Approximate peak of the memory that `Member.load` takes.
+        seconds: Approximate processor time that `Member.load` takes, where it does more than read or tile.
+        points: Approximate number of points of a point cloud; 0 for another surface.
 
     >>> import sobolev_batch as sb
     >>> sb.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
@@ -101,6 +107,8 @@ class ExpectedSize:
 
     triangles: int = 0
     projected_bytes: float = 0.0
+    seconds: float = 0.0
+    points: int = 0
 
 
 @dataclass(frozen=True)
@@ -113,6 +121,8 @@ class Member(ABC):
         name: Label of the surface in the store, unique within its source.
         level: Refinement level, or rank from coarse to fine; -1 where the source has no such order.
         time: Time of the surface, in a unit of the user's choice; None where the source has no time.
+        metadata: Numbers and texts that the user knows of the surface, by their names; tables repeat them.
+        is_quickly_loaded: True for a class whose surfaces are read, not made: a plan may look at many of them.
 
     >>> from dataclasses import dataclass
     >>> import sobolev_batch as sb
@@ -135,6 +145,13 @@ class Member(ABC):
     name: str
     level: int
     time: float | None = field(default=None, kw_only=True)
+    metadata: Metadata = field(default=(), kw_only=True)
+    is_quickly_loaded: ClassVar[bool] = False
+
+    @property
+    def is_point_cloud(self) -> bool:
+        """True if `load` makes a `PointCloud`; override it if so. A plan then refuses orders of -3/2 and above."""
+        return False
 
     @abstractmethod
     def load(self) -> Surface:
@@ -188,6 +205,12 @@ class SurfaceMember(Member):
 
     surface: Surface
     identity: Fingerprint
+    is_quickly_loaded: ClassVar[bool] = True
+
+    @property
+    def is_point_cloud(self) -> bool:
+        """True if the surface is a `PointCloud`."""
+        return isinstance(self.surface, PointCloud)
 
     def load(self) -> Surface:
         """Return the surface."""
@@ -243,17 +266,39 @@ def parse_source(table: Mapping[str, Any]) -> Source:
         StudyError: No source has this name, or it cannot be loaded.
         pydantic.ValidationError: The source does not take these parameters.
     """
-    name = table.get("source")
+    if "source" not in table:
+        raise StudyError('source is missing; add it, such as source = "files"')
+    source_type = source_type_of(table["source"])
+    return source_type.model_validate({key: value for key, value in table.items() if key != "source"})
+
+
+def source_type_of(name: object) -> type[Source]:
+    """Return the source of a name.
+
+    Raises:
+        StudyError: No source has this name, or it cannot be loaded.
+    """
     registry = _registry()
     if not isinstance(name, str) or name not in registry:
-        raise StudyError(f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}")
+        message = f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}"
+        similar = difflib.get_close_matches(name[:100].lower(), registry, n=1) if isinstance(name, str) else []
+        raise StudyError(f"{message}; did you mean {similar[0]!r}?" if similar else message)
     try:
         source_type = registry[name].load()
     except (ImportError, AttributeError) as error:
         raise StudyError(f"the source {name!r} cannot be loaded: {error}") from error
     if not (isinstance(source_type, type) and issubclass(source_type, Source)):
         raise StudyError(f"the entry point of the source {name!r} is not a subclass of Source: {registry[name].value}")
-    return source_type.model_validate({key: value for key, value in table.items() if key != "source"})
+    return source_type
+
+
+def keys_by_source() -> dict[str, tuple[str, ...]]:
+    """Return the keys of each source that can be loaded, by its name."""
+    keys = {}
+    for name in sorted(_registry()):
+        with suppress(StudyError):
+            keys[name] = tuple(source_type_of(name).model_fields)
+    return keys
 
 
 def single_member(source: Source, folder: Path) -> Member:

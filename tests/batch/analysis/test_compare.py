@@ -38,7 +38,7 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.workspace import Workspace
-from sobolev_batch.cli import cli, studies
+from sobolev_batch.cli import cli
 from sobolev_batch.results.status import Status
 from tests.support.stores import assert_same_fields, assert_same_tables
 from tests.support.studies import small_table, variable
@@ -617,11 +617,11 @@ def test_a_closed_form_has_no_proximity() -> None:
     ("section", "words"),
     [
         ({"witness": {"orders": [0.0]}}, "-1/2"),
-        ({"witness": {"order": -2.0}}, "witness.order"),
+        ({"witness": {"order": -2.0}}, r"\[witness\]: unknown key order"),
         ({"witness": True}, "witness"),
-        ({"proximity": {"points": 1}}, "proximity.points"),
-        ({"proximity": {"points": 10**9}}, "proximity.points"),
-        ({"proximity": {"points": "many"}}, "proximity.points"),
+        ({"proximity": {"points": 1}}, r"\[proximity\]: points must be 2 or more"),
+        ({"proximity": {"points": 10**9}}, r"\[proximity\]: points must be at most 10000000"),
+        ({"proximity": {"points": "many"}}, r"\[proximity\]: points must be a whole number"),
     ],
 )
 def test_sections_that_make_no_sense(section: dict[str, Any], words: str) -> None:
@@ -631,17 +631,17 @@ def test_sections_that_make_no_sense(section: dict[str, Any], words: str) -> Non
 
 def test_notes_survive_as_text() -> None:
     record = ComparisonRecord("key", "complete", "", {"chamfer": 0.1}, 7, 0.5)
-    assert ComparisonRecord.from_json(record.to_json()) == record
-    assert ComparisonRecord.from_json("") is None
+    assert ComparisonRecord.from_json(record.to_json(3), 3) == record
+    assert ComparisonRecord.from_json("", 3) is None
     with pytest.raises(sb.DamageError):
-        ComparisonRecord.from_json('{"key": 1')
+        ComparisonRecord.from_json('{"key": 1', 3)
 
 
 def test_what_was_not_compared_gives_status_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     summary = Summary("somewhere", (), ("ico/0",), {}, {"ico/0": "no witness: it has changed"})
-    monkeypatch.setattr(studies, "run", lambda *args, **options: summary)
-    monkeypatch.setattr(studies, "open_store", lambda place: None)
-    monkeypatch.setattr(studies, "format_table", lambda tree: "the table")
+    monkeypatch.setattr("sobolev_batch.batch.run.run", lambda *args, **options: summary)
+    monkeypatch.setattr("sobolev_batch.results.open.open_store", lambda place: None)
+    monkeypatch.setattr("sobolev_batch.results.tables.convergence.format_table", lambda tree: "the table")
     (tmp_path / "s.toml").write_text(
         'study.name = "s"\nnorm.orders = [-2.0]\nlattice = { xi_max = 3.0, M = 16 }\nreference.source = "sphere"\n'
         '[[family]]\nname = "ico"\nsource = "icosphere"\nlevels = [0]\n'

@@ -153,10 +153,9 @@ if __name__ == "__main__":
 COMMAND = """
 import sys
 from sobolev_batch import cli
-from sobolev_batch.cli import studies
-from sobolev_batch.cli.reporter import Reporter
+from sobolev_batch.cli import reporter
 
-class Pausing(Reporter):
+class Pausing(reporter.Reporter):
     def __call__(self, progress):
         super().__call__(progress)
         if progress.stage == "fields" and progress.done == 1:
@@ -164,7 +163,7 @@ class Pausing(Reporter):
             sys.stdin.readline()
 
 if __name__ == "__main__":
-    studies.Reporter = Pausing
+    reporter.Reporter = Pausing
     sys.argv[1:] = ["run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
     cli.main()
 """

@@ -104,7 +104,7 @@ def test_requests_grow_by_six_for_a_mesh(server: Server, s3_client: Client, url:
     # The field and its record written; looks for an older record by driver and task; the field read for norms and
     # for pairs.
     assert counts[1] - counts[0] <= 6 * 10 + 4
-    assert counts[0] < 195
+    assert counts[0] < 200
 
 
 def test_an_interrupted_run_goes_on_from_what_is_stored(

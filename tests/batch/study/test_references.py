@@ -207,7 +207,7 @@ def test_error_targets_of_smooth_references_are_met_by_settings() -> None:
 def test_smooth_surfaces_cannot_be_decimated() -> None:
     family = [{"name": "f", "source": "decimate", "mesh": {"source": "torus", **RING}, "triangles": [100]}]
     plan = make_plan(Study.from_table(torus_table(family=family)))
-    with pytest.raises(InputError, match="torus is a closed form; its triangles are needed"):
+    with pytest.raises(InputError, match="torus is no mesh; its triangles are needed"):
         plan.rows[0].member.load()
 
 

@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel
 
 from sobolev_batch import Lattice, Study, StudyError
-from sobolev_batch.batch.study.schema import FamilyName, FamilyReferenceSection, StudyDocument
+from sobolev_batch.batch.study.schema import FamilyReferenceSection, FamilySection, StudyDocument
 from sobolev_batch.surfaces.sources.registry import Source
 from tests.support.repository import blocks
 from tests.support.studies import changed, small_table
@@ -78,7 +78,7 @@ def keys_of(model: type[BaseModel]) -> set[str]:
 
 def test_the_reference_of_study_files_names_every_key_and_source() -> None:
     text = (WORKFLOWS.parent / "docs" / "studies.md").read_text(encoding="utf-8")
-    keys = keys_of(StudyDocument) | keys_of(FamilyReferenceSection) | keys_of(FamilyName)
+    keys = keys_of(StudyDocument) | keys_of(FamilyReferenceSection) | keys_of(FamilySection)
     assert {"rtol", "backend", "origin", "member"} < keys
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
@@ -91,7 +91,7 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
 
 
 def test_its_example_is_valid(tmp_path: Path) -> None:
-    study, lattice, besides = blocks("docs/studies.md", "toml")
+    study, lattice, listed, besides = blocks("docs/studies.md", "toml")
     (tmp_path / "study.toml").write_text(study)
     assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
     (tmp_path / "study.toml").write_text(study.replace("[accuracy]\nrtol = 1e-3\n", lattice))
@@ -99,6 +99,10 @@ def test_its_example_is_valid(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(f"{study}\n{besides}")
     asked = Study.from_toml(tmp_path / "study.toml")
     assert (asked.witness, asked.proximity) == ((-2.0,), 20_000)
+    (tmp_path / "study.toml").write_text(f"{study}\n{listed}")
+    (tmp_path / "remeshed.csv").write_text(blocks("docs/studies.md", "csv")[0])
+    coarse, fine = Study.from_toml(tmp_path / "study.toml").families[1].source.members(tmp_path)
+    assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
 
 
 @pytest.mark.parametrize("name", ["icosphere", "cortex"])
@@ -107,48 +111,48 @@ def test_the_workflows_are_valid(name: str) -> None:
 
 
 BROKEN = [
-    ("study.nam", "x", "unknown key study.nam"),
-    ("stdy", {}, "unknown key stdy"),
+    ("study.nam", "x", "[study]: unknown key nam: did you mean name?"),
+    ("stdy", {}, "unknown section [stdy]: did you mean [study]?"),
     (
         "study.name",
         "",
-        "study.name: a name is 1 to 100 visible characters, blanks only between them, without / and \\; it is",
+        "[study]: name: a name is 1 to 100 visible characters, blanks only between them, without / and \\; it is",
     ),
     ("study.name", "a/b", "without / and \\; it holds '/', found 'a/b'"),
     ("study.name", "a\nb", "it holds the invisible character U+000A"),
     ("study.name", " a", "it begins or ends with a blank"),
     ("study.name", "x" * 10_000, "it has 10000 characters, 100 are allowed"),
-    ("study.name", 3, "study.name: input should be a valid string, found 3"),
+    ("study.name", 3, '[study]: name must be text in quotes, such as name = "3", found 3'),
     ("lattice.M", 17, "M must be an even integer from 2 to 2048, found 17"),
-    ("lattice.M", 16.0, "lattice.M: input should be a valid integer, found 16.0"),
-    ("lattice.M", "16", "lattice.M: input should be a valid integer, found '16'"),
-    ("lattice.M", True, "lattice.M: input should be a valid integer, found True"),
+    ("lattice.M", 16.0, "[lattice]: M must be a whole number, such as M = 16, found 16.0"),
+    ("lattice.M", "16", "[lattice]: M must be a whole number, such as M = 16, found '16'"),
+    ("lattice.M", True, "[lattice]: M must be a whole number, such as M = 64, found true"),
     ("lattice.xi_max", -1.0, "xi_max must be positive"),
-    ("lattice.xi_max", float("nan"), "lattice.xi_max: input should be a finite number"),
+    ("lattice.xi_max", float("nan"), "[lattice]: xi_max must be a finite number"),
     ("norm.orders", [-0.5], "orders below -1/2, found -0.5"),
     ("norm.orders", [-2.0, 1], "orders below -1/2, found 1"),
-    ("norm.orders", [], "norm.orders: tuple should have at least 1 item"),
-    ("norm.orders", -2.0, "norm.orders: input should be a valid tuple"),
-    ("norm.orders", ["-2"], "norm.orders.0: input should be a valid number"),
-    ("norm.pairs", "some", "norm.pairs: input should be 'all' or 'reference'"),
+    ("norm.orders", [], "[norm]: orders must be a list with 1 or more entries"),
+    ("norm.orders", -2.0, "[norm]: orders must be a list, such as orders = [-2.0], found -2.0"),
+    ("norm.orders", ["-2"], "[norm]: entry 1 of orders must be a number, such as -2"),
+    ("norm.pairs", "some", "[norm]: pairs must be 'all' or 'reference'"),
     ("transform.eps", 1e-20, "eps must lie between 1e-14 and 0.1"),
-    ("transform.dtype", "float64", "transform.dtype: input should be 'complex128' or 'complex64'"),
+    ("transform.dtype", "float64", "[transform]: dtype must be 'complex128' or 'complex64'"),
     ("transform.quadrature", "gauss9", "quadrature must be"),
     ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
     ("scaling.mode", "fixed", "scale and origin belong to mode = 'fixed'"),
-    ("reference", {}, "reference: no source is named None"),
-    ("reference", {"source": "spere"}, "reference: no source is named 'spere'; known are decimate, ellipsoid, "),
-    ("reference", {"source": "os.system"}, "reference: no source is named 'os.system'"),
-    ("reference", {"source": "sphere", "radius": 0}, "reference: radius: input should be greater than 0"),
-    ("reference", {"source": "sphere", "radius": "1"}, "reference: radius: input should be a valid number"),
-    ("reference", {"source": "family", "family": "no"}, "reference: no family is named 'no'"),
-    ("family", [], "family: list should have at least 1 item"),
-    ("family", {}, "family: input should be a valid list"),
+    ("reference", {}, '[reference]: source is missing; add it, such as source = "files"'),
+    ("reference", {"source": "spere"}, "[reference]: no source is named 'spere'; known are decimate, ellipsoid, "),
+    ("reference", {"source": "os.system"}, "[reference]: no source is named 'os.system'"),
+    ("reference", {"source": "sphere", "radius": 0}, "[reference]: radius must be above 0"),
+    ("reference", {"source": "sphere", "radius": "1"}, "[reference]: radius must be a number, such as radius = 1.0"),
+    ("reference", {"source": "family", "family": "no"}, "[reference]: no family is named 'no'"),
+    ("family", [], "at least one [[family]] is needed"),
+    ("family", {}, "write [[family]], with two brackets on each side"),
     ("family.0.name", "reference", "no family can be named 'reference'"),
-    ("family.0.name", "../up", "family '../up': name: a name is 1 to 100 visible characters"),
-    ("family.0.levels", [0, 1.5], "family 'ico': levels.1: input should be a valid integer"),
-    ("family.0.levels", [13], "family 'ico': levels.0: input should be less than or equal to 12"),
-    ("family.0.level", [1], "family 'ico': unknown key level"),
+    ("family.0.name", "../up", "[[family]] 1 (named '../up'): name: a name is 1 to 100 visible characters"),
+    ("family.0.levels", [0, 1.5], "[[family]] 1 (named 'ico'): entry 2 of levels must be a whole number"),
+    ("family.0.levels", [13], "[[family]] 1 (named 'ico'): entry 1 of levels must be at most 12"),
+    ("family.0.level", [1], "[[family]] 1 (named 'ico'): unknown key level: did you mean levels?"),
 ]
 
 
@@ -170,7 +174,7 @@ def test_all_offenders_are_listed() -> None:
     table = changed("lattice.M", "x")
     table["norm"]["pairs"] = 3
     del table["reference"]
-    with pytest.raises(StudyError, match=r"lattice\.M.*norm\.pairs.*reference is missing"):
+    with pytest.raises(StudyError, match=r"\[lattice\]: M .*\[norm\]: pairs .*\[reference\] is missing"):
         Study.from_table(table)
 
 

@@ -157,7 +157,7 @@ def test_no_family_is_called_reference(name: str) -> None:
 def test_sources_are_looked_up_and_never_imported(name: str) -> None:
     loaded = set(sys.modules)
     message = refusal(changed("family.0.source", name))
-    assert "family 'ico': no source is named " in message
+    assert "[[family]] 1 (named 'ico'): no source is named " in message
     assert name[:8].strip() in message
     assert "known are decimate, ellipsoid, ellipsoid-levels, files, fit, flow, icosphere" in message
     assert set(sys.modules) == loaded
@@ -166,20 +166,20 @@ def test_sources_are_looked_up_and_never_imported(name: str) -> None:
 # Sizes: refused before memory is spent, with what was asked and what is allowed.
 
 OVERSIZED: dict[str, tuple[str, Any, str, str]] = {
-    "level": ("family.0.levels", [30], "levels.0: .*30", "12"),
+    "level": ("family.0.levels", [30], "entry 1 of levels .*30", "12"),
     "levels": ("family.0.levels", [1] * 1_000_00, "levels: .*100000", "1000"),
     "levels that are all wrong": ("family.0.levels", [30] * 100_000, "levels: .*100000", "1000"),
     "lattice": ("lattice.M", 10**6, "M must be .*1000000", "2048"),
-    "orders": ("norm.orders", [-1.0 - k for k in range(10**5)], "norm.orders: .*100000", "100"),
+    "orders": ("norm.orders", [-1.0 - k for k in range(10**5)], "orders: .*100000", "100"),
     "order": ("norm.orders", [-(10.0**5)], "-100000", "-100"),
     "many digits": ("lattice.M", 1 << 20_000, "lattice.M: .*20001 bits", str(2**63 - 1)),
     "radius": ("reference.radius", 1 << 64, "reference.radius: .*65 bits", str(2**63 - 1)),
     "text": ("study.title", "x" * 10**7, "study.title: .*10000000", "10000"),
-    "title": ("study.title", "x" * 2000, "study.title: .*2000", "1000"),
+    "title": ("study.title", "x" * 2000, "title: .*2000", "1000"),
     "triangles": (
         "family",
         [{"name": "d", "source": "decimate", "mesh": {"source": "icosphere", "levels": [1]}, "triangles": [10**12]}],
-        r"family 'd': triangles.0: .*1000000000000",
+        r"named 'd'\): entry 1 of triangles .*1000000000000",
         "1000000000",
     ),
     "paths": ("family", [{"name": "f", "source": "files", "paths": ["a"] * 100_001}], "paths: .*100001", "100000"),
@@ -211,8 +211,8 @@ def test_all_values_together_are_bounded() -> None:
 
 def test_of_many_offenders_the_first_are_listed() -> None:
     message = refusal(changed("norm.orders", ["x"] * 100))
-    assert message.count("input should be a valid number") == 10
-    assert message.endswith("; and 91 more")  # the list counts as too short besides
+    assert message.count("must be a number") == 10
+    assert message.endswith("; and 90 more")
 
 
 @pytest.mark.parametrize("depth", [21, 1000, 200_000])
@@ -229,7 +229,7 @@ def test_deep_tables_are_refused(depth: int) -> None:
 def test_unknown_keys_are_named_on_one_line(key: str) -> None:
     table = small_table()
     table["study"][key] = 1
-    assert "unknown key study." in refusal(table)
+    assert "[study]: unknown key " in refusal(table)
 
 
 def test_keys_must_be_strings() -> None:
@@ -248,7 +248,7 @@ def test_duplicate_keys_and_tables_are_refused(tmp_path: Path) -> None:
 
 
 FILES: dict[str, tuple[bytes, str]] = {
-    "empty": (b"", "study is missing"),
+    "empty": (b"", r"\[study\] is missing"),
     "byte order mark": (codecs.BOM_UTF8 + b"[study]\n", "begins with a byte order mark; save it as UTF-8 without one"),
     "UTF-16": ("[study]\n".encode("utf-16"), "not a TOML file: .*save it as UTF-8"),
     "Latin-1": ('[study]\nname = "ü"\n'.encode("latin-1"), "not a TOML file: .*save it as UTF-8"),

@@ -16,19 +16,6 @@ import sobolev_batch as sb
 from sobolev_batch.results.figures.plots import write_plots
 
 
-def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTree) -> None:
-    axes = sb.plot_convergence(tree)
-    assert axes.get_title() == "order -10"
-    assert sb.plot_convergence(tree, -2.5).get_title() == "order -2.5"
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
-    assert labels == ["f_1", "slope 2"]
-    data = axes.lines[0].get_xydata()
-    assert np.allclose(data, [[0.1, 0.025], [0.2, 0.1]])
-    slope = np.asarray(axes.lines[1].get_xydata())
-    assert np.log(slope[1, 1] / slope[0, 1]) / np.log(2) == pytest.approx(2.0)
-    assert axes.get_xscale() == axes.get_yscale() == "log"
-
-
 def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
     axes = sb.plot_transform(tree)
     labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
@@ -65,12 +52,14 @@ def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> N
     places = np.concatenate([line.get_xydata() for line in sb.plot_map(pairs, -10.0).lines])
     assert np.ptp(places[:, 0]) == pytest.approx(0.4)
     assert np.allclose(places[:, 1], 0, atol=1e-7)
-    names = [path.name for path in write_plots(pairs, tmp_path)]
+    names = [path.name for path in write_plots(pairs, tmp_path).paths]
     assert names == ["convergence.png", "transform.png", "matrix.png", "map.png"]
+    alone = sb.plot_matrix(pairs, -10.0, family="_*")
+    assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
 def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:
-    for path in write_plots(tree, tmp_path / "new" / "folder"):
+    for path in write_plots(tree, tmp_path / "new" / "folder").paths:
         assert path.read_bytes().startswith(b"\x89PNG")
     (tmp_path / "file").write_text("")
     with pytest.raises(sb.StoreError, match="pictures cannot be written there"):
@@ -90,8 +79,11 @@ def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTre
 def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
     with pytest.raises(sb.InputError, match="no order -3, only -10"):
         sb.plot_convergence(tree, -3)
-    with pytest.raises(sb.InputError, match="no mesh of the family 'g' is computed, only of: f_1"):
-        sb.plot_transform(tree, "g")
+    with pytest.raises(sb.InputError, match="no mesh of the family is computed, only of: f_1"):
+        sb.plot_transform(tree, "reference")
+    for plot in (sb.plot_convergence, sb.plot_transform, sb.plot_matrix, sb.plot_map):
+        with pytest.raises(sb.InputError, match="the study has no family 'g\\*', only f_1, reference"):
+            plot(tree, family="g*")
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
     alone = xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest})
     for plot in (sb.plot_matrix, sb.plot_map):

@@ -17,7 +17,9 @@ from click.testing import CliRunner, Result
 from plyfile import PlyData
 
 import sobolev_batch as sb
+from sobolev_batch.batch.store.comparison_records import ComparisonRecords
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.cli import cli
 from sobolev_batch.results.meshes.export import Exporter
 from sobolev_batch.results.meshes.witness import witness_at_vertices
@@ -167,7 +169,14 @@ def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
     fresh = witness_at_vertices(tree.drop_nodes("witness"), label, sb.icosphere(2), ORDERS)
     assert expected == pytest.approx(fresh, rel=1e-7)
     # No evaluation finds these.
-    Store.open(place).array("witness/witness")[1, :, :162] = 2 * expected
+    store = Store.open(place)
+    row, records = store.labels().index(label), ComparisonRecords(store, "witness")
+    record = records.read_row(row)
+    assert record is not None
+    store.array("witness/witness")[row, :, :162] = 2 * expected
+    with pytest.raises(sb.DamageError, match="witness/witness is damaged"):
+        sb.write_witness(place, label, path)
+    records.write(row, replace(record, checksum=Witnesses(store).write(row, 2 * expected)))
     sb.write_witness(place, label, path)
     vertices = PlyData.read(path)["vertex"]
     for name, row in zip(("witness_minus_4", "witness_minus_2_5"), expected, strict=True):
@@ -218,7 +227,8 @@ def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres:
     failed = call(place, "--output", tmp_path, "--folder", folder, "--mesh", "files/bad", "--mesh", "closed/sphere")
     assert failed.exit_code == 3
     assert (
-        failed.stderr == "files/bad: its status is 'failed'\nclosed/sphere: a surface in closed form has no triangles\n"
+        failed.stderr
+        == "files/bad: its status is 'failed'\nclosed/sphere: a surface that is no mesh has no triangles\n"
     )
 
 

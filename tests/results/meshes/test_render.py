@@ -118,15 +118,17 @@ def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Pa
     done = CliRunner().invoke(cli, [*options, "--witness", LABELS[1], "--witness", "closed/sphere"])
     assert done.exit_code == 3
     assert done.stderr == (
-        "not drawn with their witness functions: closed/sphere: a surface in closed form has no triangles\n"
+        "convergence: not drawn: 1 not computed, 1 without edges; families not drawn: closed\n"
+        "not drawn with their witness functions: closed/sphere: a surface that is no mesh has no triangles\n"
     )
     path = Path(done.stdout.splitlines()[-1])
     assert path == tmp_path / "witness-0002-files-beside.png"
     picture = imread(path)[..., :3]
-    # Two panels, in each of which the sphere is red to the right, towards which it is shifted.
-    left, right, left_too, right_too = (part.mean() for part in np.array_split(redness(picture), 4, axis=1))
-    assert right > left + 0.1
-    assert right_too > left_too + 0.1
+    # Two panels, seen from the side to which the sphere is shifted: it is red in the middle of each.
+    for panel in np.array_split(redness(picture), 2, axis=1):
+        height, width = panel.shape
+        middle = panel[2 * height // 5 : 3 * height // 5, 2 * width // 5 : 3 * width // 5]
+        assert middle.mean() > panel.mean() + 0.1
     assert len(list(tmp_path.glob("witness-*"))) == 1
 
 
@@ -136,8 +138,8 @@ def test_plot_does_without_what_cannot_be_drawn(
     place, folder = spheres
     elsewhere = CliRunner().invoke(cli, ["plot", place, "--output", str(tmp_path), "--folder", str(tmp_path)])
     assert elsewhere.exit_code == 0
-    assert elsewhere.stderr.count("\n") == 1
-    assert "No such file" in elsewhere.stderr
+    (reason,) = (line for line in elsewhere.stderr.splitlines() if line.startswith("not drawn with"))
+    assert "No such file" in reason
     assert not list(tmp_path.glob("witness-*"))
     monkeypatch.setattr(rendering, "find_spec", lambda _: None)
     paths, absent = write_witness_plots(open_store(place), tmp_path, folder, LABELS[:2])

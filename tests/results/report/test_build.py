@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import xarray as xr
 from click.testing import CliRunner
@@ -19,7 +21,7 @@ from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere,
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.spectra import Spectra
 from sobolev_batch.results.meshes.views import make_views
-from sobolev_batch.results.report import build
+from sobolev_batch.results.report import build, pictures
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.status import Status
@@ -28,7 +30,8 @@ from tests.support.browser import Browser, browser
 SCRIPT = "<script>window.ran=1</script>"
 IMAGE = '"><img src=x onerror="window.ran=2">'
 # A slash is no part of a name, so that of a family the script stays open.
-FAMILY = 'ico <script>window.ran=3 "><img src=x onerror=window.ran=4> $^$ %{x}'
+# A spreadsheet would take it for a formula, too.
+FAMILY = '=ico <script>window.ran=3 "><img src=x onerror=window.ran=4> $^$ %{x}'
 
 
 def table(folder: Path) -> dict[str, Any]:
@@ -72,7 +75,9 @@ def page(store: str, folder: Path) -> Path:
     """What the command writes."""
     path = folder / "report.html"
     done = CliRunner().invoke(cli, ["report", store, "--output", str(path), "--folder", str(folder)])
-    assert done.output.strip() == str(path)
+    assert done.stdout.strip() == str(path)
+    # By default those at the ends of each family.
+    assert done.stderr.startswith("left out: witness functions: only 3 of 4 meshes are drawn; --witness chooses them")
     return path
 
 
@@ -80,7 +85,7 @@ def page(store: str, folder: Path) -> Path:
 def reader(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """The page on a desktop; tests that change it leave it as they found it."""
     with browser(tmp_path_factory.mktemp("profile")) as found:
-        found.open(page)
+        found.open_report(page)
         yield found
 
 
@@ -91,7 +96,7 @@ def test_page_loads_without_complaint_or_request(reader: Browser, page: Path) ->
         "[...document.querySelectorAll('.chart')].map(e => [e.id, e.querySelectorAll('svg').length > 0])"
     )
     assert drawn == [[f"chart-{name}", True] for name in _CHARTS]
-    assert page.stat().st_size < 15e6
+    assert page.stat().st_size < 4e6
 
 
 def test_no_name_becomes_markup(reader: Browser) -> None:
@@ -110,6 +115,7 @@ def test_failures_are_shown_with_their_reasons(reader: Browser) -> None:
     assert reader.texts("#failed tbody th") == ["files/<b>bad<"]
     assert "bad<.ply" in reader.texts("#failed td")[0]
     assert "1 mesh is missing" in reader.texts("header .warning")[0]
+    assert reader.texts("#table-verdict tbody:not([hidden]) tr:last-child > *") == ["missing", "files/<b>bad<: see why"]
     rows = reader.texts("#table-convergence tbody:not([hidden]) tr")
     assert any("failed: see why" in row for row in rows)
 
@@ -118,19 +124,20 @@ def test_columns_sort_by_clicks_and_keys(reader: Browser) -> None:
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
-    shown = "#table-convergence tbody:not([hidden]) tr:not(.of-order) > :nth-child(2)"
-    button = reader.driver.find_elements(By.CSS_SELECTOR, "#table-convergence thead button")[1]
+    shown = "#table-convergence tbody:not([hidden]) tr:not(.of-order) > :nth-child(3)"
+    last = "#table-convergence tbody:not([hidden]) tr:last-child td"
+    button = reader.driver.find_elements(By.CSS_SELECTOR, "#table-convergence thead button")[2]
     reader.driver.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", button)
     button.click()
-    assert reader.texts(shown) == ["20", "80", "80", "320", "failed: see why"]
-    assert reader.tell("document.querySelectorAll('#table-convergence thead th')[1].ariaSort") == "ascending"
+    assert (reader.texts(shown), reader.texts(last)) == (["20", "80", "80", "320"], ["failed: see why"])
+    assert reader.tell("document.querySelectorAll('#table-convergence thead th')[2].ariaSort") == "ascending"
     button.send_keys(Keys.ENTER)
-    assert reader.texts(shown) == ["320", "80", "80", "20", "failed: see why"]
+    assert (reader.texts(shown), reader.texts(last)) == (["320", "80", "80", "20"], ["failed: see why"])
     assert reader.tell("document.activeElement.closest('th').ariaSort") == "descending"
     # On to the next column by keys alone.
     reader.driver.switch_to.active_element.send_keys(Keys.TAB)
     reader.driver.switch_to.active_element.send_keys(Keys.SPACE)
-    edges = [float(text) for text in reader.texts(shown.replace("2)", "3)"))]
+    edges = [float(text) for text in reader.texts(shown.replace("3)", "4)"))]
     assert edges == sorted(edges)
     assert len(edges) == 4
 
@@ -141,22 +148,46 @@ def test_the_order_switches_tables_and_pictures(reader: Browser, store: str) -> 
 
     frame = sb.table(store).dropna(subset="distance")
     for order, name in ((-10.0, "−10"), (-3.0, "−3")):
-        assert reader.texts(".current-order b") == [name]
-        shown = [float(x.split()[0]) for x in reader.texts("#table-convergence tbody:not([hidden]) td:nth-of-type(3)")]
-        assert sorted(shown) == pytest.approx(sorted(frame[frame["order"] == order]["distance"]), rel=0.02)
+        assert reader.texts(".current-order b") == [name, name]
+        assert f"at order {name}" in reader.texts(".lead")[0]
+        cells = reader.texts("#table-convergence tbody:not([hidden]) td:not(.absent):nth-of-type(1)")
+        percent = 100 * frame[frame["order"] == order]["relative"]
+        assert sorted(float(text.split()[0]) for text in cells) == pytest.approx(sorted(percent), rel=0.05)
         drawn = reader.tell("document.getElementById('chart-convergence').data[0].y")
         here = frame[(frame["order"] == order) & (frame["family"] == FAMILY)]
         assert sorted(drawn) == pytest.approx(sorted(here["relative"]), rel=1e-3)
         reader.driver.find_element(By.CSS_SELECTOR, "input[name=order]:checked").send_keys(Keys.ARROW_RIGHT)
     # Around to the first one.
-    assert reader.texts(".current-order b") == ["−10"]
+    assert set(reader.texts(".current-order b")) == {"−10"}
 
 
-def test_a_phone_is_wide_enough(reader: Browser, page: Path) -> None:
-    reader.open(page, width=360, height=740)
-    assert reader.tell("innerWidth") == 360
-    assert reader.tell("document.documentElement.scrollWidth") <= 360
-    assert reader.tell("document.querySelector('.scroll').scrollWidth > document.querySelector('.scroll').clientWidth")
+@pytest.mark.parametrize("width", [360, 390, 768, 1280])
+def test_mesh_and_distance_are_seen_at_every_width(reader: Browser, page: Path, width: int) -> None:
+    reader.open(page, width=width, height=740)
+    assert reader.tell("innerWidth") == width
+    assert reader.tell("document.documentElement.scrollWidth") <= width
+    assert reader.relative_columns() == {"table-verdict": True, "table-convergence": True}
+    is_scrolled = reader.tell("[...document.querySelectorAll('.scroll')].some(e => e.scrollWidth > e.clientWidth)")
+    assert is_scrolled or width > 400
+
+
+def test_csv_has_all_orders_and_all_digits(reader: Browser, store: str, tmp_path: Path) -> None:
+    names = {f"hostile-{name}.csv" for name in ("verdict", "convergence", "failed", "meshes")}
+    assert reader.download_tables(tmp_path) == names
+    frame = pd.read_csv(tmp_path / "hostile-convergence.csv").set_index(["order", "mesh"])
+    known = sb.table(store)
+    # Harmless in a spreadsheet.
+    known["mesh"] = ["'" * label.startswith("=") + label for label in known["mesh"]]
+    known = known.set_index(["order", "mesh"]).loc[frame.index]
+    assert len(frame) == len(known) == 10
+    numbers = ["relative", "relative_error", "distance", "error", "edge_length", "rate", "rate_error"]
+    pd.testing.assert_frame_equal(frame[numbers], known[numbers], check_exact=True)
+    assert frame["status"].xs("files/<b>bad<", level="mesh").tolist() == ["failed", "failed"]
+    unresolved = frame["relative"] <= frame["relative_error"]
+    assert (frame[unresolved]["status"] == "below its error").all()
+    verdict = pd.read_csv(tmp_path / "hostile-verdict.csv")
+    assert verdict["order"].unique().tolist() == [-10.0, -3.0]
+    assert (verdict["verdict"] == "nearest of all").sum() == 2
 
 
 def test_dark_mode_changes_page_and_pictures(reader: Browser, page: Path) -> None:
@@ -229,7 +260,7 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
     tree = open_store(store)
     made = make_views(tree, folder, ["files/good", "reference", "files/<b>bad<"])
     assert made.missing == {
-        "reference": "a surface in closed form has no triangles",
+        "reference": "a surface that is no mesh has no triangles",
         "files/<b>bad<": "its status is 'failed'",
     }
     (view,) = made.views
@@ -251,15 +282,24 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
 
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: dict[str, list[Any]] = {name: [] for name in _CHARTS}
-    monkeypatch.setattr(build, "_pictures", lambda *_: nothing)
-    text = make_report(store, folder=folder, limits=ReportLimits(convergence_rows=6, mesh_rows=2, pairs=3, spectra=2))
+    monkeypatch.setattr(build, "study_pictures", lambda *_: nothing)
+    limits = ReportLimits(convergence_rows=6, mesh_rows=2, pairs=3, spectra=2, points=6)
+    page = make_report(store, folder=folder, limits=limits)
     for note in (
         "2 more meshes are not shown here; <code>sobolev-batch table --format csv</code>",
         "4 more meshes are not shown here.",
         "The first 3 of 5 meshes are shown, including the reference",
         "2 of 4 meshes are shown, spread evenly through the study",
     ):
-        assert note in text
+        assert note in page.text
+    for omission in (
+        "the table of distances: 2 more meshes",
+        "the table of meshes and timings: 4 more meshes",
+        "the chart of convergence: only 6 of 8 distances are drawn",
+        "all pairs: only 3 of 5 meshes are shown",
+        "spectra: only those of 2 of 4 meshes are shown",
+    ):
+        assert omission in page.omissions
 
 
 def test_a_page_without_rendered_pictures_says_why(
@@ -271,8 +311,10 @@ def test_a_page_without_rendered_pictures_says_why(
     def nothing(*_: object) -> None:
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
-    monkeypatch.setattr(build, "render", nothing)
-    assert make_report(store, folder=folder).count(note) == 1
+    monkeypatch.setattr(pictures, "render", nothing)
+    page_without = make_report(store, folder=folder)
+    assert page_without.text.count(note) == 1
+    assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in page_without.omissions
 
 
 def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path) -> None:
@@ -289,9 +331,10 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
     assert sb.report(place, path) == path
     with browser(tmp_path / "profile") as reader:
         reader.open(path)
-        assert reader.texts("#table-convergence thead th")[-2:] == ["Hausdorff ≥", "Chamfer"]
+        heads = reader.texts("#table-convergence thead th")
+        assert heads[-2:] == ["Hausdorff ≥", "Chamfer ± s.e."]
         cells = reader.texts("#table-convergence tbody:not([hidden]) tr:last-child td")
-        assert len(cells) == 9
+        assert len(cells) == len(heads) - 1  # The label is a head, too.
         assert "±" in cells[-1]
         assert "Chamfer is the mean distance" in reader.texts("#convergence")[0]
         assert "proximity" in reader.texts("#study-settings dt")
@@ -300,7 +343,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(Status.of(store), not_compared={"files/good": "no witness: <i>changed</i>"})
     monkeypatch.setattr(Status, "of", lambda _: status)
-    text = make_report(store)
+    text = make_report(store).text
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
     assert "no witness: &lt;i&gt;changed&lt;/i&gt;" in text
@@ -318,7 +361,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="no store of a study is there"):
         make_report(tmp_path)
-    monkeypatch.setattr(build, "make_report", lambda *_, **__: "")
+    monkeypatch.setattr(build, "make_report", lambda *_, **__: build.Page("", ()))
     with pytest.raises(StoreError, match="cannot be written there"):
         sb.report(store, tmp_path / "nowhere" / "a.html")
 
@@ -330,7 +373,7 @@ def test_what_is_missing_is_said(store: str, monkeypatch: pytest.MonkeyPatch) ->
         patch.setattr(build, "as_tree", lambda store: empty)
         with pytest.raises(InputError, match="no tables yet: run the study to its end"):
             make_report(store)
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(InputError, match=r"library plotly.*pip install 'sobolev-batch\[report\]'"):
         make_report(store)
 

@@ -75,6 +75,8 @@ def test_the_true_surface_may_move(store: Path) -> None:
         there = found.sel(family=family, time=0.8)
         difference = np.abs(there["distance"].values - expected["distance"].values)
         assert (difference <= there["error"].values + expected["error"].values).all()
+        apart = np.abs(there["relative"].values - expected["relative"].values)
+        assert (apart <= there["relative_error"].values + expected["relative_error"].values).all()
     # Nobody knows where the true surface was at this time.
     assert np.isnan(found["distance"].sel(time=1.2).values).all()
 
@@ -91,7 +93,7 @@ def test_a_new_mesh_pays_once_the_distance_has_certainly_grown(store: Path) -> N
 def test_text_and_data(store: Path) -> None:
     tree = sb.open_store(store)
     text = format_evolution(tree, "text", [-4.0], truth="true", factor=1.01).splitlines()
-    assert text[0] == "Sobolev distance of order -4 to true over time"
+    assert text[0] == "Sobolev distance of order -4 to true over time, in % of its norm"
     assert text[2].split() == ["time", "coarse", "late"]
     assert text[4].split()[0] == "0"
     assert text[4].split()[2:] == ["1.00", "×"]
@@ -100,7 +102,7 @@ def test_text_and_data(store: Path) -> None:
     assert "coarse: the distance has at no time certainly grown to 1e+06 times the first" in still
     assert max(map(len, text)) <= 100
     frame = pd.read_csv(io.StringIO(format_evolution(tree, "csv")))
-    assert list(frame) == ["order", "family", "time", "distance", "error", "growth"]
+    assert list(frame) == ["order", "family", "time", "distance", "error", "relative", "relative_error", "growth"]
     assert len(frame) == 2 * 9
     assert json.loads(format_evolution(tree, "json", [-2.0]))[0]["growth"] == 1.0
     assert "toprule" in format_evolution(tree, "latex")
@@ -186,8 +188,12 @@ def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
     axes = sb.plot_evolution(store, -4.0, truth="true")
     legend = axes.get_legend()
     assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late"]
+    assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
     assert axes.get_title() == "order -4"
+    late = sb.plot_evolution(store, -4.0, truth="true", family="l*")
+    assert [line.get_label() for line in late.lines][:1] == ["late"]
+    with pytest.raises(sb.InputError, match="none of the chosen families moves, only coarse, late"):
+        sb.plot_evolution(store, -4.0, truth="true", family="still")
 
 
 def test_times_are_coordinates_of_all_tables(store: Path) -> None:
@@ -250,7 +256,7 @@ def test_a_report_draws_them(store: Path, tmp_path: Path) -> None:
     [
         ({"factor": 1.0}, "the factor must be larger than 1, found 1.0"),
         ({"truth": "still"}, "no family 'still' has times, only coarse, late, true"),
-        ({"order": -3.0}, "the store has no order -3"),
+        ({"order": -0.4}, "only for orders below -1/2, found -0.4"),
     ],
 )
 def test_wrong_questions(store: Path, arguments: dict[str, Any], message: str) -> None:

@@ -11,8 +11,9 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, matrix
+from sobolev_batch.results.tables.defaults import Format
 from sobolev_batch.results.tables.matrix import Matrix, format_matrix, matrix_frame
-from sobolev_batch.results.tables.text import Format
+from sobolev_batch.results.tables.orders import distances_at
 
 ORDERS = [-4.0, -2.0]
 
@@ -45,7 +46,7 @@ def made(count: int, failed: int = 1, others: str = "all") -> xr.DataTree:
 
 
 def test_frame_becomes_the_matrix() -> None:
-    frame = matrix_frame(made(4), -2.0)
+    frame = matrix_frame(distances_at(made(4), None), -2.0)
     assert frame.columns.tolist()[:4] == ["order", "mesh", "other", "distance"]
     pivoted = frame.pivot(index="mesh", columns="other", values="distance")
     public = matrix(made(4), -2.0)
@@ -65,11 +66,24 @@ def test_text_has_brackets_and_fits_a_terminal() -> None:
     text = format_matrix(made(15))
     lines = text.splitlines()
     assert max(map(len, lines)) <= 100
-    assert lines[0] == "Sobolev distances of order -4"
-    assert "Sobolev distances of order -2" in lines
+    assert lines[0] == "Sobolev distances of order -4, in the square root of a unit length"
+    assert "Sobolev distances of order -2, in the square root of a unit length" in lines
     row = next(line.split() for line in lines if line.startswith("4 f/3"))
-    assert row == ["4", "f/3", "3.00(3)e+00", "missing", "1.00(1)e+00"]
-    assert "1.234(5)e-02" in text.split("\n\n")[-1]
+    assert row == ["4", "f/3", "3.00(3)", "missing", "1.00(1)"]
+    assert "1.234(5) is 1.234 ± 0.005" in text.split("\n\n")[-1]
+
+
+@pytest.mark.parametrize("style", ["text", "markdown", "latex"])
+def test_people_get_per_cents_of_the_reference(style: Format) -> None:
+    tree = made(4)
+    columns = {"norm": (("mesh", "order"), np.full((5, 2), 50.0)), "error": (("mesh", "order"), np.full((5, 2), 0.5))}
+    norms = xr.Dataset(columns, coords={"mesh": tree["meshes"]["mesh"], "order": ORDERS})
+    text = format_matrix(xr.DataTree.from_dict({**tree.to_dict(), "/norms": norms}), style, [-4.0])
+    assert "Sobolev distances of order -4, in % of the norm of reference" in text
+    # 3 of 50, and (0.03 + 0.06 * 0.5)/49.5 = 0.0012.
+    assert re.search(r"5 reference[ |&]+2\.00\(5\)[ |&]+missing[ |&]+6\.0\(2\)", text)
+    # Programs get the distances themselves.
+    assert matrix(tree, -4.0).loc["reference", "f/2"] == 3.0
 
 
 def test_programs_get_lines_of_pairs() -> None:
@@ -103,9 +117,9 @@ def test_many_meshes_are_for_programs() -> None:
 
 def test_distances_to_the_reference_alone() -> None:
     tree = made(4, others="reference")
-    assert len(matrix_frame(tree, -4.0)) == 5
+    assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
     text = format_matrix(tree, "text", [-4.0])
-    assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)e+00"]
+    assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)"]
     assert Matrix.of(tree, -4.0) is None
 
 
@@ -121,7 +135,7 @@ def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
 
 
 def test_stores_of_earlier_versions_lack_a_column() -> None:
-    frame = matrix_frame(made(3), -4.0)
+    frame = matrix_frame(distances_at(made(3), -4.0), -4.0)
     assert "discretisation" in frame
     assert "statistical" not in frame
     with pytest.raises(InputError, match="values must be one of distance, error, truncation"):
@@ -129,8 +143,8 @@ def test_stores_of_earlier_versions_lack_a_column() -> None:
 
 
 def test_unknown_orders_and_unfinished_stores() -> None:
-    with pytest.raises(InputError, match="no order -3, only -4, -2"):
-        matrix_frame(made(3), -3.0)
+    with pytest.raises(InputError, match="the DataTree does not say where it was opened"):
+        distances_at(made(3), -3.0)
     with pytest.raises(InputError, match="no tables yet"):
         format_matrix(xr.DataTree())
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from sobolev_batch import (
     AccuracyError,
@@ -19,6 +21,10 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
+from sobolev_batch.spectral.adaptive import solve as solve_module
+from sobolev_batch.spectral.adaptive.problem import Problem, Solution
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import NormEstimate
 from tests.support.shapes import CENTRED_BOX as BOX
 
 
@@ -67,7 +73,7 @@ def test_low_accuracy_is_computed_in_single_precision() -> None:
 def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
     pair = icosphere(0), icosphere(1)
     with pytest.raises(
-        AccuracyError, match=r"rtol 1e-06 is out of reach at order -2: within 0\.6 GB .* about"
+        AccuracyError, match=r"rtol 1e-06 is out of reach at order -2 within 0\.6 GB .* about"
     ) as caught:
         distance(*pair, -2.0, rtol=1e-6, memory=6e8)
     assert caught.value.requested == 1e-6
@@ -75,6 +81,62 @@ def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
     copy = pickle.loads(pickle.dumps(caught.value))
     assert (str(copy), copy.reachable) == (str(caught.value), caught.value.reachable)
     assert distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
+
+
+def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
+    a, b, rtol = icosphere(3), Sphere(), 1e-12
+    with pytest.raises(AccuracyError, match="a best effort") as caught:
+        distance(a, b, -10.0, rtol=rtol, memory=6e8)
+    found = distance(a, b, -10.0, rtol=rtol, memory=6e8, best_effort=True)
+    assert not found["within"].item()
+    relative = found["error"].item() / found["distance"].item()
+    assert rtol < relative < 1.5 * caught.value.reachable
+
+
+def test_a_best_effort_aims_lower_where_that_comes_nearer(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = {1e-1: 0.08, 1e-2: 0.009, 1e-3: 0.2, 1e-4: 0.3}
+
+    def octaves(problem: Problem, seed: int) -> Solution:
+        rtol = problem.accuracy.rtol
+        estimate = NormEstimate(np.ones(1), np.array([errors[rtol]]), *np.zeros((3, 1)))
+        shortfall = None if errors[rtol] <= rtol else problem.out_of_reach(estimate, "here")
+        return Solution(estimate, Lattice(1.0, 16), shortfall=shortfall)
+
+    def lattices(problem: Problem, step: object) -> Solution:
+        raise problem.out_of_reach(NormEstimate(np.ones(1), np.ones(1), *np.zeros((3, 1))), "there")
+
+    monkeypatch.setattr(solve_module, "solve_in_octaves", octaves)
+    monkeypatch.setattr(solve_module, "_solve_on_lattices", lattices)
+    for rtol in (1e-2, 1e-3, 1e-4):
+        accuracy = Accuracy(rtol, best_effort=True)
+        found = solve_module.solve(Problem.of((icosphere(0), icosphere(1)), (-0.6,), accuracy, "the distance", 1))
+        assert found.estimate.errors[0] == 0.009
+        assert (found.shortfall is None) == (rtol == 1e-2)
+
+
+def test_a_best_effort_that_succeeds_is_the_same() -> None:
+    a, b = icosphere(1), Sphere()
+    strict, best = (distance(a, b, -3.0, rtol=1e-2, best_effort=best) for best in (False, True))
+    # Sums in threads differ by rounding.
+    xr.testing.assert_allclose(strict, best, rtol=1e-3)
+    assert strict.attrs.keys() == best.attrs.keys()
+    with pytest.raises(InputError, match="a best effort is made for an rtol"):
+        distance(a, b, -3.0, lattice=Lattice(2.0, 16), best_effort=True)
+
+
+def test_a_looser_accuracy_is_never_harder() -> None:
+    # Cuboids repeat their faces, so that their tails are hard.
+    plate = Mesh(BOX.vertices * [1.0, 1.0, 0.05], BOX.triangles)
+    met, reachable = [], []
+    for rtol in (3e-1, 1e-1, 1e-2):
+        try:
+            met.append(bool(distance(BOX, plate, -1.0, rtol=rtol)["within"].item()))
+        except AccuracyError as refusal:
+            met.append(False)
+            reachable.append(refusal.reachable)
+    assert met == sorted(met, reverse=True)
+    for rtol in reachable:
+        assert distance(BOX, plate, -1.0, rtol=rtol)["within"].item()
 
 
 def test_equal_surfaces_have_the_distance_zero() -> None:
@@ -118,8 +180,8 @@ def test_refuses_what_has_no_meaning() -> None:
             distance(BOX, Sphere(), -2.0, **wrong)
     with pytest.raises(InputError, match=r"memory must be a positive number of bytes, or a size .* found 'much'"):
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory="much")
-    with pytest.raises(InputError, match="expected a Mesh"):
-        distance("box.ply", Sphere(), -2.0, rtol=1e-3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"expected a Mesh, the path of a mesh file, .*; found int"):
+        distance(7, Sphere(), -2.0, rtol=1e-3)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"1e-06 GB of memory are too little"):
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
 
@@ -181,3 +243,45 @@ def test_many_orders_at_once_are_met_together() -> None:
     dataset = distance(Sphere(), Sphere(1.01), orders, rtol=1e-2)
     assert dataset["within"].all()
     assert (abs(dataset["distance"] - exact) <= dataset["error"]).all()
+
+
+SIDES, HEIGHT = 144, 0.2
+
+
+def ring(turn: float) -> Mesh:
+    """A prism of many sides without its ends, turned by a part of a side."""
+    low = np.hstack([corners(turn), np.full((SIDES, 1), -HEIGHT / 2)])
+    i = np.arange(SIDES)
+    j = (i + 1) % SIDES
+    triangles = np.vstack([np.stack([i, j, i + SIDES], axis=1), np.stack([j, j + SIDES, i + SIDES], axis=1)])
+    return Mesh(np.vstack([low, low + np.array([0.0, 0.0, HEIGHT])]), triangles)
+
+
+def corners(turn: float) -> np.ndarray:
+    angles = 2 * math.pi * (np.arange(SIDES) + turn) / SIDES
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def transform_of_ring(turn: float, frequencies: np.ndarray) -> np.ndarray:
+    """Of each side, a rectangle: its area, two cardinal sines and a phase."""
+    here = corners(turn)
+    there = np.roll(here, -1, axis=0)
+    along = np.sinc(frequencies[:, :2] @ (there - here).T)
+    phase = np.exp(-2j * math.pi * frequencies[:, :2] @ (here + there).T / 2)
+    width = math.dist(here[0], there[0])
+    return np.asarray(HEIGHT * width * np.sinc(HEIGHT * frequencies[:, 2]) * (along * phase).sum(axis=1))
+
+
+def test_a_turned_ring_differs_although_no_small_lattice_shows_it() -> None:
+    found = distance(ring(0.0), ring(0.5), -2.0, rtol=0.3)
+    # The integral over frequencies at which the sides can be told apart, by draws with even logarithms of |xi|.
+    rng, low, high = np.random.default_rng(1), SIDES / (4 * math.pi), 300.0
+    radii = np.exp(rng.uniform(math.log(low), math.log(high), 20_000))
+    directions = rng.standard_normal((len(radii), 3))
+    frequencies = radii[:, None] * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    weights = 4 * math.pi * radii**3 * math.log(high / low) * (1 + radii**2) ** -2.0
+    squares = weights * np.abs(transform_of_ring(0.0, frequencies) - transform_of_ring(0.5, frequencies)) ** 2
+    truth = math.sqrt(squares.mean())
+    spread = 3 * squares.std() / math.sqrt(len(radii)) / (2 * truth)
+    assert spread < 0.1 * truth
+    assert abs(found["distance"].item() - truth) < found["error"].item() + spread

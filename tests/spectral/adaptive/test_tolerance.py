@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from sobolev_batch import InputError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import NormEstimate
 
 
 def test_memory_limits_the_lattice() -> None:
@@ -20,6 +22,13 @@ def test_parts_add_up_to_the_accuracy() -> None:
         parts = accuracy.aliasing_part, accuracy.truncation_part(order), accuracy.discretisation_part(order)
         assert sum(parts) == pytest.approx(1e-3, rel=1e-14)
         assert min(parts) > 0
+
+
+def test_below_the_floor_errors_are_relative_to_it() -> None:
+    values, errors = np.array([4.0, 0.1, 0.0]), np.array([0.5, 0.15, 0.25])
+    found = NormEstimate(values, errors, *np.zeros((2, 3)))
+    assert Accuracy(0.1).met(found).tolist() == [False, False, False]
+    assert Accuracy(0.1, floor=2.0).met(found).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(

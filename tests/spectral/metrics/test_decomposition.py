@@ -172,7 +172,7 @@ def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = proportion(a, b, ORDERS)
     read = operands.read_blocks
     monkeypatch.setattr(
-        "sobolev_batch.spectral.metrics.decomposition.read_blocks",
+        "sobolev_batch.spectral.metrics.inputs.read_blocks",
         lambda lattice, *fields: read(lattice, *fields, largest=200),
     )
     in_blocks = proportion(a, b, ORDERS)

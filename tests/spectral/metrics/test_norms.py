@@ -94,8 +94,8 @@ def test_refuses_what_cannot_be_compared() -> None:
         distance(field, fourier_transform(Sphere(), Lattice(4.0, 30)), -2)
     with pytest.raises(InputError, match="needs a lattice"):
         norm(BOX, -2)
-    with pytest.raises(InputError, match="found str"):
-        norm("box.ply", -2)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="found dict"):
+        norm({}, -2)  # type: ignore[arg-type]
     with pytest.raises(LatticeError, match="select one mesh"):
         norm(field.expand_dims(mesh=["a"]), -2)
 

@@ -46,3 +46,9 @@ def test_distances_below_their_error_carry_no_rate() -> None:
 def test_equal_sizes_and_zero_distances_have_no_rate() -> None:
     assert np.isnan(observed_rates(np.array([1.0, 2.0]), np.zeros(2), np.array([0.1, 0.1]))[0]).all()
     assert np.isnan(observed_rates(np.array([1.0, 0.0]), np.zeros(2), np.array([0.2, 0.1]))[0]).all()
+
+
+def test_nearly_equal_sizes_are_bridged() -> None:
+    sizes = np.array([0.4, 0.2, 0.19])
+    rates, _ = observed_rates(np.array([0.16, 0.04, 0.0361]), np.zeros(3), sizes)
+    assert np.allclose(rates[1:], 2.0), "the third one is compared with the first: the second is as fine"

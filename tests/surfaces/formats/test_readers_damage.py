@@ -5,6 +5,8 @@ from __future__ import annotations
 import gzip
 import pickle
 import re
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,23 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import MeshError, read_mesh
-from tests.support.mesh_files import BIG, BOXES, LITTLE, Gltf, box_scene, gifti, obj, off, ply, stl_binary, stl_text
+from tests.support.mesh_files import (
+    BIG,
+    BOXES,
+    LITTLE,
+    Gltf,
+    VtkXml,
+    box_scene,
+    freesurfer,
+    freesurfer_quads,
+    gifti,
+    obj,
+    off,
+    ply,
+    stl_binary,
+    stl_text,
+    vtk,
+)
 from tests.support.shapes import (
     BOX_MIXED,
     BOX_QUADS,
@@ -57,6 +75,7 @@ STL_TEXT, STL_BINARY = stl_text(BOX_VERTICES, BOX_TRIANGLES), stl_binary(BOX_VER
 GLB_BOX, GLTF_BOX = box_scene().glb(), box_scene().gltf()
 INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
 GII_BOX = gifti(BOX_VERTICES, INT_TRIANGLES)
+VTP_BOX = VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES)
 GII_TEXT = gifti(BOX_VERTICES, INT_TRIANGLES, "GIFTI_ENCODING_ASCII")
 
 
@@ -282,6 +301,131 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "gifti, NaN": (".gii", gifti(nan_at(3), INT_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
     "gifti, no data": (".gii", b"<GIFTI/>", "found 0 and 0"),
     "gifti, other XML": (".gii", b"<svg><path/></svg>", ""),
+    # VTK.
+    "vtk, a face too many": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(13, 48)), "13 cells"),
+    "vtk, a number too many": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(12, 49)), "announces 49 .*found 48"),
+    "vtk, very many faces": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(10**15, 4 * 10**15)), "announces 4000"),
+    "vtk binary, a face too many": (
+        ".vtk",
+        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, counts=(13, 52)),
+        "announces",
+    ),
+    "vtk binary, very many faces": (
+        ".vtk",
+        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1", counts=(10**15, 36)),
+        "announces",
+    ),
+    "vtk binary 5, a corner too few": (
+        ".vtk",
+        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1", counts=(13, 35)),
+        "do not run from 0 up to the 35 corners",
+    ),
+    "vtk, offsets that fall": (
+        ".vtk",
+        changed(vtk(BOX_VERTICES, BOX_TRIANGLES, version="5.1"), b"\n0 3 6 9", b"\n0 9 6 3"),
+        "do not run from 0",
+    ),
+    "vtk, two corners": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1]]), "face 13 has 2 vertices"),
+    "vtk, index -1": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, -1]]), r"#12 = \[0, 1, -1\]"),
+    "vtk, index 8": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 8]], binary=True), r"#12 = \[0, 1, 8\]"),
+    "vtk, index with a fraction": (
+        ".vtk",
+        changed(vtk(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 0.7"),
+        "integer",
+    ),
+    "vtk, NaN": (".vtk", vtk(nan_at(3), BOX_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
+    "vtk, a strip of two": (".vtk", vtk(BOX_VERTICES, [[0, 1]], section="TRIANGLE_STRIPS"), "face 1 has 2 vertices"),
+    "vtk, lines alone": (".vtk", vtk(BOX_VERTICES, [[0, 1, 2]], section="LINES"), "no faces"),
+    "vtk, points twice": (".vtk", vtk(BOX_VERTICES, []) + b"POINTS 1 float\n0 0 0\n", "'POINTS' is there twice"),
+    "vtk, no points": (".vtk", re.sub(rb"POINTS.*\n.*\n", b"", vtk(BOX_VERTICES, BOX_TRIANGLES)), "no section POINTS"),
+    "vtk, tetrahedra": (".vtk", vtk(BOX_VERTICES, [[0, 1, 2, 4]], kinds=[10]), "VTK's type 10.*extract_surface"),
+    "vtk, a triangle of four corners": (
+        ".vtk",
+        vtk(BOX_VERTICES, BOX_QUADS, kinds=[5] * 6),
+        "4 corners, but .* have 3",
+    ),
+    "vtk, a kind too few": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, kinds=[5] * 11), "12 cells and 11 types"),
+    "vtk, an image": (
+        ".vtk",
+        changed(vtk([], []), b"POLYDATA", b"STRUCTURED_POINTS"),
+        "STRUCTURED_POINTS, no polygons",
+    ),
+    "vtk, a later version": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, version="6.0"), "version 6"),
+    "vtp, NaN": (".vtp", VtkXml().vtp(nan_at(3), BOX_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
+    "vtp, index -1": (".vtp", VtkXml().vtp(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, -1]]), r"outside 0\.\.7"),
+    "vtp, index of the next piece": (
+        ".vtp",
+        VtkXml().file("PolyData", [VtkXml().piece(BOX_VERTICES, [[0, 1, 8]]), VtkXml().piece(BOX_VERTICES)]),
+        r"1 of 1 triangles of a piece have indices outside 0\.\.7",
+    ),
+    "vtp, a point too many": (".vtp", changed(VTP_BOX, b'Points="8"', b'Points="9"'), "has 24 values, expected 27"),
+    "vtp, a face too many": (
+        ".vtp",
+        changed(VTP_BOX, b'Polys="12"', b'Polys="13"'),
+        "offsets .* 12 values, expected 13",
+    ),
+    "vtp, no faces": (".vtp", changed(VTP_BOX, b'Polys="12"', b'Polys="0"'), "no faces"),
+    "vtp, no piece": (".vtp", VtkXml().file("PolyData", []), "no faces"),
+    "vtp, a grid": (".vtp", VtkXml().vtu(BOX_VERTICES, BOX_TRIANGLES, [5] * 12), "name it after what it holds"),
+    "vtp, real indices": (".vtp", VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES, index="f4"), "float32, expected integers"),
+    "vtp, ghosts": (
+        ".vtp",
+        VtkXml().file(
+            "PolyData",
+            [
+                VtkXml().piece(
+                    BOX_VERTICES,
+                    BOX_TRIANGLES,
+                    more=f"<CellData>{VtkXml().array('vtkGhostType', [0] * 11 + [1], 'u1')}</CellData>",
+                )
+            ],
+        ),
+        "ghost cells",
+    ),
+    "vtp, LZ4": (
+        ".vtp",
+        changed(VtkXml("binary", "zlib").vtp(BOX_VERTICES, BOX_TRIANGLES), b"ZLib", b"LZ4"),
+        "compressed by vtkLZ4DataCompressor; save it with zlib",
+    ),
+    "vtp, a bad offset": (
+        ".vtp",
+        re.sub(rb'offset="\d+"', b'offset="99999"', VtkXml("raw").vtp(BOX_VERTICES, BOX_TRIANGLES)),
+        "more than the .* there are",
+    ),
+    "vtp, a damaged block": (
+        ".vtp",
+        changed(VtkXml("raw", "zlib").vtp(BOX_VERTICES, BOX_TRIANGLES), b"\x78\x9c", b"\x78\x9d"),
+        "",
+    ),
+    "vtu, tetrahedra": (".vtu", VtkXml().vtu(BOX_VERTICES, [[0, 1, 2, 4]], [10]), "VTK's type 10"),
+    # FreeSurfer.
+    "freesurfer, a triangle too many": (
+        "_lh.pial",
+        freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(8, 13)),
+        "announces",
+    ),
+    "freesurfer, a triangle too few": (
+        "_lh.pial",
+        freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(8, 11)),
+        "12 bytes behind",
+    ),
+    "freesurfer, very many": ("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(2**31 - 1, 8)), "2147483647"),
+    "freesurfer, negative": ("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(-8, 28)), "announces -8"),
+    "freesurfer, index -1": ("_lh.pial", freesurfer(BOX_VERTICES, [[0, 1, -1]]), r"#0 = \[0, 1, -1\]"),
+    "freesurfer, index 8": ("_lh.pial", freesurfer(BOX_VERTICES, [[0, 1, 8]]), r"#0 = \[0, 1, 8\]"),
+    "freesurfer, NaN": ("_lh.pial", freesurfer(nan_at(3), BOX_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
+    "freesurfer, no triangles": ("_lh.pial", freesurfer(BOX_VERTICES, np.zeros((0, 3))), "no triangles"),
+    "freesurfer, a quadrilateral too many": (
+        "_lh.pial",
+        freesurfer_quads(BOX_VERTICES, BOX_QUADS, counts=(8, 7)),
+        "8 vertices and 7 quadrilaterals",
+    ),
+    "freesurfer, thickness": (
+        "_lh.thickness",
+        b"\xff\xff\xff" + np.array([8, 12, 1], ">i4").tobytes() + bytes(32),
+        "values at vertices",
+    ),
+    "freesurfer, text": ("_lh.pial", b"#!ascii version of lh.pial\n", "begins with the bytes 23 21 61"),
 }
 
 
@@ -311,7 +455,7 @@ def test_bad_files_are_refused_by_name_when_zipped(tmp_path: Path, name: str) ->
     assert str(caught.value).startswith(f"{path}: ")
 
 
-FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii"]
+FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", ".vtk", ".vtp", ".vtu", "_lh.pial"]
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -334,7 +478,9 @@ def test_content_that_is_no_mesh_is_refused(tmp_path: Path, ending: str, content
 def test_a_mesh_under_another_format_s_name_is_refused(tmp_path: Path, name: str) -> None:
     own, content = BOXES[name]
     # The two forms of glTF can be told apart by their first bytes.
-    for ending in set(FORMATS) - ({".gltf", ".glb"} if own in (".gltf", ".glb") else {own}):
+    for ending in set(FORMATS) - (
+        {".gltf", ".glb"} if own in (".gltf", ".glb") else {own, "_lh.pial" if own == ".rh.white" else own}
+    ):
         path = tmp_path / f"scan{ending}"
         path.write_bytes(content)
         with pytest.raises(MeshError) as caught:
@@ -356,7 +502,7 @@ def test_empty_and_missing_files_are_told_apart(tmp_path: Path, ending: str) -> 
             read_mesh(path)
 
 
-@pytest.mark.parametrize("name", ["scan.xyz", "scan", "scan.gz", "ply", ".ply", "scan.ply.bak", "scan.ply.gz.gz"])
+@pytest.mark.parametrize("name", ["scan.pts", "scan", "scan.gz", "ply", ".ply", "scan.ply.bak", "scan.ply.gz.gz"])
 def test_names_without_a_known_format_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(PLY_BOX)
@@ -434,6 +580,13 @@ CUTTABLE: dict[str, tuple[str, bytes, int]] = {
     "glb": (".glb", Gltf([[(*TETRAHEDRON, None)]], [{"mesh": 0}]).glb(), 0),
     "gltf": (".gltf", Gltf([[(*TETRAHEDRON, None)]], [{"mesh": 0}]).gltf(), 0),
     "gifti": (".gii", gifti(TETRAHEDRON_VERTICES, np.array(TETRAHEDRON_TRIANGLES, dtype=np.int32)), 0),
+    "vtk ascii": (".vtk", vtk(*TETRAHEDRON), 0),
+    "vtk binary": (".vtk", vtk(*TETRAHEDRON, binary=True), 1),
+    "vtk binary 5": (".vtk", vtk(*TETRAHEDRON, binary=True, version="5.1"), 1),
+    "vtp": (".vtp", VtkXml("binary", "zlib").vtp(*TETRAHEDRON), 1),
+    "vtp raw": (".vtp", VtkXml("raw").vtp(*TETRAHEDRON), 1),
+    "vtu": (".vtu", VtkXml().vtu(*TETRAHEDRON, [5] * 4), 1),
+    "freesurfer": ("_lh.pial", freesurfer(*TETRAHEDRON), 0),
     "gzip": (".ply.gz", gzip.compress(ply(*TETRAHEDRON), mtime=0), 0),
 }
 
@@ -479,3 +632,38 @@ def test_random_damage_raises_nothing_but_mesh_errors(tmp_path: Path, name: str,
         assert np.isfinite(mesh.vertices).all()
         assert mesh.triangles.min() >= 0
         assert mesh.triangles.max() < len(mesh.vertices)
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("scan.step", "gmsh scan.step -2 -o scan.stl"),
+        ("my scan.FBX", "assimp export 'my scan.FBX' 'my scan'.ply"),
+        ("scan.drc.gz", "gunzip scan.drc.gz; draco_decoder -i scan.drc -o scan.ply"),
+        ("scan.msh", "meshio convert scan.msh scan.vtu"),
+        ("scan.3mf", r"pymeshlab.MeshSet.* scan.3mf scan.ply"),
+        ("scan.vtm", r"pyvista.read\(sys.argv\[1\]\).combine\(\).extract_surface\(\).triangulate\(\)"),
+        ("scan.usdz", r"blender --background --python-expr '.*usd_import.*' -- scan.usdz scan.ply"),
+        ("scan.blend", r"blender --background scan.blend --python-expr '.*ply_export.*' -- scan.blend scan.ply"),
+        ("lh.aparc.annot", ".annot files hold values at the vertices of a surface: give the surface, such as lh.pial"),
+        ("t1.nii.gz", ".nii files hold a volume: make the surface in it a mesh first"),
+        ("scan.xyz.gz", ".xyz files hold points: read them by read_points or by the source points of a study"),
+        ("scan.pts", "MeshLab and ParaView open many others and save them as .ply"),
+    ],
+)
+def test_files_of_other_formats_are_refused_with_a_remedy(tmp_path: Path, name: str, remedy: str) -> None:
+    with pytest.raises(MeshError, match=remedy) as caught:
+        read_mesh(tmp_path / name)
+    assert str(caught.value).startswith(f"{tmp_path / name}: ")
+    assert "{" not in str(caught.value)
+
+
+def test_a_remedy_by_pyvista_makes_a_readable_file(tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    parts = [pyvista.Box().triangulate(), pyvista.Box((2, 3, 2, 3, 2, 3))]
+    pyvista.MultiBlock(parts).save(tmp_path / "scan.vtm")
+    with pytest.raises(MeshError) as caught:
+        read_mesh(tmp_path / "scan.vtm")
+    command = str(caught.value).partition("for example by: ")[2].replace("python", sys.executable, 1)
+    subprocess.run(command, shell=True, cwd=tmp_path, check=True)
+    assert read_mesh(tmp_path / "scan.vtp").area == pytest.approx(24 + 6)

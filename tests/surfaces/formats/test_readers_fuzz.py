@@ -39,6 +39,14 @@ _STARTS: dict[str, tuple[bytes, ...]] = {
     ".gltf": (b"", b"{", b'{"nodes": [{"mesh": 0}], "meshes": '),
     ".glb": (b"", BOXES["glb"][1][:20]),
     ".gii": (b"", b"<GIFTI>", BOXES["gifti ascii"][1].partition(b"<Data>")[0] + b"<Data>"),
+    ".vtk": (
+        b"",
+        b"# vtk DataFile Version 4.2\nt\nASCII\nDATASET POLYDATA\nPOINTS ",
+        BOXES["vtk binary 5"][1].partition(b"POLYGONS")[0],
+    ),
+    ".vtp": (b"", b'<VTKFile type="PolyData">', BOXES["vtp binary zlib"][1][:700], BOXES["vtp raw"][1][:1500]),
+    ".vtu": (b"", b"<VTKFile>", BOXES["vtu ascii"][1][:500]),
+    "_lh.pial": (b"", b"\xff\xff\xfe", b"\xff\xff\xff", b"\xff\xff\xfed\n\n\0\0\0\3\0\0\0\1"),
     ".ply.gz": (b"", b"\x1f\x8b", gzip.compress(b"", mtime=0)),
 }
 # Numbers that have broken readers before.
@@ -59,7 +67,19 @@ _TOKENS = [
     b"<",
 ]
 _TOKENS += [b"end_header\n", b"element face 9\n", b"property list int double vertex_indices\n", b"f 1 2 3 4 5\n", b"#"]
-_TOKENS += [b"null", b'"byteStride":0,', b"<Data>", b"</DataArray>", b"&a;", b'Dim0="99"', b"\xf0\x9f\x98\x80"]
+_TOKENS += [
+    b"null",
+    b'"byteStride":0,',
+    b"METADATA\n",
+    b"POLYGONS 1 4\n",
+    b"FIELD x 9",
+    b' offset="7"',
+    b"<Data>",
+    b"</DataArray>",
+    b"&a;",
+    b'Dim0="99"',
+    b"\xf0\x9f\x98\x80",
+]
 
 _fuzz = settings(
     derandomize=True,

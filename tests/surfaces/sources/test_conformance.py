@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from sobolev_batch import ExpectedSize, Member, Mesh, MeshError, Source, Sphere, StudyError, check_source, icosphere
+from sobolev_batch import (
+    ExpectedSize,
+    Member,
+    Mesh,
+    MeshError,
+    PointCloud,
+    Source,
+    Sphere,
+    StudyError,
+    check_source,
+    icosphere,
+)
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import KINDS
 from tests.support.mesh_files import off
@@ -26,6 +37,7 @@ FINE: dict[str, Any] = {"source": "icosphere", "levels": [5]}
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
     (tmp_path / "bad.off").write_bytes(BAD_BOX)
+    (tmp_path / "scan.csv").write_text("x,y,z,area\n0,0,0,0.5\n1,0,0,0.25\n")
     return tmp_path
 
 
@@ -47,6 +59,8 @@ def test_predicted_sizes_of_larger_meshes_are_held_against_them(folder: Path) ->
         MISSING,
         {"source": "files", "paths": ["bad.off"]},
         {"source": "files", "paths": ["*.stl"]},
+        {"source": "points", "paths": ["box.off"], "area": 1.0},
+        {"source": "points", "paths": ["scan.csv"], "weight": "patch"},
         {"source": "decimate", "mesh": MISSING, "triangles": [80]},
         {"source": "decimate", "mesh": {"source": "sphere"}, "triangles": [80]},
         {"source": "spherical-levels", "mesh": MISSING, "sphere": MISSING, "levels": [1]},
@@ -208,6 +222,15 @@ class Random(Balls):
     member_type = Each
 
 
+class MakesPoints(Balls):
+    @dataclass(frozen=True)
+    class Each(BallMember):
+        def load(self) -> Any:
+            return PointCloud([[0.0, 0.0, self.radius]], [1.0])
+
+    member_type = Each
+
+
 class Large(Balls):
     @dataclass(frozen=True)
     class Each(BallMember):
@@ -246,7 +269,8 @@ class LargeAndLight(Large):
         (Unpicklable, "the member 'one' raises TypeError: it holds a handle"),
         (RelativePaths, "makes another surface or fingerprint after pickling, in another working directory"),
         (CarriesItsSurface, "bytes when it is pickled, 1048576 are allowed; make its surface in load()"),
-        (MakesSomethingElse, "makes a ndarray, expected a Mesh, Sphere, Ellipsoid, Torus or ParametrisedSurface"),
+        (MakesSomethingElse, "makes a ndarray, expected a Mesh, Sphere, Ellipsoid, Torus, ParametrisedSurface or"),
+        (MakesPoints, "the member 'one' makes a PointCloud and says is_point_cloud = False; override is_point_cloud"),
         (Random, "makes another surface or fingerprint after pickling"),
         (Large, "predicts 0 triangles and makes 20480; predict them in expected_size()"),
         (LargeAndLight, "predicts 1000 bytes for making a mesh of 737328; predict the peak of its memory"),

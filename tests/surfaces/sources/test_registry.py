@@ -58,7 +58,7 @@ def test_all_sources_are_registered() -> None:
         parse_source({"source": "nothing"})
     assert str(caught.value) == (
         "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, fit, flow, "
-        "icosphere, refine, remesh, sphere, spherical-levels, torus, torus-grid"
+        "icosphere, moved, noisy, points, refine, remesh, sphere, spherical-levels, torus, torus-grid"
     )
 
 
@@ -69,7 +69,7 @@ def test_names_of_sources_must_be_exact(name: object) -> None:
 
 
 def test_a_table_must_name_its_source() -> None:
-    with pytest.raises(StudyError, match="no source is named None"):
+    with pytest.raises(StudyError, match="source is missing; add it, such as source = "):
         parse_source({"levels": [1]})
 
 
@@ -150,7 +150,7 @@ PATHS = {"source": "files", "paths": ["a.ply"]}
         ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "around": 2}, "around"),
         ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [1], "across": 6.0}, "across"),
         ({"source": "torus-grid", "R": 1.0, "r": 0.4, "levels": [0, 12]}, ""),
-        ({"source": "files"}, "paths"),
+        ({"source": "files"}, ""),
         ({"source": "files", "paths": []}, "paths"),
         ({"source": "files", "paths": "a.ply"}, "paths"),
         ({"source": "files", "paths": [""]}, "paths.0"),
@@ -197,11 +197,16 @@ def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], plac
     assert places <= {place, place.rsplit(".", 1)[0]}
 
 
+def test_areas_of_points_are_given_once() -> None:
+    with pytest.raises(ValidationError, match='both "weight" and "area" are given; give one of them'):
+        parse_source({"source": "points", "paths": ["a.csv"], "weight": 4, "area": 1.0})
+
+
 @pytest.mark.parametrize("name", ["decimate", "remesh", "spherical-levels"])
 def test_nested_sources_must_exist(name: str) -> None:
     with pytest.raises(StudyError, match="no source is named 'nothing'"):
         parse_source({"source": name, "mesh": {"source": "nothing"}, "triangles": [80]})
-    with pytest.raises(StudyError, match="no source is named None"):
+    with pytest.raises(StudyError, match="source is missing; add it, such as source = "):
         parse_source({"source": name, "mesh": {"paths": ["a.ply"]}, "triangles": [80]})
 
 
@@ -234,9 +239,10 @@ def test_sources_survive_pickling(kind: str) -> None:
 
 def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
+    (tmp_path / "scan.csv").write_text("x,y,z,area\n0,0,0,0.5\n")
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
-    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 19
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 24
 
 
 @pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])

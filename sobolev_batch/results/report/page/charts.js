@@ -1,6 +1,24 @@
 "use strict";
 // Charts of a report, drawn by plotly.js from the page's data in the colours of its style sheet.
-(() => {
+(async () => {
+  // The page holds plotly.js compressed: it would be most of it. Without it, pictures stand for the charts.
+  const unpacked = async (text) => {
+    const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Response(stream).text();
+  };
+  try {
+    const script = document.createElement("script");
+    script.textContent = await unpacked(document.getElementById("library").textContent);
+    document.body.append(script);
+  } catch (error) {
+    console.warn(`no charts: ${error}`);
+  }
+  if (typeof Plotly === "undefined") {
+    document.documentElement.classList.add("undrawn");
+    return;
+  }
+
   const data = JSON.parse(document.getElementById("data").textContent);
   const symbols = ["circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x"];
   // Named one by one: other buttons would send data to a service.
@@ -44,13 +62,23 @@
     Plotly.react(place, traces, layout({ height: Number(place.dataset.height), ...changes }), config);
   };
 
-  // Ticks of a logarithmic axis: powers of ten, with 2 and 5 between them where these are few.
+  // Ticks of a logarithmic axis: powers of ten, with 2 and 5 between them where these are few, and even steps within
+  // less than a decade.
   const ticks = (values) => {
-    const [low, high] = [Math.log10(Math.min(...values)), Math.log10(Math.max(...values))];
+    const [least, most] = [Math.min(...values), Math.max(...values)];
+    const [low, high] = [Math.log10(least), Math.log10(most)];
     const steps = high - low > 2.5 ? [1] : [1, 2, 5];
     const tickvals = [];
-    for (let power = Math.floor(low) - 1; power <= Math.ceil(high); power += 1) {
-      for (const step of steps) tickvals.push(Number(`${step}e${power}`));
+    if (high - low < 0.7 && most > least) {
+      const power = 10 ** Math.floor(Math.log10((most - least) / 4));
+      const step = power * [1, 2, 5, 10].find((one) => one * power >= (most - least) / 4);
+      for (let i = Math.floor(least / step); i <= Math.ceil(most / step); i += 1) {
+        if (i > 0) tickvals.push(Number((i * step).toPrecision(6)));
+      }
+    } else {
+      for (let power = Math.floor(low) - 1; power <= Math.ceil(high); power += 1) {
+        for (const step of steps) tickvals.push(Number(`${step}e${power}`));
+      }
     }
     const plainly = low > -4 && high < 5;
     return { tickvals, ticktext: tickvals.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
@@ -72,7 +100,7 @@
       marker: { color: series(line.family), symbol: symbol(line.family), size: 8 },
       text: line.labels.map((label, i) =>
         `${plain(label)}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.sizes[i])}` +
-        `<br>relative distance ${number(line.values[i])} ± ${line.errors[i]?.toPrecision(2) ?? "?"}`),
+        `<br>relative distance ${number(100 * line.values[i])} % ± ${line.errors[i] == null ? "?" : `${(100 * line.errors[i]).toPrecision(2)} %`}`),
       hoverinfo: "text",
     }));
     const all = (key) => families.flatMap((line) => line[key]);
@@ -87,7 +115,23 @@
     }
     draw("convergence", traces, {
       xaxis: { type: "log", ...(all("sizes").length ? ticks(all("sizes")) : {}), title: { text: "mean edge length" } },
-      yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "relative distance" } },
+      yaxis: { type: "log", ...(all("values").length ? ticks(all("values")) : {}), title: { text: narrow() ? "" : "relative distance" } },
+    });
+  };
+
+  const league = () => {
+    const methods = data.league[state.order];
+    const traces = methods.map(({ family, sizes, values, errors }) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), x: sizes, y: values, error_y: bars(values, errors),
+      line: { color: series(family), width: 1.8 },
+      marker: { color: series(family), symbol: symbol(family), size: 8 },
+      text: values.map((value, i) => `${plain(family)}<br>${plain(data.size)}: ${number(sizes[i])}` +
+        `<br>mean relative distance ${number(100 * value)} %`),
+      hoverinfo: "text",
+    }));
+    draw("league", traces, {
+      xaxis: { type: "log", ...ticks(methods.flatMap(({ sizes }) => sizes)), title: { text: plain(data.size) } },
+      yaxis: { type: "log", ...ticks(methods.flatMap(({ values }) => values)), title: { text: narrow() ? "" : "mean relative distance" } },
     });
   };
 
@@ -236,8 +280,9 @@
     }, space);
   };
 
-  const drawings = [convergence, data.evolution && evolution, data.matrix && matrix, data.matrix && map,
-    data.spectrum && spectrum, data.energy && energy, data.witness.length && witness].filter(Boolean);
+  const drawings = [data.convergence && convergence, data.league?.length && league, data.evolution && evolution,
+    data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
+    data.witness?.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
   document.addEventListener("order", ({ detail }) => { state.order = detail; redraw(); });
@@ -254,4 +299,5 @@
   const chosen = document.querySelector("input[name=order]:checked, #order");
   state.order = chosen ? Number(chosen.value) : 0;
   redraw();
+  document.documentElement.classList.add("drawn");
 })();

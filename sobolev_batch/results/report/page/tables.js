@@ -1,5 +1,5 @@
 "use strict";
-// Sortable tables, the choice of the order that tables and charts show, and the copy button.
+// Sortable tables, their CSV, the choice of the order that tables and charts show, and the copy button.
 (() => {
   document.documentElement.classList.add("js");
 
@@ -9,7 +9,8 @@
     if (!cell || cell.dataset.key === undefined) return null;
     const key = cell.dataset.key;
     const isText = column === 0 || cell.classList.contains("text");
-    return isText ? key : Number(key);
+    // Python spells infinity "inf".
+    return isText ? key : Number(key.replace("inf", "Infinity"));
   };
 
   const compare = (a, b) =>
@@ -39,13 +40,51 @@
     });
   }
 
-  const names = JSON.parse(document.getElementById("data").textContent).orders;
+  const data = JSON.parse(document.getElementById("data").textContent);
+
+  // A spreadsheet would take such a text for a formula, and run it.
+  const harmless = (text) => (/^[=+\-@\t\r]/.test(text) ? `'${text}` : text);
+  const field = (text) => (/[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+
+  // All orders of a table, with all digits, and the names of columns that the package uses.
+  const csvOf = (table) => {
+    const heads = [...table.tHead.rows[0].cells];
+    const bodies = [...table.tBodies];
+    const hasOrders = bodies.some((body) => body.dataset.value !== undefined);
+    const hasRemarks = table.querySelector("[data-remark], .mark") !== null;
+    const names = heads.flatMap((head) => [head.dataset.name, head.dataset.second ?? []].flat());
+    const lines = [[...(hasOrders ? ["order"] : []), ...names, ...(hasRemarks ? ["status"] : [])]];
+    for (const body of bodies) {
+      for (const row of body.rows) {
+        if (row.classList.contains("of-order")) continue;
+        const isWhole = row.cells.length === heads.length;
+        const cells = heads.flatMap((head, i) => {
+          const { key = "", second = "" } = isWhole || i === 0 ? row.cells[i].dataset : {};
+          const isNumber = head.classList.contains("number");
+          return [isNumber ? key : harmless(key), ...(head.dataset.second === undefined ? [] : [second])];
+        });
+        const remark = row.querySelector("[data-remark]")?.dataset.remark
+          ?? [...row.querySelectorAll(".mark")].map((mark) => mark.textContent).join("; ");
+        lines.push([...(hasOrders ? [body.dataset.value] : []), ...cells, ...(hasRemarks ? [harmless(remark)] : [])]);
+      }
+    }
+    return lines.map((line) => `${line.map(field).join(",")}\n`).join("");
+  };
+
+  for (const button of document.querySelectorAll("button.csv")) {
+    button.addEventListener("click", () => {
+      const table = document.getElementById(button.dataset.table);
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([csvOf(table)], { type: "text/csv" }));
+      link.download = `${data.name}-${table.dataset.name}.csv`;
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  }
 
   const show = (order) => {
-    for (const body of document.querySelectorAll("tbody[data-order]")) {
-      body.hidden = Number(body.dataset.order) !== order;
-    }
-    for (const name of document.querySelectorAll(".current-order b")) name.textContent = names[order];
+    for (const part of document.querySelectorAll("[data-order]")) part.hidden = Number(part.dataset.order) !== order;
+    for (const name of document.querySelectorAll(".current-order b")) name.textContent = data.orders[order];
     document.dispatchEvent(new CustomEvent("order", { detail: order }));
   };
 

@@ -1,0 +1,4 @@
+"""Methods compared over several objects, and studies with earlier ones.
+
+See docs/leagues.md.
+"""

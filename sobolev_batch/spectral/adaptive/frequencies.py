@@ -1,0 +1,212 @@
+"""Frequencies at which surfaces are compared, and the norms and products that follow from values there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_of
+from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, aliased, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
+from sobolev_batch.spectral.errors.reference import ReferenceEstimate, product_rounding
+from sobolev_batch.spectral.fields import field_for
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
+from sobolev_batch.spectral.octaves.tail import Tail
+from sobolev_batch.spectral.octaves.values import SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among
+from sobolev_batch.surfaces.shapes.surface import Surface
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Frequencies:
+    """A lattice of the innermost frequencies, and octaves beyond it.
+
+    Attributes:
+        lattice: The lattice.
+        octaves: The octaves, which may be none.
+        orders: Orders s.
+        widths: Widths of all surfaces together, see `Support`.
+        has_tail: True where all that lies beyond the lattice is known: from octaves, and from the distances of points.
+    """
+
+    lattice: Lattice
+    octaves: tuple[SampledOctave, ...]
+    orders: tuple[float, ...]
+    widths: Reals
+    has_tail: bool = False
+
+    @classmethod
+    def of(cls, problem: Problem, solution: Solution) -> Self:
+        """Return the frequencies that a problem was solved with.
+
+        Args:
+            problem: Norm or distance.
+            solution: Its solution, for which something had to be computed.
+        """
+        widths = problem.support.widths
+        return cls(cast(Lattice, solution.lattice), solution.octaves, problem.orders, widths, solution.has_tail)
+
+    @cached_property
+    def weights(self) -> SobolevWeights:
+        """Weights of the lattice, with a step where a tail follows."""
+        return SobolevWeights(self.lattice, self.orders, self.lattice.xi_max if self.has_tail else None)
+
+    @cached_property
+    def _octave_weights(self) -> tuple[OctaveWeights, ...]:
+        return tuple(OctaveWeights(octave.quadrature, self.orders) for octave in self.octaves)
+
+    def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
+        """Return the values of a surface, with an error within a target.
+
+        Args:
+            surface: Surface in units of length.
+            target: Largest error of the values.
+            execution: Threads, and memory that the transforms of octaves may take.
+
+        Raises:
+            LatticeError: The surface extends beyond the lattice's half period.
+        """
+        single = permits_single(surface, self.lattice, target)
+        settings = TransformSettings(dtype="complex64" if single else "complex128")
+        field = field_for(surface, self.lattice, target, settings, Execution(threads=execution.threads))
+        octaves = (
+            octave_values(surface, octave, self.orders, settings_for(target), execution) for octave in self.octaves
+        )
+        return SurfaceValues(field, tuple(octaves))
+
+    def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:
+        """Return the norms of a signed sum of surfaces."""
+        return self._norms(Measure.of(values, signs), self._errors(values), surfaces, signs)
+
+    def against(
+        self,
+        values: Sequence[SurfaceValues],
+        signs: Sequence[int],
+        reference: SurfaceValues,
+        pair: Sequence[Surface],
+    ) -> ReferenceEstimate:
+        """Return the norm of the reference b of a distance ||a - b||, and the product <a - b, b>.
+
+        Args:
+            values: Values whose signed sum is a - b: triangles that both have may be left out.
+            signs: Signs of these.
+            reference: Values of b.
+            pair: The surfaces a and b.
+        """
+        difference, own = Measure.of(values, signs), Measure.of([reference], [1])
+        distances = self._norms(difference, self._errors(values), pair, [1, -1])
+        norms = self._norms(own, self._errors([reference]), pair[1:], [1])
+        products = self._lattice_sums(difference, own)
+        if not self.has_tail:
+            return ReferenceEstimate.on_lattice(products, distances, norms, self.weights, self.widths)
+        in_octaves = self._octave_sums(difference, own)
+        statistical = statistical_errors(in_octaves) if in_octaves else 0.0
+        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+        tails = (
+            self._tail(difference + own, pair[:1], [1]),
+            self._tail(own, pair[1:], [1]),
+            self._tail(difference, pair, [1, -1]),
+        )
+        beyond = (tails[0].beyond - tails[1].beyond - tails[2].beyond) / 2
+        uncertainty = np.sum([tail.uncertainty for tail in tails], axis=0) / 2 + statistical
+        images = aliased(products, self.weights, self.widths)
+        return ReferenceEstimate(
+            norms,
+            products.totals + np.sum([one.squares for one in in_octaves], axis=0) + beyond,
+            uncertainty + images + product_rounding(distances, norms),
+        )
+
+    def moved(self, values: SurfaceValues, surface: Surface, length: float) -> Reals:
+        """Return the distance of a surface to itself moved by a length, the root mean square over all directions.
+
+        Args:
+            values: Values of the surface.
+            surface: The surface.
+            length: Length of the move, in units of length.
+
+        Returns:
+            float64 (orders,).
+        """
+        # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
+        own = Measure.of([values], [1])
+        radii = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
+        shells = shell_sums(own.lattice, None, self.lattice, self.lattice.half)
+        squares = self.weights.per_shell @ (shells * (2 - 2 * np.sinc(2 * radii * length)))
+        for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
+            factors = 2 - 2 * np.sinc(2 * weights.quadrature.radii * length)
+            squares = squares + weights.integrals(squared_moduli(octave) * factors)
+        if self.octaves:
+            squares = squares + 2 * self._tail(own, [surface], [1]).beyond
+        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+    def _errors(self, values: Sequence[SurfaceValues]) -> Reals:
+        return np.asarray(np.sum([one.error_norms(self.weights) for one in values], axis=0))
+
+    def _norms(
+        self, measure: Measure, errors: Reals, surfaces: Sequence[Surface], signs: Sequence[int]
+    ) -> NormEstimate:
+        sums = self._lattice_sums(measure, measure)
+        if not self.has_tail:
+            return estimate_norms(sums, self.weights, self._support(surfaces), errors)
+        images = aliased(sums, self.weights, self.widths)
+        tail = self._tail(measure, surfaces, signs, self._needed_octaves(surfaces))
+        return tail.estimate(sums.totals, images, errors)
+
+    def _support(self, surfaces: Sequence[Surface]) -> Support:
+        points = PointSpectrum.of(clouds_among(surfaces), self.lattice.xi_max)
+        levels = None if points is None else points.highest
+        return Support(support_of(surfaces).areas, self.widths, point_levels=levels)
+
+    def _lattice_sums(self, measure: Measure, other: Measure) -> Sums:
+        """Return the sums of Re(a conj b) over the lattice."""
+        return sums_of_shells(shell_sums(measure.lattice, other.lattice, self.lattice, self.lattice.half), self.weights)
+
+    def _octave_sums(self, measure: Measure, other: Measure) -> list[OctaveSums]:
+        """Return the integrals of Re(a conj b) over each octave."""
+        return [
+            weights.sums((a.astype(np.complex128) * b.conj()).real)
+            for weights, a, b in zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
+        ]
+
+    def _tail(
+        self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int], count: int | None = None
+    ) -> Tail:
+        """Return the tail from the first octaves, by default all, and what is known to lie beyond them."""
+        octaves = [octave.sampling.octave for octave in self.octaves][:count]
+        sums, inner = self._octave_sums(measure, measure)[:count], self._lattice_sums(measure, measure).outer
+        limit, clouds = EnergyLimit.of(surfaces, signs), tuple(clouds_among(surfaces))
+        if clouds:
+            known = (clouds, len(octaves))
+            if known not in self._pairs:
+                self._pairs[known] = PointPairs.of(clouds, octaves[-1].highest if octaves else self.lattice.xi_max)
+            limit = limit.with_points(self._pairs[known])
+        return Tail.of(octaves, sums, limit, self.orders, inner.tolist())
+
+    def _needed_octaves(self, surfaces: Sequence[Surface]) -> int:
+        """Return the number of octaves after which nothing is left to measure: of points, pairs tell the rest."""
+        clouds = tuple(clouds_among(surfaces))
+        if len(clouds) == len(surfaces):
+            pairs = PointPairs.where_few(clouds, self.lattice.xi_max)
+            count = pairs.octaves_from(self.lattice.xi_max)
+            if count <= len(self.octaves):
+                self._pairs[clouds, count] = pairs
+                return count
+        return len(self.octaves)
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[tuple[PointCloud, ...], int], PointPairs]:
+        """Pairs of the points of clouds that tell all beyond a number of octaves."""
+        return {}

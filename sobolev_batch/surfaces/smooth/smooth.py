@@ -1,0 +1,205 @@
+"""Smooth surfaces given by a parametrisation x(u, v) over a rectangle.
+
+At a pole, one end of a parameter is a single point of the surface. The area element |x_u × x_v|
+vanishes there, which does no harm.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
+from sobolev_batch.surfaces.shapes.surface import Point
+from sobolev_batch.surfaces.smooth.interval import Interval
+
+Reals = NDArray[np.float64]
+Counts = tuple[int, int]
+
+# Nodes of any one rule: about 1,000 by 4,000.
+MOST_NODES = 1 << 22
+# Nodes along a parameter that is not periodic: a Gauss rule and its derivatives cost the square of them.
+MOST_GAUSS_NODES = 1 << 11
+# Nodes that are computed at a time, where derivatives are given.
+_BATCH = 1 << 16
+# Relative changes of the area when the nodes are doubled: one that ends the doubling, and one too large at its end.
+_SETTLED, _UNSETTLED = 1e-12, 1e-3
+_FIRST_NODES = 31
+_MOST_AREA_NODES = 1 << 20
+# Extents are sought on a grid of so many points along each parameter, then on small ones around the best.
+_GRID, _ZOOM_GRID, _ZOOMS = 65, 9, 12
+
+
+class Smooth(ABC):
+    """A surface with a smooth parametrisation x(u, v), in units of length."""
+
+    @property
+    @abstractmethod
+    def intervals(self) -> tuple[Interval, Interval]:
+        """Intervals of u and v."""
+
+    @abstractmethod
+    def positions(self, u: Reals, v: Reals) -> Reals:
+        """Return x(u, v), float64 (3, ...), at parameters of one shape (...)."""
+
+    @abstractmethod
+    def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals] | None:
+        """Return x_u and x_v, float64 (3, ...) each; None where they are computed from positions."""
+
+    @abstractmethod
+    def moved(self, scale: float, origin: Point) -> Self:
+        """Return the surface after x -> scale * (x - origin)."""
+
+    def nodes(self, counts: Counts, most: int = _BATCH) -> Iterator[tuple[Reals, Reals]]:
+        """Yield batches of nodes x (3, k) and weights (k,) of the product rule of both intervals.
+
+        The weights include the area elements. Where `tangents` is None, these are those of the interpolant
+        through all nodes: see `Interval.derivative`.
+
+        Args:
+            counts: Numbers of nodes along u and v, odd where periodic.
+            most: Bound on k.
+        """
+        (u, along_u), (v, along_v) = (
+            interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)
+        )
+        interpolated = self._interpolated(u, v)
+        rows = max(1, most // counts[1])
+        for first_row in range(0, counts[0], rows):
+            batch = slice(first_row, first_row + rows)
+            if interpolated is None:
+                positions, tangents = self._given(u[batch], v)
+            else:
+                positions, tangents = interpolated[0][:, batch], (interpolated[1][:, batch], interpolated[2][:, batch])
+            weights = _cross_lengths(*tangents)
+            weights *= along_u[batch, None]
+            weights *= along_v
+            points, flat_weights = positions.reshape(3, -1), weights.ravel()
+            for start in range(0, len(flat_weights), most):
+                yield np.ascontiguousarray(points[:, start : start + most]), flat_weights[start : start + most]
+
+    def _given(self, u: Reals, v: Reals) -> tuple[Reals, tuple[Reals, Reals]]:
+        """Return positions and given derivatives (3, n, m) on a grid."""
+        first, second = np.meshgrid(u, v, indexing="ij")
+        tangents = self.tangents(first, second)
+        if tangents is None:
+            raise TypeError(f"{type(self).__name__} has derivatives at some points and none at others")
+        return self.positions(first, second), tangents
+
+    def _interpolated(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals] | None:
+        """Return positions and derivatives (3, n, m) of the interpolant; None where derivatives are given."""
+        if self.tangents(u[:1], v[:1]) is not None:
+            return None
+        first, second = np.meshgrid(u, v, indexing="ij")
+        positions = self.positions(first, second)
+        along_u, along_v = self.intervals
+        return positions, along_u.derivative(positions, 1), along_v.derivative(positions, 2)
+
+    @cached_property
+    def area(self) -> float:
+        """Area, in squared units of length: by quadrature, doubled until it changes by a relative 1e-12 or less.
+
+        Raises:
+            InputError: The area is zero or does not settle.
+        """
+        counts = _FIRST_NODES, _FIRST_NODES
+        area = self._area(counts)
+        change = math.inf
+        while change > _SETTLED * area and math.prod(doubled(counts)) <= _MOST_AREA_NODES:
+            counts = doubled(counts)
+            area, before = self._area(counts), area
+            change = abs(area - before)
+        if not (math.isfinite(area) and area > 0):
+            raise InputError(f"a surface needs an area that is positive and finite, found {area:g}")
+        if change > _UNSETTLED * area:
+            raise InputError(
+                f"the area of the surface changes from {before:.6g} to {area:.6g} when the nodes are doubled to "
+                f"{counts[0]} x {counts[1]}: its parametrisation is not smooth, or oscillates too fast"
+            )
+        return area
+
+    def _area(self, counts: Counts) -> float:
+        return math.fsum(float(weights.sum()) for _, weights in self.nodes(counts))
+
+    def highest_along(self, directions: Reals) -> Reals:
+        """Return the greatest x · direction over the surface (k,), for unit vectors (k, 3), in units of length.
+
+        The error is about 1e-12 of the extent, unless the surface has details that a grid of 65 by 65 misses.
+        """
+
+        def heights(points: Reals) -> Reals:
+            # A sum of products instead of one of matrices: all directions may share the points, or not.
+            return np.asarray(sum(directions[:, axis, None, None] * points[axis] for axis in range(3)))
+
+        return self._greatest(heights, len(directions))
+
+    @cached_property
+    def bounds(self) -> tuple[Reals, Reals]:
+        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
+        highest = self.highest_along(np.concatenate([-np.eye(3), np.eye(3)]))
+        return -highest[:3], highest[3:]
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent along `DIRECTIONS`."""
+        lowest, highest = -self.highest_along(-DIRECTIONS), self.highest_along(DIRECTIONS)
+        return Extent(tuple(lowest.tolist()), tuple(highest.tolist()))
+
+    @property
+    def bounding_sphere(self) -> tuple[Point, float]:
+        """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
+        lower, upper = self.bounds
+        center = lower + (upper - lower) / 2
+
+        def distances(points: Reals) -> Reals:
+            return np.asarray(np.sqrt(sum((points[axis] - center[axis]) ** 2 for axis in range(3))))
+
+        return (float(center[0]), float(center[1]), float(center[2])), float(self._greatest(distances, 1)[0])
+
+    def _greatest(self, heights: Callable[[Reals], Reals], count: int) -> Reals:
+        """Return the maxima over the surface (count,) of as many functions of position."""
+        grids = [np.linspace(interval.low, interval.high, _GRID) for interval in self.intervals]
+        values = heights(self.positions(*np.meshgrid(*grids, indexing="ij"))[:, None]).reshape(count, -1)
+        best = np.unravel_index(values.argmax(axis=1), (_GRID, _GRID))
+        centers = [grid[index] for grid, index in zip(grids, best, strict=True)]
+        widths = [interval.length / (_GRID - 1) for interval in self.intervals]
+        greatest: Reals = values.max(axis=1)
+        steps = np.linspace(-1, 1, _ZOOM_GRID)
+        for _ in range(_ZOOMS):
+            lines = [
+                _brought_back(interval, center[:, None] + width * steps)
+                for interval, center, width in zip(self.intervals, centers, widths, strict=True)
+            ]
+            u, v = np.broadcast_arrays(lines[0][:, :, None], lines[1][:, None, :])
+            values = heights(self.positions(u, v)).reshape(count, -1)
+            np.maximum(greatest, values.max(axis=1), out=greatest)
+            best = np.unravel_index(values.argmax(axis=1), (_ZOOM_GRID, _ZOOM_GRID))
+            centers = [line[np.arange(count), index] for line, index in zip(lines, best, strict=True)]
+            widths = [width / 3 for width in widths]
+        return greatest
+
+
+def doubled(counts: Counts) -> Counts:
+    """Return twice as many nodes each way plus one: coprime to before, so that both rules rarely alias alike."""
+    return 2 * counts[0] + 1, 2 * counts[1] + 1
+
+
+def _brought_back(interval: Interval, values: Reals) -> Reals:
+    """Return parameters within their interval."""
+    if interval.periodic:
+        turns = np.floor((values - interval.low) / interval.length)
+        return np.asarray(values - turns * interval.length)
+    return np.asarray(np.clip(values, interval.low, interval.high))
+
+
+def _cross_lengths(first: Reals, second: Reals) -> Reals:
+    """Return |x_u × x_v| of vectors (3, ...)."""
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return np.asarray(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))

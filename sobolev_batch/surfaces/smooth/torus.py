@@ -1,0 +1,121 @@
+"""Tori as smooth surfaces, and grids of triangles inscribed in them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point, checked_point, is_finite_number, moved_point
+from sobolev_batch.surfaces.smooth.interval import Interval
+from sobolev_batch.surfaces.smooth.smooth import Smooth
+
+Reals = NDArray[np.float64]
+
+_INTERVALS = Interval(0.0, 2 * math.pi, periodic=True), Interval(0.0, 2 * math.pi, periodic=True)
+# A larger grid is a typing error.
+MOST_TRIANGLES = 10**9
+
+
+@dataclass(frozen=True)
+class Torus(Smooth):
+    """A torus around an axis along z, in the user's unit of length.
+
+    Args:
+        R: Distance from the centre to the middle of the tube.
+        r: Radius of the tube, less than R.
+        center: Centre of the torus.
+
+    Raises:
+        InputError: The radii are not finite numbers with 0 < r < R, or the centre is not three finite numbers.
+
+    >>> import sobolev_batch as sb
+    >>> torus = sb.Torus(R=1.0, r=0.4)
+    >>> f"{torus.area:.4f}"
+    '15.7914'
+    >>> torus.mesh(around=48, across=24)
+    Mesh(1152 vertices, 2304 triangles)
+    """
+
+    R: float = 1.0
+    r: float = 0.4
+    center: Point = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < self.R):
+            raise InputError(f"a torus needs finite radii with 0 < r < R, found R = {self.R} and r = {self.r}")
+        if float(self.R) > LARGEST_LENGTH:
+            raise InputError(f"a torus's radii must be at most {LARGEST_LENGTH:g}, found {self.R}")
+        object.__setattr__(self, "R", float(self.R))
+        object.__setattr__(self, "r", float(self.r))
+        object.__setattr__(self, "center", checked_point(self.center, "a torus's center"))
+
+    @property
+    def intervals(self) -> tuple[Interval, Interval]:
+        """Intervals of the angle around the axis and of that around the tube, 0 farthest from the axis."""
+        return _INTERVALS
+
+    def positions(self, u: Reals, v: Reals) -> Reals:
+        """Return x(u, v), float64 (3, ...)."""
+        radii = self.R + self.r * np.cos(v)
+        x, y, z = self.center
+        return np.stack([x + radii * np.cos(u), y + radii * np.sin(u), z + self.r * np.sin(v)])
+
+    def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
+        """Return x_u and x_v, float64 (3, ...) each."""
+        radii, cosines, sines = self.R + self.r * np.cos(v), np.cos(u), np.sin(u)
+        along_u = np.stack([-radii * sines, radii * cosines, np.zeros_like(u)])
+        slopes = -self.r * np.sin(v)
+        return along_u, np.stack([slopes * cosines, slopes * sines, self.r * np.cos(v)])
+
+    def moved(self, scale: float, origin: Point) -> Torus:
+        """Return the torus after x -> scale * (x - origin)."""
+        return Torus(scale * self.R, scale * self.r, moved_point(self.center, scale, origin))
+
+    @cached_property
+    def area(self) -> float:
+        """Area 4π²Rr, in squared units of length."""
+        return 4 * math.pi**2 * self.R * self.r
+
+    def highest_along(self, directions: Reals) -> Reals:
+        """Return the greatest x · direction over the surface (k,), for unit vectors (k, 3), in units of length."""
+        heights = self.R * np.hypot(directions[:, 0], directions[:, 1]) + self.r
+        return np.asarray(directions @ np.array(self.center) + heights)
+
+    @property
+    def bounding_sphere(self) -> tuple[Point, float]:
+        """Centre and radius of the smallest sphere that holds the surface."""
+        return self.center, self.R + self.r
+
+    def mesh(self, around: int, across: int) -> Mesh:
+        """Return a grid of points on the torus, each of its cells cut into two triangles by the same diagonal.
+
+        Args:
+            around: Number of cells around the axis.
+            across: Number of cells around the tube.
+
+        Returns:
+            A mesh of around * across vertices and twice as many triangles, facing outwards.
+
+        Raises:
+            InputError: The counts are not integers of at least 3, or make more than a billion triangles.
+        """
+        if not all(is_whole_number(n) and n >= 3 for n in (around, across)):
+            raise InputError(f"a grid of a torus needs at least 3 cells each way, found {around!r} and {across!r}")
+        # Not NumPy's, whose products may overflow.
+        around, across = int(around), int(across)
+        if 2 * around * across > MOST_TRIANGLES:
+            raise InputError(f"a grid of a torus has at most {MOST_TRIANGLES} triangles, found {2 * around * across}")
+        angles = (2 * math.pi / n * np.arange(n) for n in (around, across))
+        vertices = self.positions(*np.meshgrid(*angles, indexing="ij")).reshape(3, -1).T
+        corner = np.arange(around * across).reshape(around, across)
+        ahead, above = np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=1)
+        opposite = np.roll(ahead, -1, axis=1)
+        cells = np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1)
+        return Mesh(vertices, cells.reshape(-1, 3))

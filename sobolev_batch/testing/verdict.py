@@ -1,0 +1,147 @@
+"""Verdicts: two surfaces are the same to a tolerance, different, or neither can be told."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Literal
+
+from sobolev_batch.html import table_html
+from sobolev_batch.parameters import byte_count
+from sobolev_batch.results.tables.formatting import Digits, rounded_outwards
+from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.shells import single_order
+from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.testing.defaults import DEFAULT_ORDER, DEFAULT_RTOL
+
+Outcome = Literal["same", "different", "undecided"]
+
+# A larger relative error says less than the bounds themselves.
+_WIDEST = 0.25
+# From here on per cents are whole numbers.
+_WHOLE = 10
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Answer to whether two surfaces are the same, to a tolerance. It is true if they are the same.
+
+    Attributes:
+        outcome: "same" if the upper bound is at most rtol, "different" if the lower one is above it, else "undecided".
+        lower: Lower bound on the Sobolev distance of the surfaces over the Sobolev norm of the reference.
+        upper: Upper bound on it. The bounds are only as narrow as the outcome needs.
+        rtol: Largest distance of surfaces that count as the same.
+        order: Order s of the norm.
+        area_change: Area of the surface over that of the reference, less one.
+        method: What the distance follows from: "identical" (meshes have the same triangles, or clouds the same points),
+            "lattice" (the areas bound what lies beyond it), or "octaves" (random frequencies, and the distances of
+            points, measure what lies beyond a lattice).
+
+    >>> import sobolev_batch as sb
+    >>> verdict = sb.same_surface(sb.icosphere(3), sb.Sphere())
+    >>> verdict.outcome, f"{verdict.distance:.3f}", f"{verdict.area_change:.3f}"
+    ('different', '0.008', '-0.005')
+    """
+
+    outcome: Outcome
+    lower: float
+    upper: float
+    rtol: float
+    order: float
+    area_change: float
+    method: Method
+
+    @property
+    def distance(self) -> float:
+        """Middle of the bounds."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def error(self) -> float:
+        """Half of the distance between the bounds."""
+        return (self.upper - self.lower) / 2
+
+    def __bool__(self) -> bool:
+        """Tell whether the surfaces are the same."""
+        return self.outcome == "same"
+
+    def _repr_html_(self) -> str:
+        return table_html(f"Verdict: {self.outcome}", [("", str(self))])
+
+    def __str__(self) -> str:
+        """Return the verdict in one line."""
+        number = f"relative distance {self._number} at order {self.order:g}"
+        change = 100 * self.area_change
+        area = f"area {change:+,.0f} %" if abs(change) >= _WHOLE else f"area {change:+.2g} %"
+        match self.outcome:
+            case "same":
+                return f"same surface: {number}, within rtol {self.rtol:g}"
+            case "different":
+                return f"different surfaces: {number}, above rtol {self.rtol:g}; {area}"
+            case "undecided":
+                return f"undecided: {number}, which does not tell it from rtol {self.rtol:g}; take another rtol"
+
+    @property
+    def _number(self) -> str:
+        """The distance with its error, or its bounds where these are far apart."""
+        if self.error <= _WIDEST * self.distance:
+            return Digits.of(self.distance, self.error).together
+        lower, upper = rounded_outwards(self.lower, self.upper)
+        return f"at most {upper}" if self.outcome == "same" else f"from {lower} to {upper}"
+
+
+def same_surface(
+    a: SurfaceLike,
+    b: SurfaceLike,
+    *,
+    rtol: float = DEFAULT_RTOL,
+    order: float = DEFAULT_ORDER,
+    scaling: bool = True,
+    memory: float | str | None = None,
+    seed: int = 0,
+) -> Verdict:
+    """Return whether two surfaces are the same, to a tolerance.
+
+    Vertices, triangles and their order do not matter, only how the surfaces spread their area in space. So a mesh that
+    is subdivided, triangulated anew or merged from parts is the same, and one that has lost a patch is not. Which way
+    triangles face does not matter either. The distance is only computed as exactly as the answer needs.
+
+    Args:
+        a: Surface: a `Mesh`, a surface in closed form such as a `Sphere`, a `PointCloud`, the path of a mesh file, or a
+            tuple of vertices (n, 3) and triangles (m, 3).
+        b: Reference, likewise.
+        rtol: Largest distance of surfaces that count as the same, over the norm of the reference.
+        order: Order s < -1/2 of the norm, for point clouds < -3/2. Orders from -3 on take seconds for an rtol of 1e-3,
+            and most time near -1/2.
+        scaling: Compare both in the unit of length in which the bounding sphere of the reference has the radius 1.
+            Otherwise they are compared in their own, on which norms depend.
+        memory: Memory that a transform may take, in bytes or as a text such as "4GB"; default 2e9.
+        seed: Seed of the random frequencies that orders near -1/2 need.
+
+    Returns:
+        The verdict, with the distance and its error.
+
+    Raises:
+        InputError: An argument is no surface, or out of range.
+        MeshError: A file or arrays hold no valid mesh.
+        OrderError: The order is not below -1/2, or for point clouds -3/2.
+
+    >>> import sobolev_batch as sb
+    >>> fine, coarse = sb.icosphere(4), sb.icosphere(3)
+    >>> print(sb.same_surface(coarse, fine, rtol=0.01))
+    same surface: relative distance 0.00...
+    >>> sb.same_surface(coarse, fine).outcome
+    'different'
+    """
+    accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, byte_count(memory))
+    checked_order = single_order(order)
+    surface, reference = (as_surface(one, (checked_order,)) for one in (a, b))
+    area_change = surface.area / reference.area - 1
+    similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
+    pair = similarity.apply(surface), similarity.apply(reference)
+    found = relative_distance(*pair, checked_order, rtol, accuracy, os.cpu_count() or 1, seed)
+    lower, upper = found.bounds.lower, found.bounds.upper
+    outcome: Outcome = "same" if upper <= rtol else "different" if lower > rtol else "undecided"
+    return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, found.method)

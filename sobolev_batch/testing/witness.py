@@ -1,0 +1,118 @@
+"""Files that show where two surfaces differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.results.meshes.files import VertexField
+from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.fields import fourier_transform
+from sobolev_batch.spectral.metrics.witness import witness
+from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Surface
+
+Reals = NDArray[np.float64]
+
+# Of the fields and of images; the files are to be looked at.
+_ACCURACY = 1e-2
+_EPS = 1e-6
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Files of two meshes with the witness function of the one against the other.
+
+    Attributes:
+        paths: Files that were written.
+        value: Largest value of the witness function at a vertex, by modulus, in 1 / unit length.
+        place: Vertex where it is, in the meshes' own unit of length.
+    """
+
+    paths: tuple[Path, ...]
+    value: float
+    place: tuple[float, float, float]
+
+    def __str__(self) -> str:
+        """Return where the surfaces differ most, and the files, as the end of a line."""
+        return self.sentence("a")
+
+    def sentence(self, name: str) -> str:
+        """Return where the surfaces differ most, and the files; the first surface has a name."""
+        if not self.paths:
+            return "no witness: neither surface is a mesh"
+        files = f"witness: {' '.join(map(str, self.paths))}"
+        if self.value == 0:
+            return f"they differ nowhere; {files}"
+        kind = "more" if self.value > 0 else "less"
+        place = ", ".join(f"{coordinate:.4g}" for coordinate in self.place)
+        return f"{name} has {kind} area near ({place}); {files}"
+
+
+def require_place(path: Path) -> None:
+    """Create the folder of the files that `write_difference` writes.
+
+    Raises:
+        InputError: The path names no file, or its folder cannot be created.
+    """
+    if not path.name:
+        raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{str(path)!r}: its folder cannot be created: {error}") from error
+
+
+def write_difference(
+    a: Surface, b: Surface, path: Path, order: float, *, scaling: bool = True, name: str = ""
+) -> Difference:
+    """Write two meshes, each with the witness function of a against b at its vertices.
+
+    Surfaces that are no meshes have no file.
+
+    Args:
+        a: Surface.
+        b: Reference.
+        path: Beginning of the paths of the files, to which "-a.ply" and "-b.ply" are added. Its folder is created.
+        order: Order s.
+        scaling: See `same_surface`.
+        name: Name of the comparison for the comments of the files; by default that of the path.
+
+    Raises:
+        InputError: The order is out of range, or the path names no file, or its folder cannot be created.
+        StoreError: A file cannot be written.
+    """
+    similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
+    pair = [similarity.apply(surface) for surface in (a, b)]
+    middle = np.mean(Extent.union([surface.extent for surface in pair]).box, axis=0)
+    x, y, z = middle.tolist()
+    centered = [Similarity(1.0, (x, y, z)).apply(surface) for surface in pair]
+    extent = Extent.union([surface.extent for surface in centered])
+    area = np.array(sum(surface.area for surface in centered))
+    lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))
+    fields = [fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in centered]
+    require_place(path)
+    written, greatest, place = [], 0.0, (0.0, 0.0, 0.0)
+    for label, own, mesh in zip("ab", (a, b), centered, strict=True):
+        if not isinstance(own, Mesh) or not isinstance(mesh, Mesh):
+            continue
+        used = mesh.used_vertices
+        values = np.full((1, len(mesh.vertices)), np.nan)
+        values[0, used] = witness(fields[0], fields[1], order, mesh.vertices[used], dtype="complex64")
+        vertex = int(np.nanargmax(np.abs(values[0])))
+        if abs(values[0, vertex]) > abs(greatest):
+            greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
+        file = path.with_name(f"{path.name}-{label}.ply")
+        VertexField(
+            own, values, (order,), 1 / similarity.scale, label, "b", name or path.name, context="comparison"
+        ).write(file)
+        written.append(file)
+    return Difference(tuple(written), greatest, place)

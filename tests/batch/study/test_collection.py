@@ -1,0 +1,166 @@
+"""Studies with several objects: how their objects and methods are found, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.batch.study.collection import read_study
+from sobolev_batch.batch.study.templates import names_of
+from tests.support.studies import small_table
+
+
+def table(**changes: Any) -> dict[str, Any]:
+    own = {
+        "reference": {"source": "files", "paths": ["objects/{object}.ply"]},
+        "family": [{"name": "{method}", "source": "files", "paths": ["out/{method}/{object}_*.ply"]}],
+    }
+    return small_table(**{**own, **changes})
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = [
+        *("objects/cow.ply", "objects/cow_2.ply", "objects/bee10.ply", "objects/bee9.ply"),
+        *("out/quick/cow_100.ply", "out/quick/cow_200.ply", "out/quick/bee9_100.ply", "out/quick/bee10_100.ply"),
+        *("out/quick/cow_2_100.ply", "out/even/cow_2_100.ply", "out/even/cow_100.ply", "out/even/bee9_100.ply"),
+    ]
+    for path in map(tmp_path.joinpath, made):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sb.write_mesh(sb.icosphere(0), path)
+    return tmp_path
+
+
+def methods(collection: sb.StudyCollection) -> dict[str, list[str]]:
+    return {name: [family.name for family in study.families] for name, study in collection.studies.items()}
+
+
+def files(collection: sb.StudyCollection, folder: Path, name: str, method: str) -> list[str]:
+    (family,) = (family for family in collection.studies[name].families if family.name == method)
+    return [member.name for member in family.source.members(folder)]
+
+
+def test_files_give_objects_and_methods(folder: Path) -> None:
+    found = sb.StudyCollection.from_table(table(), folder=folder)
+    assert list(found.studies) == ["bee9", "bee10", "cow", "cow_2"]
+    assert methods(found)["cow_2"] == ["even", "quick"]
+    assert methods(found)["bee10"] == ["quick"]
+    assert found.lacking == {"bee10": ("even",)}
+    # One object's name begins with that of another: the glob takes what follows.
+    assert files(found, folder, "cow", "quick") == ["cow_100", "cow_200", "cow_2_100"]
+    assert files(found, folder, "cow_2", "quick") == ["cow_2_100"]
+
+
+def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
+    objects = [
+        {"name": "cow"},
+        {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}},
+    ]
+    family = [{"name": "ico", "source": "icosphere", "levels": [0]}]
+    found = sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
+    assert [study.scaling.mode for study in found.studies.values()] == ["reference", "none"]
+    assert [study.name for study in found.studies.values()] == ["small cow", "small ball"]
+
+
+def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> None:
+    (folder / "lists").mkdir()
+    (folder / "lists/meshes.csv").write_text(
+        "object,method,path,method_seconds\n"
+        "cow,reference,../objects/cow.ply,\ncow,quick,../out/quick/cow_100.ply,0.5\n"
+        "bee,reference,../objects/bee9.ply,\nbee,quick,../out/quick/bee9_100.ply,0.25\n"
+    )
+    listed = small_table(objects={"meshes": "lists/meshes.csv"})
+    del listed["reference"], listed["family"]
+    found = sb.StudyCollection.from_table(listed, folder=folder)
+    assert methods(found) == {"cow": ["quick"], "bee": ["quick"]}
+    (member,) = found.studies["bee"].families[0].source.members(folder)
+    assert member.metadata == (("method_seconds", 0.25),)
+    frame = pd.DataFrame({"object": ["cow"], "method": ["quick"], "path": ["out/quick/cow_100.ply"]})
+    found = sb.StudyCollection.from_table(table(objects={"meshes": frame}, family=[]), folder=folder)
+    assert methods(found) == {"cow": ["quick"]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reference": {"source": "sphere"}, "object": []}, "object"),
+        ({"object": [{"name": "a/b"}]}, "holds none of|without / and"),
+        ({"object": [{"name": ".a"}]}, r"does not begin with \. or __"),
+        ({"object": [{"name": "cow"}, {"name": "COW"}]}, r"object: names must differ by more than case"),
+        ({"object": [{"name": "cow", "colour": 1}]}, r"\[\[object\]\] 1: unknown key colour"),
+        ({"objects": {"meshes": [{"path": "a.ply", "object": "cow"}]}}, "'a.ply' has no method"),
+        ({"reference": {"source": "files", "paths": ["none/{object}.ply"]}}, "matches no file"),
+        ({"norm": {"orders": [0.0]}}, r"object 'bee9': "),
+        (
+            {"objects": {"meshes": [{"path": "a.ply", "object": "a/b", "method": "m"}]}},
+            "object 'a/b': name: .*without / and",
+        ),
+        ({"objects": {"meshes": [{"path": "a.ply", "object": "zarr.json", "method": "m"}]}}, r"not end with \.json"),
+        (
+            {
+                "objects": {"meshes": [{"path": "a.ply", "object": name, "method": "m"} for name in ("cow", "dog")]},
+                "object": [{"name": "cow"}],
+            },
+            r"\[objects\] lists 'dog', and no \[\[object\]\] section has this name",
+        ),
+        ({"objects": 3}, r"objects must be \[objects\] with the key meshes, .*found 3"),
+        ({"family": 3}, r"family must be written as sections, \[\[family\]\] before each, found 3"),
+        ({"study": 3}, r"study must be a section, \[study\].*found 3"),
+        ({"study": {}}, r"\[study\]: name must be a text, found None"),
+        ({"reference": {"source": "sphere"}}, "a collection needs its objects"),
+    ],
+)
+def test_refusals_name_the_place(folder: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(sb.StudyError, match=message):
+        sb.StudyCollection.from_table(table(**changes), folder=folder)
+
+
+def test_objects_may_have_numbers_for_names(folder: Path) -> None:
+    lines = "object,method,path\n001,reference,objects/cow.ply\n001,10,out/quick/cow_100.ply\n"
+    (folder / "meshes.csv").write_text(lines)
+    listed = small_table(objects={"meshes": "meshes.csv"})
+    del listed["reference"], listed["family"]
+    assert methods(sb.StudyCollection.from_table(listed, folder=folder)) == {"001": ["10"]}
+    listed["objects"] = {"meshes": pd.read_csv(folder / "meshes.csv")}
+    listed["reference"] = {"source": "files", "paths": ["objects/cow.ply"]}
+    assert methods(sb.StudyCollection.from_table(listed, folder=folder)) == {"1": ["10"]}
+
+
+def test_a_study_without_a_name_is_told_so(folder: Path) -> None:
+    nameless = table()
+    del nameless["study"]
+    with pytest.raises(sb.StudyError, match=r"study must be a section, \[study\].* is missing"):
+        sb.StudyCollection.from_table(nameless, folder=folder)
+
+
+def test_a_study_file_is_read_as_what_it_is(folder: Path) -> None:
+    common = 'study.name = "x"\nlattice = { xi_max = 3.0, M = 16 }\nnorm.orders = [-2.0]\n'
+    family = 'family = [{ name = "{method}", source = "files", paths = ["out/{method}/{object}_*.ply"] }]\n'
+    (folder / "many.toml").write_text(
+        f'{common}{family}reference = {{ source = "files", paths = ["objects/{{object}}.ply"] }}\n'
+    )
+    (folder / "one.toml").write_text(
+        f'{common}reference.source = "sphere"\nfamily = [{{ name = "i", source = "icosphere", levels = [0] }}]\n'
+    )
+    assert isinstance(read_study(folder / "many.toml"), sb.StudyCollection)
+    assert isinstance(read_study(folder / "one.toml"), sb.Study)
+
+
+@pytest.mark.parametrize(
+    ("template", "path", "name"),
+    [
+        ("{method}_*.ply", "quadric_edge_100.ply", "quadric_edge"),
+        ("a/**/{method}.ply", "a/b/c/x.ply", "x"),
+        ("{method}/{method}-1.ply", "m/m-1.ply", "m"),
+        ("m[0-9]/{method}.ply", "m3/y.ply", "y"),
+        ("?/{method}.ply", "k/y.ply", "y"),
+    ],
+)
+def test_placeholders_take_as_much_as_they_can(tmp_path: Path, template: str, path: str, name: str) -> None:
+    (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / path).write_text("")
+    assert names_of(template, "{method}", tmp_path) == [name]

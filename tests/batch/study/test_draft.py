@@ -1,0 +1,278 @@
+"""First study files for folders of meshes: what is the reference, what a family, and that they run."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.batch.study.collection import read_study
+from sobolev_batch.batch.study.draft.mesh_files import MeshFolder
+from sobolev_batch.surfaces.sources.files import FileMember
+from tests.support.commands import call
+
+Files = dict[str, dict[str, list[str]]]
+
+# The reference last in each, since it has the most triangles.
+ONE_OBJECT: dict[str, tuple[list[str], str, dict[str, list[str]]]] = {
+    "names": (
+        ["even_80.ply", "even_320.ply", "odd.ply", "quick_1k2.obj", "quick_2.5k.obj", "statue_original.ply"],
+        "statue_original.ply",
+        {"even": ["even_80", "even_320"], "meshes": ["odd"], "quick": ["quick_1k2", "quick_2.5k"]},
+    ),
+    "folders": (
+        ["a/1.ply", "a/2.ply", "b/x/1.stl", "b/x/2.obj.gz", "scan.ply"],
+        "scan.ply",
+        {"a": ["1", "2"], "b x": ["1", "2"]},
+    ),
+    "one folder": (["out/p-1.ply", "out/p-2.ply", "out/q-1.ply", "out/q-2.ply", "ref.ply"], "ref.ply", {
+        "p": ["p-1", "p-2"],
+        "q": ["q-1", "q-2"],
+    }),
+    "hostile": (
+        [
+            *("[a] 'b'/*.ply", "[a] 'b'/?.ply", '[a] \'b\'/"q" {x}.ply'),
+            *("reference/ünï 💥.ply", "reference/Ground-Truth [1].ply"),
+        ],
+        "reference/Ground-Truth [1].ply",
+        {"[a] 'b'": ["*", "?", '"q" {x}'], "reference 2": ["ünï 💥"]},
+    ),
+    "alike": (["a/b/1.ply", "a b/2.ply", "scan.ply"], "scan.ply", {
+        "a b": ["2"],
+        "a b 2": ["1"],
+    }),
+    "alone": (["object 12.ply"], "object 12.ply", {"quadric decimation": ["80", "160", "320", "640"]}),
+}  # fmt: skip
+
+SEVERAL_OBJECTS: dict[str, tuple[list[str], list[str], str]] = {
+    "methods": (
+        ["objects/big cow.ply", "objects/cow.ply"],
+        ["out/{method}/{object}_80.ply", "out/{method}/{object}_320.ply"],
+        'paths = ["meshes/out/{method}/{object}_*.ply"]',
+    ),
+    "objects": (
+        ["big cow/ground truth.ply", "cow/ground truth.ply"],
+        ["{object}/{method}/80.ply", "{object}/{method}/320.ply"],
+        'paths = ["meshes/{object}/{method}/*.ply"]',
+    ),
+    "names": (
+        ["big cow_original.ply", "cow_original.ply"],
+        ["{object}_{method}_80.ply", "{object}_{method}_320.ply"],
+        'paths = ["meshes/{object}_{method}_*.ply"]',
+    ),
+    "folders of objects": (
+        ["objects/big cow/original.ply", "objects/cow/original.ply"],
+        ["objects/{object}/{method}_80.ply", "objects/{object}/{method}_320.ply"],
+        'paths = ["meshes/objects/{object}/{method}_*.ply"]',
+    ),
+    "hostile": (
+        ["[o]/originals/big cow.ply", "[o]/originals/cow.ply"],
+        ["[o]/*{method}?/{object}_80.ply", "[o]/*{method}?/{object}_320.ply"],
+        "[objects]",
+    ),
+}
+
+
+def write(path: Path, level: int) -> None:
+    """Write a sphere, in whatever format the name says."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix != ".gz":
+        sb.write_mesh(sb.icosphere(level), path)
+        return
+    sb.write_mesh(sb.icosphere(level), path.with_suffix(""))
+    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
+    path.with_suffix("").unlink()
+
+
+def files_of(study: sb.Study) -> Files:
+    """Return the paths of each family below the folder of the meshes, by the names of their members."""
+    folder = (study.folder / "meshes").absolute()
+    return {
+        family.name: {
+            member.name: [member.path.relative_to(folder).as_posix()] if isinstance(member, FileMember) else []
+            for member in family.source.members(study.folder)
+        }
+        for family in study.families
+    }
+
+
+@pytest.mark.parametrize("layout", ONE_OBJECT)
+def test_reference_and_families(tmp_path: Path, layout: str) -> None:
+    paths, reference, families = ONE_OBJECT[layout]
+    for path in paths:
+        write(tmp_path / "meshes" / path, 3 if path == reference else 1)
+    draft = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
+    study = sb.Study.from_toml(draft.path)
+    assert not draft.left_out
+    assert draft.summary[0] == f"reference meshes/{reference}, 1,280 triangles"
+    (found,) = study.reference.members(tmp_path)  # type: ignore[union-attr]
+    assert isinstance(found, FileMember)
+    assert found.path == (tmp_path / "meshes" / reference).absolute()
+    assert {name: set(members) for name, members in files_of(study).items()} == {
+        name: set(members) for name, members in families.items()
+    }
+
+
+@pytest.mark.parametrize("layout", SEVERAL_OBJECTS)
+def test_several_objects(tmp_path: Path, layout: str) -> None:
+    references, templates, expected = SEVERAL_OBJECTS[layout]
+    own = {
+        path.format(object=one, method=method): (one, method)
+        for path in templates
+        for one in ("cow", "big cow")
+        for method in ("even", "quick")
+    }
+    for path in (*references, *own):
+        write(tmp_path / "meshes" / path, 1)
+    draft = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
+    assert expected in draft.path.read_text(encoding="utf-8")
+    collection = read_study(draft.path)
+    assert isinstance(collection, sb.StudyCollection)
+    found = {
+        path: (one, family.strip("*?"))
+        for one, study in collection.studies.items()
+        for family, members in files_of(study).items()
+        for paths in members.values()
+        for path in paths
+    }
+    assert found == own
+    assert draft.summary == ("2 objects: big cow, cow", *draft.summary[1:])
+
+
+@pytest.mark.parametrize("template", ["{}_500.ply", "{}/500.ply", "out/{}.ply"])
+def test_meshes_of_no_method(tmp_path: Path, template: str) -> None:
+    paths = {template.format(one): one for one in ("big cow", "cow")}
+    for path in (*paths, "big cow_original.ply", "cow_original.ply"):
+        write(tmp_path / "meshes" / path, 1)
+    draft = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
+    collection = read_study(draft.path)
+    assert isinstance(collection, sb.StudyCollection)
+    found = {name: files_of(study) for name, study in collection.studies.items()}
+    method = "out" if template.startswith("out") else "meshes"
+    assert {one: [*members.values()] for one, families in found.items() for members in [families[method]]} == {
+        one: [[path]] for path, one in paths.items()
+    }
+    assert draft.summary == ("2 objects: big cow, cow", f"method {method}: 2 meshes")
+
+
+def test_methods_of_alike_folders_are_kept_apart(tmp_path: Path) -> None:
+    for one in ("cow", "hand"):
+        for path in (f"objects/{one}.ply", f"a/b/{one}.ply", f"a b/{one}.ply"):
+            write(tmp_path / path, 1)
+    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert draft.summary == ("2 objects: cow, hand", "method a b: 2 meshes", "method a b 2: 2 meshes")
+
+
+def test_large_files_do_not_keep_small_ones_from_being_read(tmp_path: Path) -> None:
+    write(tmp_path / "a.stl", 1)
+    with (tmp_path / "a.stl").open("r+b") as file:
+        file.truncate(40 << 20)
+    write(tmp_path / "b.stl", 1)
+    with (tmp_path / "b.stl").open("r+b") as file:
+        file.truncate(1000)
+    write(tmp_path / "c.stl", 1)
+    assert "b.stl" in MeshFolder.of(tmp_path).left_out
+
+
+def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> None:
+    write(tmp_path / "elsewhere" / "far.ply", 1)
+    write(tmp_path / "in" / "original.ply", 2)
+    write(tmp_path / "in" / "own" / "near.ply", 1)
+    (tmp_path / "in" / "out").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "in" / "own" / "a.ply").symlink_to("near.ply")
+    (tmp_path / "in" / "far.ply").symlink_to(tmp_path / "elsewhere" / "far.ply")
+    draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
+    assert draft.summary[1:] == (
+        "family meshes: 1 mesh, 80 triangles",
+        "family own: 2 meshes, 80 triangles",
+    )
+
+
+def test_one_small_mesh_is_not_enough(tmp_path: Path) -> None:
+    triangles = np.array([[0, 1, 2], [3, 1, 0], [3, 2, 1], [3, 0, 2]])
+    sb.write_mesh(sb.Mesh(np.eye(4, 3), triangles), tmp_path / "a.ply")
+    with pytest.raises(sb.StudyError, match=r"^a\.ply is the only mesh that can be read, and too small to decimate"):
+        sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert not (tmp_path / "study.toml").exists()
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "original.ply", 3)
+    write(tmp_path / "in" / "scan_1.ply", 1)
+    write(tmp_path / "in" / "scan_2.ply", 1)
+    (tmp_path / "in" / "scan_3.ply").write_text("nothing")
+    (tmp_path / "in" / "cad.step").write_text("nothing")
+    (tmp_path / "in" / "notes.txt").write_text("nothing")
+    write(tmp_path / "in" / "{object}.ply", 1)
+    write(tmp_path / "in" / "old.zarr" / "mesh.ply", 4)
+    draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
+    assert sorted(draft.left_out) == ["cad.step", "scan_3.ply", "{object}.ply"]
+    assert "convert it" in draft.left_out["cad.step"]
+    assert "left out: scan_3.ply: " in str(draft)
+    text = draft.path.read_text(encoding="utf-8")
+    assert 'paths = ["in/scan_1.ply", "in/scan_2.ply"]' in text
+    # What the file offers is valid too.
+    offers = [line.removeprefix("# ") for line in text.splitlines() if not line.startswith("# More")]
+    (tmp_path / "more.toml").write_text("\n".join(line for line in offers if not line.startswith(("`", "Compare"))))
+    more = sb.Study.from_toml(tmp_path / "more.toml")
+    assert more.proximity == 10_000
+    assert more.witness == (-2.0,)
+    assert [family.name for family in more.families] == ["scan", "quadric decimation"]
+
+
+def test_names_that_a_study_or_a_terminal_cannot_take_are_left_out(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "original.ply", 3)
+    for name in ("B.ply", "b.ply", "\x1b[31mred.ply"):
+        write(tmp_path / "in" / name, 1)
+    draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
+    assert "differs from that of 'B.ply' only in case" in draft.left_out["b.ply"]
+    assert r"left out: '\x1b[31mred.ply': its name" in str(draft)
+    assert "\x1b" not in str(draft)
+    assert [family.name for family in sb.Study.from_toml(draft.path).families] == ["meshes"]
+
+
+def test_long_summaries_are_cut() -> None:
+    draft = sb.StudyDraft(
+        Path("study.toml"), [f"line {i}" for i in range(50)], {f"{i}.ply": "empty" for i in range(50)}
+    )
+    assert [line.split(":")[0] for line in str(draft).splitlines()] == [
+        "study.toml",
+        *(f"line {i}" for i in range(1, 11)),
+        "and 39 more",
+        *["left out"] * 11,
+        "next",
+        "      sobolev-batch run study.toml",
+    ]
+
+
+def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(sb.StudyError, match="no such folder"):
+        sb.init_study(tmp_path / "nowhere", tmp_path / "study.toml")
+    (tmp_path / "a.ply").write_text("nothing")
+    with pytest.raises(sb.StudyError, match=r"no mesh file that can be read: a\.ply: no PLY header"):
+        sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert not (tmp_path / "study.toml").exists()
+    write(tmp_path / "b.ply", 1)
+    with pytest.raises(sb.StudyError, match="no study can be written there: No such file"):
+        sb.init_study(tmp_path, tmp_path / "nowhere" / "study.toml")
+
+
+def test_the_command_writes_a_study_that_runs_and_keeps_it(tmp_path: Path) -> None:
+    write(tmp_path / "original.ply", 2)
+    for level in (0, 1):
+        write(tmp_path / f"ball {level}.ply", level)
+    done = call("init", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "family ball: 2 meshes, 20 to 80 triangles" in done.stdout
+    assert done.stdout.endswith("next: sobolev-batch plan study.toml\n      sobolev-batch run study.toml\n")
+    summary = sb.run(sb.Study.from_toml(tmp_path / "study.toml"), "memory://first-study.zarr", workers=1)
+    assert len(summary.computed) == 3
+    assert not summary.imprecise
+    written = (tmp_path / "study.toml").read_text(encoding="utf-8")
+    done = call("init", folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: study.toml exists already; name another file, or move it away\n"
+    assert (tmp_path / "study.toml").read_text(encoding="utf-8") == written

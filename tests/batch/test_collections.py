@@ -1,0 +1,253 @@
+"""Runs of collections: a store for each object, and one that cannot be carried out stops no other."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+import xarray as xr
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock, locked
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import Plan, make_plan
+from tests.support.commands import call
+from tests.support.studies import small_table
+
+
+def spheres(**radii: float) -> list[dict[str, Any]]:
+    return [
+        {"name": label, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
+        for label, radius in radii.items()
+    ]
+
+
+GONE = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"]}}
+
+
+def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:
+    families = [
+        {"name": "ico", "source": "icosphere", "levels": [1, 2]},
+        {"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
+    ]
+    return sb.StudyCollection.from_table(small_table(study={"name": name}, object=objects, family=families))
+
+
+@pytest.fixture(scope="module")
+def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store of a collection of which one object has lost its reference."""
+    path = tmp_path_factory.mktemp("collection") / "balls.zarr"
+    summary = sb.run(collection([*spheres(a=1.0), GONE, *spheres(b=1.1)]), path, client)
+    assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in labels()}
+    assert list(summary.failed) == ["gone"]
+    assert "the reference cannot be made: nowhere.ply" in summary.failed["gone"].replace(str(Path.cwd()) + "/", "")
+    return path
+
+
+def labels() -> list[str]:
+    return ["ico/1", "ico/2", "egg/1", "egg/2", "reference"]
+
+
+def test_each_object_has_a_store_of_its_own(store: Path, client: Client, tmp_path: Path) -> None:
+    alone = collection(spheres(b=1.1)).studies["b"]
+    sb.run(alone, tmp_path / "alone.zarr", client)
+    assert sb.table(store / "b").equals(
+        sb.table(tmp_path / "alone.zarr").assign(seconds=sb.table(store / "b")["seconds"])
+    )
+
+
+def test_xarray_reads_all_objects_at_once(store: Path) -> None:
+    tree = xr.open_datatree(store, engine="zarr", consolidated=False)
+    assert tree["a/convergence"]["distance"].sizes == {"mesh": 5, "order": 2}
+    assert tree.attrs["collection"]["objects"] == ["a", "gone", "b"]
+
+
+def test_what_is_damaged_is_named_with_its_object(store: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(store, copy)
+    sound = sb.verify(copy)
+    assert (sound.is_sound, sound.complete, sound.total) == (True, 10, 10)
+    assert {name: one.total for name, one in sound.objects.items()} == {"a": 5, "gone": 0, "b": 5}
+    chunk = copy / "b/fourier/fourier/c/1/0/0/0"
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 5] ^= 1
+    chunk.write_bytes(data)
+    done = call("verify", copy)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert lines[:3] == [
+        "a: 5 of 5 surfaces complete, their fields read back",
+        "gone: it has no results yet",
+        "b: 5 of 5 surfaces complete, their fields read back",
+    ]
+    assert lines[3].startswith("b/ico/2: ")
+    assert lines[-1] == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
+
+
+def test_plots_of_a_collection_are_those_of_its_league(store: Path, tmp_path: Path) -> None:
+    done = call("plot", store, "--output", tmp_path, "--order", "-3", "--format", "svg")
+    assert done.stdout.split() == [str(tmp_path / "league.svg")]
+    text = (tmp_path / "league.svg").read_text(encoding="utf-8")
+    assert "order -3, mean of 2 objects" in text
+    assert "order -10" not in text
+    refused = call("plot", store, "--witness", "ico/1")
+    assert refused.returncode == 2
+    assert "--witness draws meshes of one object" in refused.stderr
+
+
+def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
+    joined = sb.table(store, -3)
+    assert joined.columns[0] == "object"
+    for name in ("a", "b"):
+        expected = sb.table(store / name, -3)
+        of_object = joined[joined["object"] == name].drop(columns="object").reset_index(drop=True)
+        assert of_object.equals(expected)
+    text = call("table", store, "--order", "-3").stdout
+    assert text.count("Object ") == 2
+    assert text.count("Relative distances are fractions") == 1
+    assert call("table", store, "--format", "csv").stdout.startswith("object,order,mesh")
+    refused = call("table", store, "--matrix")
+    assert refused.returncode == 2
+    assert "name the store of one object, such as" in refused.stderr
+
+
+def test_what_is_wrong_with_a_question_is_said_as_it_is(store: Path) -> None:
+    with pytest.raises(sb.OrderError, match=r"finite only for orders below -1/2, found -0\.2"):
+        sb.table(store, -0.2)
+    with pytest.raises(sb.StoreError, match="nowhere"):
+        sb.league({"a": store / "a", "b": store / "nowhere"})
+
+
+def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    table = collection([*spheres(a=1.0), GONE, *spheres(b=1.1)]).table
+    path.write_text(tomli_w.dumps(table))
+    done = call("plan", path, "--store", tmp_path / "s.zarr")
+    assert done.returncode == 3
+    assert [line for line in done.stdout.splitlines() if line in {"a:", "gone:", "b:"}] == ["a:", "gone:", "b:"]
+    assert done.stderr.startswith("not planned: ")
+
+
+def test_a_collection_goes_on_while_its_next_object_is_planned(store: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(store, copy)
+    ended = sb.status(copy)
+    assert not ended.going_on
+    assert list(ended.failed) == ["gone"]
+    with locked(Location.of(copy / "gone"), Lock.of_this_process()):
+        status = sb.status(copy)
+        assert (status.going_on, status.complete, status.total, status.failed) == (True, 10, 11, {})
+        assert "running: planning; by process " in str(status)
+    # The lock of a process of which nobody knows whether it runs, from long ago.
+    lock = replace(Lock.of_this_process(outlives_process=True), since="2020-01-01T00:00:00Z")
+    with locked(Location.of(copy / "gone"), lock):
+        status = sb.status(copy)
+        assert status.lost
+        assert f"sobolev-batch release {copy / 'gone'}" in str(status)
+    assert not sb.status(copy).lost
+
+
+def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[bool] = []
+
+    def planned(*arguments: Any) -> Plan:
+        seen.append(sb.status(tmp_path / "s.zarr").going_on)
+        return make_plan(*arguments)
+
+    monkeypatch.setattr("sobolev_batch.batch.run.make_plan", planned)
+    sb.run(collection([GONE, {**GONE, "name": "too"}]), tmp_path / "s.zarr")
+    assert seen == [True, True]
+    assert not sb.status(tmp_path / "s.zarr").going_on
+
+
+@pytest.mark.parametrize("state", ["failed", "running"])
+def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(store: Path, tmp_path: Path, state: str) -> None:
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(store, copy)
+    ended = Store.open(copy / "a").read_run()
+    assert ended is not None
+    seen = "2020-01-01T00:00:00Z"
+    Store.open(copy / "a").write_run(replace(ended, state=state, started=seen, seen=seen, error="no disk"))  # type: ignore[arg-type]
+    status = sb.status(copy)
+    assert status.run_store == str(copy / "a")
+    shown = f"the latest run of {copy / 'a'} failed: no disk" if state == "failed" else f"release {copy / 'a'}"
+    assert shown in str(status)
+    assert status.lost == (state == "running")
+
+
+def test_fields_of_another_collection_are_taken_over_by_object(store: Path, tmp_path: Path, client: Client) -> None:
+    summary = sb.run(collection(spheres(a=1.0, b=1.1), "again"), tmp_path / "again.zarr", client, reuse=[store])
+    assert summary.computed == ()
+    assert len(summary.reused) == 10
+    assert sb.table(tmp_path / "again.zarr/b")["distance"].equals(sb.table(store / "b")["distance"])
+
+
+def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
+    summary = sb.run(collection(spheres(a=1.0, b=1.1, c=1.2)), store, client)
+    assert set(summary.computed) == {f"c/{label}" for label in labels()}
+    assert summary.failed == {}
+
+
+def test_the_store_of_another_collection_is_refused(store: Path, client: Client) -> None:
+    with pytest.raises(sb.StoreError, match="the store of another collection is there, 'small', not 'other'"):
+        sb.run(collection(spheres(a=1.0), "other"), store, client)
+
+
+def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
+    leagues = sb.league(store)
+    assert [one.order for one in leagues] == [-10.0, -3.0]
+    assert leagues[1].table["method"].tolist() == ["ico", "egg"]
+    assert leagues[1].scores.objects[:2] == ("a", "b")
+
+
+def test_what_is_no_collection_is_said(finished_store: Path) -> None:
+    with pytest.raises(sb.StoreError, match="no store of a collection is there"):
+        sb.league(finished_store)
+
+
+def test_a_study_against_itself_has_not_changed(store: Path) -> None:
+    frame = sb.compare_studies(store, store, -3)
+    assert frame["ratio"].tolist() == [1.0, 1.0]
+    assert set(frame["verdict"]) == {"undecided"}
+
+
+def test_a_study_against_another_finds_what_became_farther(tmp_path: Path, client: Client) -> None:
+    radii = {f"o{i}": 1 + i / 100 for i in range(7)}
+    new, old = tmp_path / "new.zarr", tmp_path / "old.zarr"
+    studies = {
+        new: [{"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.7], "levels": [2]}],
+        old: [{"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [2]}],
+    }
+    for path, family in studies.items():
+        lattice = {"xi_max": 4.0, "M": 32}
+        table = small_table(object=spheres(**radii), family=family, lattice=lattice)
+        sb.run(sb.StudyCollection.from_table(table), path, client)
+    change = sb.compare_studies(new, old, -3).to_dict("records")[0]
+    assert change["verdict"] == "farther"
+    assert (change["objects"], change["meshes"]) == (7, 7)
+    assert change["low"] > 1
+    assert change["worst"].endswith("/egg/2")
+    with pytest.raises(sb.InputError, match="different references or units"):
+        sb.compare_studies(new / "o0", store_in_another_unit(tmp_path, client), -3)
+
+
+def test_other_references_in_closed_form_are_told_apart(tmp_path: Path, client: Client) -> None:
+    stores = {"sphere": tmp_path / "sphere.zarr", "egg": tmp_path / "egg.zarr"}
+    references = {"sphere": {"source": "sphere"}, "egg": {"source": "ellipsoid", "axes": [1.0, 1.0, 0.9]}}
+    for name, reference in references.items():
+        sb.run(sb.Study.from_table(small_table(reference=reference)), stores[name], client)
+    assert len(sb.compare_studies(stores["egg"], stores["egg"], -3)) == 1
+    with pytest.raises(sb.InputError, match="different references or units"):
+        sb.compare_studies(stores["egg"], stores["sphere"], -3)
+
+
+def store_in_another_unit(folder: Path, client: Client) -> Path:
+    study = sb.Study.from_table(small_table(scaling={"mode": "fixed", "scale": 0.5}))
+    sb.run(study, folder / "unit.zarr", client)
+    return folder / "unit.zarr"

@@ -1,0 +1,226 @@
+"""Leagues over tables that are put together by hand, whose answers are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import permutations, product
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+import sobolev_batch as sb
+from sobolev_batch.results.league.intervals import Interval, adjusted, sign_flip_test, within_objects
+from sobolev_batch.results.league.league import League, leagues_of
+from sobolev_batch.results.league.text import format_league
+
+SIZES = (100, 400, 1600)
+
+Ranked = Callable[..., League]
+
+
+def frame(distances: Mapping[str, Mapping[int, float]], error: float = 0.0, order: float = -2.0) -> pd.DataFrame:
+    """Return rows of a table from relative distances by method and triangles."""
+    rows = [
+        {
+            "order": order,
+            "mesh": f"{method}/{triangles}",
+            "family": method,
+            "triangles": triangles,
+            "edge_length": triangles**-0.5,
+            "relative": value,
+            "relative_error": error * value,
+        }
+        for method, by_size in distances.items()
+        for triangles, value in by_size.items()
+    ]
+    return pd.DataFrame(rows)
+
+
+@pytest.fixture
+def ranked() -> Ranked:
+    """A function that makes the league of some tables."""
+
+    def make(tables: Mapping[str, pd.DataFrame], **arguments: Any) -> League:
+        (made,) = leagues_of(tables, list(tables), **arguments)
+        return made
+
+    return make
+
+
+def of_powers(factors: Mapping[str, float], scale: float, rate: float = 2.0) -> pd.DataFrame:
+    """Return the table of methods whose distances are factors of the same power of the edge length."""
+    return frame({name: {n: factor * scale * n ** (-rate / 2) for n in SIZES} for name, factor in factors.items()})
+
+
+def test_factors_between_methods_are_found_whatever_the_objects(ranked: Ranked) -> None:
+    rng = np.random.default_rng(3)
+    tables = {
+        f"object{i}": of_powers({"a": 1.0, "b": 1.5 * np.exp(0.01 * rng.standard_normal())}, scale)
+        for i, scale in enumerate((1.0, 10.0, 0.1, 3.0, 0.02, 7.0))
+    }
+    made = ranked(tables)
+    assert made.table["method"].tolist() == ["a", "b"]
+    assert made.table[["rank", "last_rank"]].to_numpy().tolist() == [[1, 1], [2, 2]]
+    np.testing.assert_allclose(made.table["rate"], 2.0)
+    (pair,) = made.pairs.to_dict("records")
+    assert pair["ratio"] == pytest.approx(1 / 1.5, rel=0.02)
+    assert pair["low"] < 1 / 1.5 < pair["high"]
+    # Of 2^6 changes of sign, two are as extreme.
+    assert pair["p"] == pytest.approx(2 / 64)
+    assert pair["nearer"] == "a"
+
+
+def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
+    first = {n: 1.0 / n for n in SIZES}
+    # The same curve, sampled elsewhere: with fewer triangles each, at which a mean of distances would be larger.
+    second = {n: 1.0 / n for n in (50, 150, 500, 2000)}
+    tables = {name: frame({"a": first, "b": second}) for name in ("x", "y", "z")}
+    made = ranked(tables)
+    assert made.pairs["ratio"].item() == pytest.approx(1.0)
+    # The middle of the common range, 100 to 1600, on a logarithmic axis.
+    np.testing.assert_allclose(made.table["relative"], 1 / 400)
+
+
+def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
+    distances = {"a": dict.fromkeys(SIZES, 1.0), "b": dict.fromkeys(SIZES, 1.1)}
+    sharp, blurred = (ranked({f"{i}": frame(distances, error) for i in range(8)}) for error in (1e-3, 0.1))
+    assert sharp.pairs["nearer"].item() == "a"
+    assert sharp.table["last_rank"].tolist() == [1, 2]
+    assert blurred.pairs["nearer"].item() == ""
+    assert blurred.pairs["p"].item() == 1.0
+    assert blurred.table["last_rank"].tolist() == [2, 2]
+
+
+def test_a_distance_below_its_error_bounds_nothing(ranked: Ranked) -> None:
+    tables = {f"{i}": frame({"a": {100: 1e-3}, "b": {100: 1.0}}, error=2.0) for i in range(6)}
+    made = ranked(tables)
+    assert np.isinf(made.table["high"]).all()
+    assert made.table["last_rank"].tolist() == [2, 2]
+    assert "?" in format_league([made])
+
+
+def test_objects_without_a_method_are_left_out_and_named(ranked: Ranked) -> None:
+    both, one = of_powers({"a": 1, "b": 2}, 1.0), of_powers({"a": 1}, 1.0)
+    made = ranked({"x": both, "y": one, "z": both})
+    assert made.scores.objects == ("x", "z")
+    assert made.scores.left_out == {"y": "no distance of b"}
+    assert "y is left out: no distance of b." in format_league([made])
+    assert ranked({"x": both, "y": one}, methods=["a"]).scores.objects == ("x", "y")
+    with pytest.raises(sb.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"):
+        ranked({"y": one, "w": of_powers({"b": 1}, 1.0)})
+    with pytest.raises(sb.InputError, match="no method is named 'c'; known are a, b"):
+        ranked({"x": both}, methods=["c"])
+
+
+@pytest.mark.parametrize("distance", [3e-8, 0.0])
+def test_objects_that_a_method_reproduced_are_left_out_and_named(distance: float, ranked: Ranked) -> None:
+    plain = of_powers({"a": 1, "b": 2}, 1.0)
+    box = frame({"a": dict.fromkeys(SIZES, distance), "b": {n: 1.0 / n for n in SIZES}}, error=0.03)
+    made = ranked({"x": plain, "box": box, "z": plain})
+    assert made.scores.left_out == {"box": "a reproduced it, up to rounding"}
+    assert made.pairs["ratio"].item() == pytest.approx(0.5)
+    np.testing.assert_allclose(made.table["rate"], 2.0)
+
+
+def test_objects_are_named_with_the_orders_that_leave_them_out(ranked: Ranked) -> None:
+    plain = of_powers({"a": 1, "b": 2}, 1.0)
+    exact = frame({"a": dict.fromkeys(SIZES, 1e-8), "b": {n: 1.0 / n for n in SIZES}})
+    every, some = ranked({"x": plain, "box": plain}), ranked({"x": plain, "box": exact})
+    assert "box is left out at order -2: a reproduced it" in format_league([every, some])
+    assert "box is left out: a reproduced it" in format_league([some, some])
+
+
+def test_few_objects_are_said_to_be_too_few(ranked: Ranked) -> None:
+    plain = of_powers({"a": 1, "b": 2}, 1.0)
+    five, six = (ranked({f"{i}": plain for i in range(count)}) for count in (5, 6))
+    assert "The test cannot tell 2 methods from chance with 5 objects; take 6 or more." in format_league([five])
+    assert "a is 2 times nearer than b" in format_league([six])
+
+
+def test_sizes_that_do_not_meet_are_not_compared(ranked: Ranked) -> None:
+    near = frame({"a": {1000: 1.0}, "b": {1100: 2.0}})
+    far = frame({"a": {1000: 1.0}, "b": {2000: 2.0}})
+    made = ranked({"x": near, "y": far, "z": near})
+    assert made.scores.left_out == {"y": "no common range of sizes: b begins at 2,000, a ends at 1,000"}
+    assert made.pairs["ratio"].item() == pytest.approx(0.5)
+
+
+def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size(ranked: Ranked) -> None:
+    close = frame({"a": {1000: 0.0100, 1001: 0.0102}, "b": {1150: 0.0100}})
+    made = ranked(dict.fromkeys("stuvwxyz", close))
+    assert made.table.set_index("method").loc["a", "relative"] == pytest.approx(0.0102)
+
+
+def test_meshes_of_one_size_all_count(ranked: Ranked) -> None:
+    tables = frame({"a": {1000: 0.01}, "b": {1000: 0.015}})
+    more = [tables[tables["family"] == "a"].assign(relative=relative) for relative in (0.03, 0.03)]
+    made = ranked(dict.fromkeys("stuvwxyz", pd.concat([tables, *more], ignore_index=True)))
+    assert made.table["method"].tolist() == ["b", "a"]
+    assert made.table["relative"].iloc[1] == pytest.approx((0.01 * 0.03 * 0.03) ** (1 / 3))
+
+
+def test_rates_are_those_of_the_objects_that_count_and_need_sizes(ranked: Ranked) -> None:
+    plain = of_powers({"a": 1, "b": 2}, 1.0)
+    steep = frame({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
+    lone = frame({"a": {1000: 1.0, 8000: 1e-3}})
+    made = ranked({"x": plain, "steep": steep, "lone": lone, "z": plain})
+    assert list(made.scores.left_out) == ["lone"]
+    np.testing.assert_allclose(made.table["rate"], 2.0)
+
+
+def test_objects_without_tables_are_named() -> None:
+    (made,) = leagues_of({"x": of_powers({"a": 1, "b": 2}, 1.0)}, ["x", "y"])
+    assert "y is left out: it has no tables yet." in format_league([made])
+
+
+def test_one_object_has_no_intervals_and_no_ranks(ranked: Ranked) -> None:
+    made = ranked({"x": of_powers({"a": 1, "b": 2}, 1.0)})
+    assert made.table[["low", "high"]].isna().all(axis=None)
+    assert made.table[["rank", "last_rank"]].to_numpy().tolist() == [[1, 2], [1, 2]]
+    assert made.pairs["nearer"].item() == ""
+
+
+def test_intervals_are_those_of_student() -> None:
+    values = np.random.default_rng(1).normal(2.0, 0.3, 12)
+    known = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    made = Interval.of(values, np.full(12, 0.05))
+    assert made.low == pytest.approx(known.low - 0.05)
+    assert made.high == pytest.approx(known.high + 0.05)
+
+
+def test_the_permutation_test_is_that_of_another_library() -> None:
+    differences = np.random.default_rng(2).normal(0.4, 1.0, 10)
+    known = stats.permutation_test(
+        (differences,), np.sum, permutation_type="samples", n_resamples=10_000, alternative="two-sided"
+    )
+    assert sign_flip_test(differences, np.zeros(10)) == pytest.approx(known.pvalue)
+
+
+def test_errors_make_p_the_largest_that_they_allow() -> None:
+    rng = np.random.default_rng(4)
+    differences, errors = rng.normal(1.0, 0.5, 6), np.full(6, 0.1)
+    bound = sign_flip_test(differences, errors)
+    for signs in product((-1.0, 0.0, 1.0), repeat=6):
+        assert sign_flip_test(differences + np.array(signs) * errors, np.zeros(6)) <= bound
+
+
+def test_many_objects_are_tried_at_random_and_p_is_never_zero() -> None:
+    p = sign_flip_test(np.ones(40), np.zeros(40))
+    assert 0 < p < 1e-3
+
+
+def test_adjusted_p_values_keep_their_order_and_do_not_exceed_one() -> None:
+    for values in permutations((0.01, 0.03, 0.4)):
+        expected = {0.01: 0.03, 0.03: 0.06, 0.4: 0.4}
+        np.testing.assert_allclose(adjusted(np.array(values)), [expected[value] for value in values])
+    assert adjusted(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
+
+
+def test_what_objects_differ_by_does_not_widen_intervals() -> None:
+    rng = np.random.default_rng(5)
+    noise = 0.1 * rng.standard_normal((2000, 3))
+    spread = within_objects(noise + 10 * rng.standard_normal((2000, 1)))
+    np.testing.assert_allclose(spread, 0.1, rtol=0.05)

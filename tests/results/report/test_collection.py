@@ -1,0 +1,153 @@
+"""The report of a collection, in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+import sobolev_batch as sb
+from sobolev_batch import InputError
+from sobolev_batch.cli import cli
+from sobolev_batch.results.league.league import leagues_of
+from sobolev_batch.results.report import collection as collection_module
+from sobolev_batch.results.report.build import make_report
+from tests.support.browser import Browser, browser
+from tests.support.studies import small_table
+
+SCRIPT = "<script>window.ran=1</script>"
+
+
+@pytest.fixture(scope="module")
+def store() -> str:
+    """Two spheres by two methods, and an object that has lost its reference."""
+    objects = [
+        {"name": name, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
+        for name, radius in (("ball", 1.0), ("large", 1.1))
+    ]
+    families = [
+        {"name": "ico", "source": "icosphere", "levels": [1, 2]},
+        {"name": "=egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
+    ]
+    gone = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"]}}
+    study = {"name": "balls", "title": f"Balls {SCRIPT}"}
+    table = small_table(study=study, object=[*objects, gone], family=families)
+    place = "memory://balls-report.zarr"
+    assert list(sb.run(sb.StudyCollection.from_table(table), place).failed) == ["gone"]
+    return place
+
+
+@pytest.fixture(scope="module")
+def page(store: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("collection") / "report.html"
+    done = CliRunner().invoke(cli, ["report", store, "--output", str(path)])
+    assert done.stdout.strip() == str(path)
+    assert f"left out: single meshes: each object has a report of its own, such as that of {store}/ball" in done.stderr
+    return path
+
+
+@pytest.fixture(scope="module")
+def reader(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("profile")) as found:
+        found.open_report(page)
+        yield found
+
+
+def test_the_page_opens_with_the_league(reader: Browser, page: Path, store: str) -> None:
+    assert reader.requests() == [page.as_uri()]
+    assert reader.complaints() == []
+    assert reader.tell("window.ran === undefined")
+    (league, _) = sb.league(store)
+    best = league.table["method"].iloc[0]
+    assert reader.texts(".lead")[0].startswith(f"The intervals do not separate {best} and ")
+    shown = reader.texts("#table-league tbody:not([hidden]) th.label")
+    assert shown == league.table["method"].tolist()
+    assert reader.tell("document.querySelector('main table').id") == "table-league"
+    drawn = reader.tell("document.getElementById('chart-league').data.map(line => line.y.length)")
+    assert drawn == [2, 2]
+    assert reader.texts("#failed tbody th") == ["gone"]
+    assert reader.texts("#table-objects tbody:not([hidden]) th.label") == ["ball", "large"]
+
+
+def test_tables_are_those_of_the_league(reader: Browser, store: str, tmp_path: Path) -> None:
+    names = {f"balls-{name}.csv" for name in ("league", "pairs", "objects", "failed")}
+    assert reader.download_tables(tmp_path) == names
+    leagues = sb.league(store)
+    for name, tables in (("league", [one.table for one in leagues]), ("pairs", [one.pairs for one in leagues])):
+        known = pd.concat([table.assign(order=one.order) for table, one in zip(tables, leagues, strict=True)])
+        found = pd.read_csv(tmp_path / f"balls-{name}.csv")
+        assert found["method"].str.removeprefix("'").tolist() == known["method"].tolist()
+        numbers = known.select_dtypes("number").columns.tolist()
+        pd.testing.assert_frame_equal(
+            found[numbers], known[numbers].reset_index(drop=True), check_exact=True, check_dtype=False
+        )
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_method_and_distance_are_seen_at_every_width(reader: Browser, page: Path, width: int) -> None:
+    reader.open(page, width=width)
+    assert reader.tell("document.documentElement.scrollWidth") <= width
+    assert reader.relative_columns() == {"table-league": True, "table-objects": True}
+
+
+def test_a_collection_without_league_says_why(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise InputError("no object has all of the methods <a>")
+
+    monkeypatch.setattr(collection_module, "leagues_of", refuse)
+    text = make_report(store).text
+    assert "<strong>There is no league.</strong> no object has all of the methods &lt;a&gt;" in text
+    assert "left out: methods cannot be compared" in text
+    assert 'id="table-objects"' in text
+    # At every order.
+    assert text.count("Methods cannot be compared over the objects.") == 2
+
+
+def test_meshes_of_a_collection_are_shown_by_the_report_of_an_object(store: str) -> None:
+    with pytest.raises(InputError, match=f"in the report of one object, such as {store}/ball"):
+        make_report(store, witnesses=["ico/1"])
+
+
+def frame(factors: Mapping[str, float], scale: float) -> pd.DataFrame:
+    """Return rows of a table of methods whose distances differ by factors."""
+    rows = [
+        {
+            "order": -2.0,
+            "mesh": f"{method}/{triangles}",
+            "family": method,
+            "triangles": triangles,
+            "edge_length": triangles**-0.5,
+            "relative": scale * factor / triangles,
+            "relative_error": 0.0,
+        }
+        for method, factor in factors.items()
+        for triangles in (100, 400)
+    ]
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize(
+    ("factors", "objects", "sentence"),
+    [
+        ({"b": 2.0, "a": 1.0}, 8, "a is nearest to the references over 8 objects at order −2: it differs by 0.5 %."),
+        ({"a": 1.0}, 2, "a differs from the references by 0.5 % over 2 objects at order −2."),
+        ({"b": 2.0, "a": 1.0}, 1, "a is nearest on o0 at order −2: it differs by 0.5 %. One object ranks no methods."),
+        (
+            {"a": 1.0, "b": 1.0, "c": 2.0},
+            8,
+            "The intervals do not separate a and b over 8 objects at order −2. a has the smallest mean, 0.5 %.",
+        ),
+        (
+            dict.fromkeys("abcde", 1.0),
+            2,
+            "The intervals do not separate 5 of 5 methods over 2 objects at order −2. a has the smallest mean, 0.5 %.",
+        ),
+    ],
+)
+def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], objects: int, sentence: str) -> None:
+    tables = {f"o{i}": frame(factors, 1.0) for i in range(objects)}
+    (league,) = leagues_of(tables, list(tables))
+    assert collection_module.sentence_of(league) == sentence

@@ -1,0 +1,115 @@
+"""The time that a plan foretells: what it counts, and how it follows from stored fields."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.results import forecast as forecasts
+from sobolev_batch.results.forecast import Forecast
+from sobolev_batch.spectral.transform.durations import expected_points, field_seconds
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import transform_block
+from tests.support.studies import small_table
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return make_plan(sb.Study.from_table(small_table()))
+
+
+def records(plan: Plan, *labels: str, seconds: float) -> dict[str, Record]:
+    """Return records of fields that took so long each."""
+    keys = {row.label: row.key for row in plan.rows}
+    return {label: Record(keys[label], "complete", seconds=seconds) for label in labels}
+
+
+@pytest.mark.parametrize("mesh", [sb.icosphere(1), sb.icosphere(4), sb.Torus(1.0, 0.4).mesh(96, 48)])
+@pytest.mark.parametrize("xi_max", [2.0, 8.0])
+def test_points_are_predicted_without_the_mesh(mesh: sb.Mesh, xi_max: float) -> None:
+    lattice, settings = sb.Lattice(xi_max, 48), TransformSettings()
+    block = replace(lattice.half, shape=(2, 2, 2))
+    points = transform_block(mesh, lattice, block, settings).points
+    predicted = expected_points(len(mesh.triangles), mesh.area, lattice, settings)
+    assert predicted == pytest.approx(points, rel=0.5)
+
+
+def test_finer_meshes_and_larger_lattices_take_longer() -> None:
+    lattices = [sb.Lattice(4.0, M) for M in (32, 128)]
+    seconds = np.array(
+        [
+            [field_seconds(count, 12.0, lattice, TransformSettings()) for count in (0, 10_000, 1_000_000)]
+            for lattice in lattices
+        ]
+    )
+    assert (np.diff(seconds, axis=0) > 0).all()
+    assert (np.diff(seconds, axis=1) > 0).all()
+    # Spreading costs some hundreds of nanoseconds for each of some points of a triangle.
+    assert 0.1 < seconds[0, 2] - seconds[0, 0] < 10
+
+
+def test_stored_fields_tell_the_speed_of_the_others(plan: Plan) -> None:
+    labels = [row.label for row in plan.rows]
+    stored = records(plan, *labels[:3], seconds=10.0)
+    workers = Workers.of_this_machine(2)
+    forecast = Forecast.of(plan, stored, workers, None, planning_seconds=0.0)
+    twice = Forecast.of(plan, records(plan, *labels[:3], seconds=20.0), workers, None, planning_seconds=0.0)
+    later = Forecast.of(plan, stored, workers, None, planning_seconds=7.0)
+    assert forecast.surfaces == len(labels) - 3
+    # Two surfaces of about the same cost as those that took ten seconds, side by side.
+    assert 10 < forecast.seconds < 40
+    assert forecast.processor_seconds > forecast.seconds
+    assert 1.3 < twice.seconds / forecast.seconds <= 2
+    assert later.seconds == pytest.approx(forecast.seconds + 7.0)
+    first, second = forecast.lines
+    assert first.endswith("for 2 missing fields, with 2 tasks at once")
+    assert second.endswith("of processor time; the speed is that of the 3 fields that are stored")
+
+
+def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured() -> float:
+        raise AssertionError("nothing needs to be measured")
+
+    monkeypatch.setattr(forecasts, "slowness", measured)
+    stored = records(plan, *(row.label for row in plan.rows), seconds=1.0)
+    forecast = Forecast.of(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
+    assert (forecast.seconds, forecast.lines) == (0.0, ("nothing is missing",))
+
+
+def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
+    fit = {"name": "fitted", "source": "fit", "mesh": {"source": "icosphere", "levels": [1]}}
+    table = small_table(family=[fit])
+    slow = make_plan(sb.Study.from_table(table))
+    (fast,) = (row for row in plan.rows if row.label == "ico/1")
+    (fitted,) = (row for row in slow.rows if row.label == "fitted/1")
+    assert fitted.member.expected_size().seconds > 1 > fast.member.expected_size().seconds
+
+
+def test_points_of_clouds_count(tmp_path: Path) -> None:
+    seconds = []
+    for count in (1_000, 100_000):
+        points = np.random.default_rng(1).normal(size=(count, 3))
+        np.savetxt(tmp_path / "scan.xyz", points / np.linalg.norm(points, axis=1, keepdims=True))
+        family = {"name": "scan", "source": "points", "paths": [str(tmp_path / "scan.xyz")], "area": 4 * np.pi}
+        found = make_plan(sb.Study.from_table(small_table(family=[family])))
+        missing = {row.label: row for row in found.rows}.pop("scan/scan")
+        assert count / 3 < missing.member.expected_size().points < 3 * count
+        seconds.append(Forecast.of(found, {}, Workers.of_this_machine(1), None, planning_seconds=0.0).processor_seconds)
+    assert seconds[1] > seconds[0] + 0.01
+
+
+def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
+    found = sb.plan(sb.Study.from_table(small_table()), "memory://forecast-cluster.zarr", client)
+    assert 0 < found.seconds <= found.processor_seconds < 60
+    *_, first, second = str(found).splitlines()
+    assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
+    assert second.endswith("the speed is that of a transform on a worker")

@@ -1,0 +1,129 @@
+"""Progress in one line: a count, a rate, and the time left as the last surfaces let it be told."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import sobolev_batch as sb
+from sobolev_batch.batch.store.records import Record, RunRecord
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.cli import cli
+from sobolev_batch.results.status import Status
+from tests.support.studies import small_table
+
+
+def moment(seconds: float) -> str:
+    """Return a time of so many seconds from an hour ago, as records have it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time.time() - 3600 + seconds))
+
+
+@pytest.fixture
+def store() -> Store:
+    """Return a store with the five rows of a study that has been run."""
+    sb.run(sb.Study.from_table(small_table()), "memory://status.zarr", workers=1)
+    return Store.open("memory://status.zarr")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the path of such a store, for commands."""
+    path = tmp_path_factory.mktemp("status") / "s.zarr"
+    sb.run(sb.Study.from_table(small_table()), path, workers=1)
+    return path
+
+
+def running(store: Store, *finished: float, begun: float = 0.0, state: str = "running") -> Status:
+    """Return the status of a run in which surfaces were finished at these seconds, the first of them in vain."""
+    records = list(store.records())
+    for row in range(len(records)):
+        status = "failed" if row == 0 else "complete"
+        is_there = row < len(finished)
+        record = Record(key="k", status=status, finished=moment(finished[row])) if is_there else None  # type: ignore[arg-type]
+        store.write_record(row, record)
+    now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    store.write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
+    return Status.of(store.path)
+
+
+def test_the_time_left_follows_from_the_last_ones(store: Store) -> None:
+    status = running(store, 0, 10, 40, 70)
+    # Times in records are whole seconds, and that of the end may be the next one.
+    assert status.rate == pytest.approx(1 / 30, rel=0.05)
+    assert status.seconds_left == pytest.approx(30, rel=0.05)
+    assert status.progress == "4 of 5 done, 1 failed, 2 a minute, about 30 s left at this rate"
+
+
+def test_what_cannot_be_told_is_not(store: Store) -> None:
+    for status in (running(store, 0, 10), running(store, 0, 0, 0), running(store, 0, 10, 40, begun=20)):
+        assert status.progress.endswith(" of 5 done, 1 failed, time left not known yet")
+    assert running(store, 0, 10, 20, 30, 40).progress == "5 of 5 done, 1 failed, fields, 3 of 5"
+    assert running(store, state="submitted").progress == "0 of 5 done, 0 failed, no worker has taken it up yet"
+
+
+def test_a_moment_between_two_objects_is_not_the_end(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = replace(Status.of(store.path), run_store="object")
+    goes_on = replace(running(store), run_store="object")
+    looks = [goes_on, ended, goes_on, goes_on, ended, ended]
+    monkeypatch.setattr("sobolev_batch.results.status.status", lambda place: looks.pop(0))
+    monkeypatch.setattr("sobolev_batch.cli.stores._FOLLOW_SECONDS", 0)
+    done = CliRunner().invoke(cli, ["status", store.path, "--follow"])
+    assert done.exit_code == 0
+    assert not looks
+
+
+# Follows a store that says three times that its run goes on, and then that it is done.
+FOLLOWING = """
+import sys
+from dataclasses import replace
+import sobolev_batch.cli as line
+import sobolev_batch.cli.stores as stores
+import sobolev_batch.results.status as module
+
+found = module.Status.of(sys.argv[2])
+left = [4, 4, 3]
+
+def status(store):
+    if not left:
+        return replace(found, run=replace(found.run, state="done"))
+    return replace(found, complete=5 - left.pop(), run=replace(found.run, state="running"))
+
+module.status, stores._FOLLOW_SECONDS = status, 0
+line.main()
+"""
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_a_terminal_has_one_line_and_a_file_one_for_each_change(on_terminal: bool, path: Path) -> None:
+    arguments = [sys.executable, "-c", FOLLOWING, "status", str(path), "--follow"]
+    if not on_terminal:
+        done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+        lines = done.stdout.splitlines()
+        assert [line[:13] for line in lines[:2]] == ["2 of 5 done, ", "1 of 5 done, "]
+        assert "\x1b" not in done.stdout
+        assert lines[2].endswith(": 5 of 5 complete, 0 failed, 0 to go")
+        assert done.returncode == 0
+        return
+    main, worker = pty.openpty()
+    process = subprocess.Popen(arguments, stdout=worker, stderr=worker, env={**os.environ, "COLUMNS": "30"})
+    os.close(worker)
+    shown = b""
+    while process.poll() is None or not shown.endswith(b"Z\r\n"):
+        try:
+            shown += os.read(main, 4096)
+        except OSError:  # the other end was closed
+            break
+    os.close(main)
+    assert process.wait(60) == 0
+    updates = shown.decode().split("\r\x1b[K")
+    assert [update[:13] for update in updates[1:4]] == ["2 of 5 done, ", "1 of 5 done, ", "1 of 5 done, "]
+    assert all("\n" not in update and len(update) < 30 for update in updates[:4])
+    assert ": 5 of 5 complete, 0 failed, 0 to go" in updates[4]

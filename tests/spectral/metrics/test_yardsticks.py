@@ -1,0 +1,77 @@
+"""Yardsticks against changes of known size, whose distances are computed by themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sobolev_batch import InputError, Lattice, Mesh, Sphere, distance, icosphere, yardsticks
+from sobolev_batch.surfaces.sources.derived.decimation import decimated
+from sobolev_batch.surfaces.sources.derived.displacement import with_noise
+
+LATTICE = Lattice(3.0, 32)
+ORDERS = [-3.0, -5.0]
+BALL = icosphere(3)
+
+
+def moved(length: float) -> Mesh:
+    """The ball is nearly the same from all directions."""
+    return Mesh(BALL.vertices + length * np.array([0.36, 0.48, 0.8]), BALL.triangles)
+
+
+@pytest.mark.parametrize("length", [0.002, 0.3])
+def test_a_move_is_found_again(length: float) -> None:
+    found = yardsticks(moved(length), BALL, ORDERS, lattice=LATTICE)
+    np.testing.assert_allclose(found["moved"], length, rtol=0.01)
+
+
+def test_noise_is_found_again() -> None:
+    found = yardsticks(with_noise(BALL, 0.01, 4), BALL, ORDERS, lattice=LATTICE, seed=4)
+    np.testing.assert_allclose(found["noise"], 0.01, rtol=0.03)
+    assert (abs(found["noise"] - 0.01) <= found["noise_error"] + 1e-4).all()
+
+
+def test_decimation_is_found_again() -> None:
+    found = yardsticks(decimated(BALL, 300), BALL, -2.0, lattice=LATTICE)
+    assert found["decimated"].dims == ()
+    assert found["decimated"].item() == pytest.approx(300, rel=0.05)
+
+
+def test_yardsticks_come_with_the_distance() -> None:
+    a, b = moved(0.1), BALL
+    found, alone = yardsticks(a, b, ORDERS, rtol=0.05), distance(a, b, ORDERS, rtol=0.05)
+    for name, variable in alone.items():
+        np.testing.assert_array_equal(found[name], variable)
+    assert found.attrs == alone.attrs
+    np.testing.assert_allclose(found["moved"], 0.1, rtol=0.05)
+
+
+def test_shared_triangles_change_nothing() -> None:
+    """The reference is whole though most of it cancels."""
+    part = Mesh(BALL.vertices, BALL.triangles[:-40])
+    halves = Mesh(*split(np.asarray(part.vertices), np.asarray(part.triangles)))
+    together, apart = (yardsticks(mesh, BALL, -2.0, rtol=0.02) for mesh in (part, halves))
+    for name in ("moved", "noise", "relative", "excess", "area_share"):
+        assert together[name].item() == pytest.approx(apart[name].item(), rel=0.03), name
+
+
+def split(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each triangle is cut in two, in its plane."""
+    middles = (vertices[triangles[:, 0]] + vertices[triangles[:, 1]]) / 2
+    numbers = len(vertices) + np.arange(len(triangles))
+    a, b, c = triangles.T
+    halves = [np.stack([a, numbers, c], axis=1), np.stack([numbers, b, c], axis=1)]
+    return np.concatenate([vertices, middles]), np.concatenate(halves)
+
+
+def test_what_is_like_nothing() -> None:
+    same = yardsticks(BALL, BALL, ORDERS, lattice=LATTICE)
+    assert (same["distance"] == 0).all()
+    assert np.isnan(same["moved"]).all()
+    # No move of a ball is as far from it as a ball of twice the radius.
+    far = yardsticks(Mesh(2 * np.asarray(BALL.vertices), BALL.triangles), BALL, -4.0, lattice=Lattice(3.0, 48))
+    assert np.isnan(far["moved"].item())
+    with pytest.raises(InputError, match="found Sphere"):
+        yardsticks(Sphere(), BALL, -2.0, lattice=LATTICE)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="seed must be a whole number from 0 on, found -1"):
+        yardsticks(moved(0.1), BALL, -2.0, lattice=LATTICE, seed=-1)

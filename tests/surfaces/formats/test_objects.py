@@ -1,0 +1,230 @@
+"""Meshes of other libraries, paths and pairs of arrays are meshes to every function, and meshes become theirs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import xarray as xr
+from numpy.typing import NDArray
+
+import sobolev_batch as sb
+from sobolev_batch.surfaces.formats.readers import mesh_format
+from tests.support.gallery import run_blocks
+from tests.support.mesh_files import BOXES
+from tests.support.repository import ROOT
+from tests.support.shapes import AWKWARD_VERTICES, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, box
+
+meshio = pytest.importorskip("meshio")
+pyvista = pytest.importorskip("pyvista")
+try:
+    import open3d
+except ImportError:
+    open3d = None  # not for every version of Python
+with_open3d = pytest.mark.skipif(open3d is None, reason="Open3D is not installed")
+
+# Vertices in an order of their own, two of them in one place, and one that no triangle uses.
+VERTICES: NDArray[np.float64] = np.vstack([AWKWARD_VERTICES[::-1], AWKWARD_VERTICES[:1], [(9, 9, 9)]])
+TRIANGLES = np.array([*BOX_TRIANGLES, BOX_TRIANGLES[0], [7, 8, 1]])
+
+
+def original() -> sb.Mesh:
+    return sb.Mesh(VERTICES, TRIANGLES)
+
+
+def scene() -> Any:
+    """The mesh in a scene that moves it by a power of two, which loses no digit."""
+    made = trimesh.Scene()
+    moved = trimesh.transformations.scale_matrix(0.5)
+    made.add_geometry(trimesh.Trimesh(2 * VERTICES, TRIANGLES, process=False), transform=moved)
+    return made
+
+
+MAKERS: dict[str, Callable[[], Any]] = {
+    "mesh": original,
+    "pair": lambda: (VERTICES, TRIANGLES),
+    "lists": lambda: (VERTICES.tolist(), TRIANGLES.tolist()),
+    "trimesh": lambda: trimesh.Trimesh(VERTICES, TRIANGLES, process=False),
+    "trimesh scene": scene,
+    "pyvista": lambda: pyvista.PolyData(VERTICES, np.insert(TRIANGLES, 0, 3, axis=1).ravel()),
+    "meshio": lambda: meshio.Mesh(
+        VERTICES, [("line", [[0, 1]]), ("triangle", TRIANGLES[:5]), ("triangle", TRIANGLES[5:])]
+    ),
+    "to_trimesh": lambda: original().to_trimesh(),
+    "to_pyvista": lambda: original().to_pyvista(),
+    "to_meshio": lambda: original().to_meshio(),
+}
+OPEN3D: dict[str, Callable[[], Any]] = {
+    "to_open3d": lambda: original().to_open3d(),
+    "tensors": lambda: open3d.t.geometry.TriangleMesh(open3d.core.Tensor(VERTICES), open3d.core.Tensor(TRIANGLES)),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_meshes_of_other_libraries_stay_as_they_are(name: str) -> None:
+    mesh = sb.as_mesh(MAKERS[name]())
+    assert mesh.digest == original().digest
+
+
+@with_open3d
+@pytest.mark.parametrize("name", OPEN3D)
+def test_meshes_of_open3d_stay_as_they_are(name: str) -> None:
+    assert sb.as_mesh(OPEN3D[name]()).digest == original().digest
+
+
+def test_paths_are_read_and_meshes_returned(tmp_path: Path) -> None:
+    mesh = original()
+    assert sb.as_mesh(mesh) is mesh
+    sb.write_mesh(mesh, tmp_path / "mesh.ply")
+    for path in (tmp_path / "mesh.ply", str(tmp_path / "mesh.ply")):
+        assert sb.as_mesh(path).digest == mesh.digest
+
+
+@pytest.mark.parametrize("name", ["trimesh", "pyvista", "meshio"])
+def test_nothing_is_shared_with_other_libraries(name: str) -> None:
+    mesh = original()
+    made = getattr(mesh, f"to_{name}")()
+    array = made.vertices if name == "trimesh" else made.points
+    again = sb.as_mesh(made)
+    array[0] = 0.0
+    assert mesh.digest == again.digest == original().digest
+    assert type(made).__module__.startswith(name)
+
+
+def test_single_precision_is_widened() -> None:
+    made = pyvista.PolyData(VERTICES.astype(np.float32), np.insert(TRIANGLES, 0, 3, axis=1).ravel())
+    assert (sb.as_mesh(made).vertices == VERTICES.astype(np.float32)).all()
+
+
+def two_parts() -> Any:
+    made = scene()
+    made.add_geometry(trimesh.creation.box())
+    return made
+
+
+class Sub(trimesh.Trimesh):  # type: ignore[misc]
+    """A class of somebody's own."""
+
+
+QUADS = np.insert(np.array(BOX_QUADS), 0, 4, axis=1).ravel()
+WRONG: dict[str, tuple[Callable[[], Any], str]] = {
+    "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or Open3D; found int"),
+    "sphere": (sb.Sphere, "found Sphere"),
+    "three": (lambda: (1, 2, 3), "found tuple"),
+    "path of trimesh": (lambda: trimesh.path.Path3D(), "found trimesh.Path3D"),
+    "quadrilaterals": (
+        lambda: pyvista.PolyData(BOX_VERTICES, QUADS),
+        r"PolyData is no mesh .*; pass mesh\.triangulate",
+    ),
+    "strips": (lambda: pyvista.Sphere().strip(), "it has polygons or strips"),
+    "mixed": (lambda: pyvista.PolyData(BOX_VERTICES, [2, 0, 1, 4, 0, 1, 2, 3]), "it has polygons or strips"),
+    "no faces": (lambda: pyvista.PolyData(BOX_VERTICES), r"the pyvista\.PolyData is no mesh .*no triangles"),
+    "grid": (lambda: box().to_pyvista().cast_to_unstructured_grid(), "found pyvista.UnstructuredGrid"),
+    "tetrahedra": (lambda: meshio.Mesh(BOX_VERTICES, [("tetra", [[0, 1, 2, 4]])]), "cells of the type tetra"),
+    "lines": (lambda: meshio.Mesh(BOX_VERTICES, [("line", [[0, 1]])]), "no triangles"),
+    "flat": (
+        lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("triangle", BOX_TRIANGLES)]),
+        r"shape \(n, 3\), found \(8, 2\)",
+    ),
+    "out of range": (
+        lambda: meshio.Mesh(BOX_VERTICES, [("triangle", [[0, 1, 8]])]),
+        r"outside 0\.\.7: #0 = \[0, 1, 8\]",
+    ),
+    "empty trimesh": (
+        lambda: trimesh.Trimesh(BOX_VERTICES, process=False),
+        r"the trimesh\.Trimesh is no mesh.* no triangles",
+    ),
+    "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
+    "empty scene": (trimesh.Scene, "it holds 0 parts"),
+    "NaN": (lambda: (np.full((3, 3), np.nan), [[0, 1, 2]]), "NaN or infinite"),
+    "texts": (lambda: ("a", "b"), "vertices must be real numbers"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_no_mesh_is_refused_by_its_type(name: str) -> None:
+    make, reason = WRONG[name]
+    with pytest.raises(sb.InputError, match=reason):
+        sb.as_mesh(make())
+
+
+def test_classes_that_derive_from_a_library_s_are_meshes() -> None:
+    assert sb.as_mesh(Sub(VERTICES, TRIANGLES, process=False)).digest == original().digest
+
+
+LATTICE = sb.Lattice(2.0, 12)
+BALL = sb.icosphere(0)
+# Every function that takes a mesh; the target is a field, since closeness to a surface takes longer.
+USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
+    "distance": lambda mesh, target: sb.distance(mesh, target, -2.0)["distance"].item(),
+    "distance from": lambda mesh, _: sb.distance(BALL, mesh, -4.0, rtol=0.5)["distance"].item(),
+    "norm": lambda mesh, _: sb.norm(mesh, -4.0, rtol=0.5)["norm"].item(),
+    "inner product": lambda mesh, _: sb.inner_product(mesh, BALL, -4.0, rtol=0.5)["inner_product"].item(),
+    "proportion": lambda mesh, target: sb.proportion(target, mesh, -2.0)["area_part"].item(),
+    "spectrum": lambda mesh, _: sb.spectrum(mesh, None, -2.0, lattice=LATTICE)["total"].item(),
+    "witness": lambda mesh, target: sb.witness(mesh, target, -2.0, [[0, 0, 0]]).item(),
+    "fourier_transform": lambda mesh, _: abs(sb.fourier_transform(mesh, LATTICE)).sum().item(),
+    "accessor": lambda mesh, target: target.sobolev.distance(mesh, -2.0)["distance"].item(),
+    "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10).hausdorff,
+    "gradient": lambda mesh, target: sb.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
+    "objective": lambda mesh, target: sb.SquaredDistance.of(mesh, target, -2.0, threads=1).value(1.1 * BALL.vertices),
+    "target": lambda mesh, _: sb.SquaredDistance.of(BALL, mesh, -2.0, lattice=LATTICE).value(BALL.vertices),
+    "fit": lambda mesh, target: sb.fit(mesh, target, -4.0, steps=1, threads=1).mesh.area,
+    "refine": lambda mesh, target: sb.refine(mesh, target, -4.0, triangles=21, steps=1, threads=1).mesh.area,
+}
+
+
+@pytest.fixture(scope="module")
+def target() -> xr.DataArray:
+    return sb.fourier_transform(sb.Sphere(1.2), LATTICE)
+
+
+@pytest.mark.parametrize("name", USES)
+def test_every_function_takes_paths_and_meshes_of_other_libraries(
+    tmp_path: Path, name: str, target: xr.DataArray
+) -> None:
+    larger = BALL.moved(1.25, (0.0, 0.0, 0.0))
+    path = tmp_path / "ball.off"
+    sb.write_mesh(larger.to_trimesh(), path)
+    expected = USES[name](larger, target)
+    for given in (path, larger.to_meshio()):
+        assert USES[name](given, target) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("meshio", "meshio is not installed: pip install meshio"),
+        ("open3d", "Open3D is not installed: pip install open3d"),
+        ("pyvista", "PyVista is not installed: pip install 'sobolev-batch[vtk]'"),
+    ],
+)
+def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, name: str, message: str) -> None:
+    # Python's own way to say that a module cannot be imported.
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(sb.InputError, match=re.escape(message)):
+        getattr(box(), f"to_{name}")()
+
+
+def test_no_library_is_imported_to_tell_its_meshes() -> None:
+    code = (
+        "import sys, sobolev_batch as sb; sb.as_mesh(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]));"
+        "assert not {'pyvista', 'vtkmodules', 'meshio', 'open3d'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_page_names_every_format_and_its_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    formats = {mesh_format(Path(f"scan{ending}")) for ending, _ in BOXES.values()}
+    assert {f"`{name}`" for name in formats if name[0] == "."} <= set(re.findall(r"`\.\w+`", page))
+    monkeypatch.chdir(tmp_path)
+    results = run_blocks("docs/formats.md")
+    assert sb.read_mesh("fitted.glb").area == pytest.approx(results["fitted"].mesh.area, rel=1e-6)

@@ -1,0 +1,95 @@
+"""What notebooks show of objects: all of it, and nothing of it as markup."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sobolev_batch as sb
+from tests.support.studies import small_table
+
+HOSTILE = "<script>alert('&')</script>"
+# Names of families hold no slash.
+HOSTILE_NAME = "<b>&amp;"
+TAGS = {"div", "strong", "table", "thead", "tbody", "tr", "th", "td"}
+
+
+class Page(HTMLParser):
+    """The tags and the text of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def shown(value: Any) -> Page:
+    """Return what a notebook shows of a value."""
+    page = Page(value._repr_html_())
+    assert set(page.tags) <= TAGS
+    return page
+
+
+def summary() -> sb.Summary:
+    failed = {f"{HOSTILE}/{number}": HOSTILE for number in range(30)}
+    return sb.Summary(HOSTILE, ("a/1", "a/2"), ("a/3",), failed, {HOSTILE: HOSTILE}, {HOSTILE: 0.25})
+
+
+@pytest.mark.parametrize(
+    ("value", "texts"),
+    [
+        (summary(), ["2 computed, 1 reused, 30 failed", f"{HOSTILE}/19: ", "and 10 more", "error of 25 %"]),
+        (sb.StudyDraft(Path(HOSTILE), [HOSTILE], {HOSTILE: "damaged"}), [f"{HOSTILE}: damaged"]),
+        (
+            sb.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {}, {"norm": HOSTILE}, withdrawn=True),
+            ["damaged", "3 of 4", f"{HOSTILE}: gone", "computes what is damaged again"],
+        ),
+        (sb.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0), ["3 of 5 complete, 1 failed, 1 to go"]),
+        (sb.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.00010 ± 0.00001"]),
+    ],
+)
+def test_texts_are_shown_and_never_run(value: Any, texts: list[str]) -> None:
+    text = shown(value).text
+    for expected in texts:
+        assert expected in text
+    if isinstance(value, sb.Verdict):
+        return
+    assert HOSTILE in text
+
+
+def test_a_plan_shows_its_lines() -> None:
+    title = {"study": {"name": "small", "title": HOSTILE}}
+    plan = sb.plan(sb.Study.from_table(small_table(**title)), "memory://html-plan.zarr")
+    page = shown(plan)
+    assert HOSTILE in page.text
+    for line in str(plan).splitlines():
+        assert line[15:] in page.text
+
+
+def test_a_league_shows_both_tables(tmp_path: Path) -> None:
+    families = [
+        {"name": name, "source": "icosphere", "levels": levels}
+        for name, levels in ((HOSTILE_NAME, [0, 1]), ("b", [0, 2]))
+    ]
+    spheres = {
+        "object": [
+            {"name": name, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
+            for name, radius in (("ball", 1.0), ("large", 1.1))
+        ]
+    }
+    table = {key: value for key, value in small_table(family=families).items() if key != "reference"}
+    sb.run(sb.StudyCollection.from_table({**table, **spheres}), "memory://html-league.zarr", workers=1)
+    page = shown(sb.league("memory://html-league.zarr")[0])
+    assert page.tags.count("table") == 2
+    assert HOSTILE_NAME in page.text
+    assert "over 2 objects" in page.text

@@ -1,0 +1,78 @@
+"""The notebooks run from the first cell to the last, show what their texts say, and are kept without outputs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.support.notebooks import code_cells, run_notebook
+from tests.support.repository import ROOT
+
+FOLDER = ROOT / "workflows" / "notebooks"
+NAMES = ["compare", "study", "cluster"]
+
+pytestmark = pytest.mark.slow
+
+
+def shown(outputs: list[str], name: str, text: str) -> str:
+    """Return what the only cell shows that holds a text."""
+    (output,) = (
+        output for cell, output in zip(code_cells(FOLDER / f"{name}.ipynb"), outputs, strict=True) if text in cell
+    )
+    return output
+
+
+def cells_of_row(html: str, label: str) -> list[float]:
+    """Return the numbers of a row of a data frame."""
+    (row,) = re.findall(rf"<th>{re.escape(label)}</th>(.*?)</tr>", html, re.DOTALL)
+    return [float(number) for number in re.findall(r"<td>(.*?)</td>", row)]
+
+
+def test_there_are_no_others() -> None:
+    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_notebooks_are_linked_and_have_no_outputs(name: str) -> None:
+    notebook = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
+    assert notebook["nbformat"] == 4
+    ids = [cell["id"] for cell in notebook["cells"]]
+    assert len(set(ids)) == len(ids)
+    for cell in notebook["cells"]:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+    for page in ("README.md", "workflows/README.md"):
+        assert f"notebooks/{name}.ipynb)" in (ROOT / page).read_text(encoding="utf-8")
+
+
+def test_two_meshes(tmp_path: Path) -> None:
+    outputs = run_notebook(FOLDER / "compare.ipynb", tmp_path)
+    table = shown(outputs, "compare", "pd.DataFrame")
+    relative, error, _, chamfer, hausdorff = cells_of_row(table, "twice")
+    assert relative > 0.01 > 10 * error
+    assert chamfer < 1e-12
+    assert hausdorff < 1e-12
+    assert cells_of_row(table, "coarser")[3] > 1e-3
+    # The worst place lies in the patch.
+    x, y, z = map(float, re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", shown(outputs, "compare", "argmax"))[:3])
+    assert (x - 1.4) ** 2 + y**2 + z**2 < 0.15**2
+
+
+def test_a_folder_of_meshes(tmp_path: Path) -> None:
+    outputs = run_notebook(FOLDER / "study.ipynb", tmp_path)
+    assert "family narrow: 3 meshes" in shown(outputs, "study", "init_study")
+    assert "7 computed, 0 reused, 0 failed" in shown(outputs, "study", "workers=2")
+    assert "0 computed, 7 reused, 0 failed" in shown(outputs, "study", "again = ")
+    assert "the speed is that of" in shown(outputs, "study", "sb.plan")
+    assert "even/even_32" in shown(outputs, "study", "sb.table")
+
+
+@pytest.mark.cluster
+def test_a_cluster(tmp_path: Path) -> None:
+    outputs = run_notebook(FOLDER / "cluster.ipynb", tmp_path)
+    assert "6 of 6 complete, 0 failed, 0 to go" in shown(outputs, "cluster", "going_on")
+    assert "0 computed, 6 reused, 0 failed" in shown(outputs, "cluster", "sb.run")
+    assert "icosphere/4" in shown(outputs, "cluster", "sb.table")

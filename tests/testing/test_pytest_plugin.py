@@ -1,0 +1,83 @@
+"""The plug-in of pytest: its fixture writes where surfaces differ, and it costs nothing where it is not used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import sobolev_batch as sb
+from tests.support.repository import ROOT
+
+pytest_plugins = ["pytester"]
+
+MODULE = "sobolev_batch.testing.pytest_plugin"
+TESTS = """
+import sobolev_batch as sb, pytest
+
+def test_same(assert_same_surface):
+    assert_same_surface(sb.icosphere(1), sb.icosphere(1))
+
+@pytest.mark.parametrize("text", ["a/b", "c"])
+def test_lost(assert_same_surface, text):
+    sphere = sb.icosphere(2)
+    assert_same_surface(sphere, sphere)
+    assert_same_surface((sphere.vertices, sphere.triangles[30:]), sphere)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The inner sessions run in this process, and import no libraries anew.
+    assert sb.assert_same_surface.__doc__
+    # Where the package is installed, its entry point would register the plug-in a second time.
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "folder"),
+    [
+        ("", [], ".pytest_cache/d/sobolev-witness"),
+        ("", ["--sobolev-witness-folder=chosen/here"], "chosen/here"),
+        ("[pytest]\nsobolev_witness_folder = of_settings", [], "of_settings"),
+    ],
+)
+def test_files_lie_beside_the_failure(
+    pytester: pytest.Pytester, settings: str, options: list[str], folder: str
+) -> None:
+    pytester.makepyfile(test_meshes=TESTS)
+    pytester.path.joinpath("pytest.ini").write_text(settings or "[pytest]")
+    result = pytester.runpytest_subprocess("-p", MODULE, *options)
+    result.assert_outcomes(passed=1, failed=2)
+    files = sorted(file.name for file in pytester.path.joinpath(folder).glob("*.ply"))
+    assert len(files) == 4
+    # Of the second comparison of each test.
+    assert [name.rpartition("-2-")[2] for name in files] == ["a.ply", "b.ply", "a.ply", "b.ply"]
+    assert files[0].startswith("test-lost-a-b-")
+    assert files[2].startswith("test-lost-c-")
+    result.stdout.fnmatch_lines([f"E *AssertionError: different surfaces: *; witness: *{folder}/{files[0]} *"])
+    assert "assertion.py" not in result.stdout.str()
+
+
+def test_without_a_cache_files_lie_in_the_temporary_folder(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(test_meshes=TESTS)
+    result = pytester.runpytest_subprocess("-p", MODULE, "-p", "no:cacheprovider", f"--basetemp={pytester.path}/temp")
+    result.assert_outcomes(passed=1, failed=2)
+    assert len(list(pytester.path.glob("temp/test_lost_*_0/*.ply"))) == 4
+
+
+def test_loading_it_imports_no_library() -> None:
+    code = (
+        "import sys, pytest; before = set(sys.modules); "
+        f"import {MODULE}; new = {{name.partition('.')[0] for name in set(sys.modules) - before}}; "
+        "assert not {'numpy', 'scipy', 'xarray', 'dask', 'finufft', 'click', 'pydantic'} & new, new"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_pytest_finds_it() -> None:
+    project = tomllib.loads(Path(ROOT, "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["entry-points"]["pytest11"] == {"sobolev-batch": MODULE}

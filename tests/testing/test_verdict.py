@@ -1,0 +1,178 @@
+"""Verdicts do not depend on how a surface is cut into triangles, and see what is missing from it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import sobolev_batch as sb
+from tests.support.shapes import BOX_QUADS, BOX_VERTICES
+
+Reals = NDArray[np.float64]
+
+# Triangles of 1.6 % of the area in all.
+PATCH = 80
+
+
+@pytest.fixture(scope="module")
+def mesh() -> sb.Mesh:
+    return sb.Ellipsoid((1.0, 0.8, 0.6)).mesh(4)
+
+
+def corners(mesh: sb.Mesh) -> Reals:
+    return mesh.vertices[mesh.triangles].reshape(-1, 3)
+
+
+def permuted(mesh: sb.Mesh) -> sb.Mesh:
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(mesh.vertices))
+    return sb.Mesh(mesh.vertices[order], rng.permutation(np.argsort(order)[mesh.triangles]))
+
+
+def unmerged(mesh: sb.Mesh) -> sb.Mesh:
+    return sb.Mesh(corners(mesh), np.arange(3 * len(mesh.triangles)).reshape(-1, 3))
+
+
+def split(mesh: sb.Mesh) -> sb.Mesh:
+    """Cut each triangle into three at its centroid."""
+    a, b, c = mesh.triangles.T
+    centroids = len(mesh.vertices) + np.arange(len(a))
+    vertices = np.concatenate([mesh.vertices, corners(mesh).reshape(-1, 3, 3).mean(axis=1)])
+    parts = [np.stack(part, axis=1) for part in ((a, b, centroids), (b, c, centroids), (c, a, centroids))]
+    return sb.Mesh(vertices, np.concatenate(parts))
+
+
+def turned_over(mesh: sb.Mesh) -> sb.Mesh:
+    return sb.Mesh(mesh.vertices, mesh.triangles[:, ::-1])
+
+
+@pytest.mark.parametrize("cut", [permuted, unmerged, split, turned_over, lambda mesh: permuted(split(mesh))])
+def test_the_same_surface_in_other_triangles(cut: Callable[[sb.Mesh], sb.Mesh], mesh: sb.Mesh) -> None:
+    verdict = sb.same_surface(cut(mesh), mesh)
+    assert verdict
+    assert verdict.outcome == "same"
+    assert verdict.distance + verdict.error <= verdict.rtol
+    assert verdict.area_change == pytest.approx(0.0, abs=1e-12)
+
+
+def test_quadrilaterals_cut_along_the_other_diagonal() -> None:
+    halves = [[[q[0], q[i], q[j]] for q in BOX_QUADS for i, j in pairs] for pairs in (((1, 2), (2, 3)), ((1, 3),))]
+    others = halves[1] + [[q[1], q[2], q[3]] for q in BOX_QUADS]
+    assert sb.same_surface((BOX_VERTICES, others), (BOX_VERTICES, halves[0]))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda mesh: sb.Mesh(mesh.vertices, mesh.triangles[PATCH:]), id="a patch is missing"),
+        pytest.param(lambda mesh: sb.Mesh(split(mesh).vertices, split(mesh).triangles[PATCH:]), id="of another cut"),
+        pytest.param(
+            lambda mesh: sb.Mesh(mesh.vertices, np.concatenate([mesh.triangles, mesh.triangles[:PATCH]])),
+            id="a patch is there twice",
+        ),
+        pytest.param(lambda mesh: sb.Mesh(1.01 * mesh.vertices, mesh.triangles), id="it is larger"),
+        pytest.param(
+            lambda mesh: sb.Mesh(mesh.vertices + np.array([0.01, 0.0, 0.0]), mesh.triangles), id="it is elsewhere"
+        ),
+        pytest.param(
+            lambda mesh: sb.Mesh(mesh.vertices + np.array([1e5, 0.0, 0.0]), mesh.triangles), id="it is far away"
+        ),
+        pytest.param(lambda mesh: sb.Mesh(1e-3 * mesh.vertices, mesh.triangles), id="it is in another unit"),
+    ],
+)
+def test_another_surface(change: Callable[[sb.Mesh], sb.Mesh], mesh: sb.Mesh) -> None:
+    verdict = sb.same_surface(change(mesh), mesh)
+    assert not verdict
+    assert verdict.outcome == "different"
+    assert verdict.distance - verdict.error > verdict.rtol
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_neither_the_unit_nor_the_place_of_both_matters(scale: float, mesh: sb.Mesh) -> None:
+    place = scale * np.array([1e3, -2e3, 0.0])
+    own, other = (sb.Mesh(scale * one.vertices + place, one.triangles) for one in (mesh, split(mesh)))
+    assert sb.same_surface(other, own)
+    assert sb.same_surface((other.vertices, other.triangles[PATCH:]), own).outcome == "different"
+    # One triangle of 15,360, which is 7e-5 of the area.
+    assert sb.same_surface((other.vertices, other.triangles[1:]), own, rtol=1e-4).outcome == "different"
+
+
+def test_flat_and_open_meshes_of_several_parts() -> None:
+    square = sb.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    assert sb.same_surface(split(split(square)), square)
+    assert sb.same_surface((split(square).vertices, split(square).triangles[1:]), square).outcome == "different"
+    beside = sb.Mesh(
+        np.concatenate([square.vertices, square.vertices + np.array([3, 0, 0])]), [[0, 1, 2], [0, 2, 3], [4, 5, 6]]
+    )
+    assert sb.same_surface(permuted(split(beside)), beside)
+    assert sb.same_surface(square, beside).outcome == "different"
+
+
+def test_files_and_closed_forms(tmp_path: Path) -> None:
+    sb.write_mesh(sb.icosphere(4), tmp_path / "sphere.ply")
+    verdict = sb.same_surface(tmp_path / "sphere.ply", sb.Sphere(), rtol=0.01)
+    assert verdict
+    assert verdict.area_change == pytest.approx(sb.icosphere(4).area / (4 * np.pi) - 1)
+    assert sb.same_surface(sb.Sphere(), sb.Sphere(), order=-2)
+    assert not sb.same_surface(sb.Torus(1.0, 0.3), sb.Torus(1.0, 0.31))
+
+
+def test_between_same_and_different_it_is_undecided() -> None:
+    # With the norm's own unit of length the numbers are those of `distance`.
+    truth = float(sb.distance(sb.Sphere(0.9), sb.Sphere(), -4.0)["distance"] / sb.norm(sb.Sphere(), -4.0)["norm"])
+    verdict = sb.same_surface(sb.Sphere(0.9), sb.Sphere(), rtol=truth, scaling=False)
+    assert verdict.outcome == "undecided"
+    assert not verdict
+    assert abs(verdict.distance - truth) <= verdict.error
+    assert str(verdict).startswith("undecided: relative distance 0.")
+
+
+@pytest.mark.parametrize(("move", "rtol"), [(5e-4, 1e-5), (1e-4, 1e-7), (1e-6, 1e-12)])
+def test_what_is_printed_holds_the_truth(move: float, rtol: float) -> None:
+    own = sb.icosphere(2)
+    moved = sb.Mesh(own.vertices + np.array([move, 0, 0]), own.triangles)
+    truth = float(sb.distance(moved, own, -4.0, rtol=1e-3)["distance"] / sb.norm(own, -4.0, rtol=1e-3)["norm"])
+    text = str(sb.same_surface(moved, own, rtol=rtol, scaling=False))
+    number = r"(\d[\d.]*(?: × 10\S+)?)"
+    if " from " in text:
+        low, high = (as_float(part) for part in re.findall(f"from {number} to {number}", text)[0])
+    else:
+        value, error = (as_float(part) for part in re.findall(f"distance {number} ± {number}", text)[0])
+        low, high = value - error, value + error
+    assert low <= truth <= high
+
+
+def as_float(text: str) -> float:
+    powers = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    return float(re.sub(r" × 10(\S+)", lambda found: "e" + found[1].translate(powers), text))
+
+
+def test_bounds_far_apart_are_told_as_such() -> None:
+    verdict = sb.Verdict("different", 281.4, 2.34e12, 1e-3, -4.0, 3.0, "lattice")
+    assert "relative distance from 280 to 2.4 × 10¹² at order -4" in str(verdict)
+    verdict = sb.Verdict("same", 0.0, 9.52e-4, 1e-3, -4.0, 0.0, "lattice")
+    assert "relative distance at most 0.00096 at order -4" in str(verdict)
+    own = sb.icosphere(2)
+    twice = sb.Mesh(np.concatenate([own.vertices] * 2), np.concatenate([own.triangles, own.triangles + 162]))
+    assert "; area +100 %" in str(sb.same_surface(twice, own))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "settings", "message"),
+    [
+        ((3, sb.Sphere()), {}, "expected a Mesh.* found int"),
+        ((sb.Sphere(), (1, 2, 3)), {}, "expected a Mesh, the path of a mesh file"),
+        ((sb.Sphere(), sb.Sphere()), {"rtol": 0}, "rtol must lie between 0 and 1, found 0"),
+        ((sb.Sphere(), sb.Sphere()), {"order": [-2, -3]}, "one order is needed, found 2"),
+        (("nowhere.ply", sb.Sphere()), {}, "nowhere.ply: "),
+    ],
+)
+def test_refusals(arguments: tuple[Any, Any], settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(sb.InputError, match=message):
+        sb.same_surface(*arguments, **settings)
