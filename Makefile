@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere league test test-fast coverage soak check bench docs audit format clean
+.PHONY: study icosphere league test test-fast coverage soak mutants check bench gpu docs audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -33,8 +33,13 @@ test-fast: $(READY)  ## the tests of surfaces and numerics, one to two minutes
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage
 
-soak: $(READY)  ## 2,000 meshes while workers and drivers are killed and the storage fails; some five minutes
+soak: $(READY)  ## 2,000 meshes while processes are killed and the storage fails, 30 struck clusters, 1,000 damaged files; two to three hours
 	$(BIN)/python -m tests.soak
+	$(BIN)/python -m tests.soak --sequences 30
+	$(BIN)/python -m tests.soak --corruptions 1000
+
+mutants: $(READY)  ## take out each guard of stores, batch and readers, and see whether a test fails; hours
+	$(BIN)/python -m tests.mutants
 
 check: $(READY)  ## lint, formatting, types
 	$(BIN)/ruff check .
@@ -44,6 +49,11 @@ check: $(READY)  ## lint, formatting, types
 bench: $(READY)  ## time it against the paper's pipeline, print the table of ratios
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m benchmarks
+
+gpu: $(READY)  ## where there is a GPU: its tests, and its times into storage/gpu.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[gpu]'
+	$(BIN)/python -m pytest -rs tests/spectral/backends tests/batch/cluster/test_gpus.py tests/batch/cluster/test_mixed_clusters.py
+	$(BIN)/python -m benchmarks --only 9 --repeats 20 --markdown storage/gpu.md
 
 docs: $(READY)  ## the API from its docstrings and the pages of docs/, as HTML in site/
 	$(BIN)/python docs/build.py site

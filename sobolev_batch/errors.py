@@ -1,5 +1,7 @@
 """Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
+from sobolev_batch.visible import visible
+
 
 class SobolevBatchError(Exception):
     """Base of every error that the package raises on purpose.
@@ -84,5 +86,9 @@ class AddressError(ClusterError, InputError):
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error in one line, or the name of its type if it has none."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """Return the message of an error on one line, or the name of its type if it has none.
+
+    Line breaks of our own messages are those of names, and stay visible.
+    """
+    message = str(error) if isinstance(error, SobolevBatchError) else " ".join(str(error).split())
+    return visible(message) or type(error).__name__

@@ -418,7 +418,10 @@ BAD = [
         ("run", "study.toml", "--store", "huge.zarr", "--memory", "1000TB"),
         "memory of a worker of 1.0PB is more than there is",
     ),
+    (("run", "greedy.toml"), "[accuracy]: memory of 1.0PB is more than there is"),
     (("plan", "greedy.toml"), "[accuracy]: memory of 1.0PB is more than any worker has"),
+    (("compare", "one.off", "two.off", "--rtol", "0.1", "--memory", "1000TB"), "memory of 1.0PB is more than there is"),
+    (("compare", "one.off", "two.off", "--below", "1%", "--memory", "1000TB"), "memory of 1.0PB is more than there is"),
     (("witness", "storage/cli.zarr", "--mesh", "reference"), "'reference' is the reference: its witness is zero"),
     (("witness", "storage/cli.zarr", "--output", "study.toml"), "study.toml: no files can be written there"),
 ]
@@ -437,6 +440,8 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
     (folder / "taken").mkdir(exist_ok=True)
     (folder / "taken" / "precious").write_text("text")
     (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
+    for name, x in (("one.off", 1), ("two.off", 2)):
+        (folder / name).write_text(f"OFF\n3 1 0\n0 0 0\n{x} 0 0\n0 1 0\n3 0 1 2\n")
     done = call(*arguments, folder=folder)
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
@@ -444,6 +449,21 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
     assert done.stderr.count("\n") == 1
     assert done.stdout == ""
     assert (folder / "taken" / "precious").read_text() == "text"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("compare", "one.off", "two.off", "--rtol", "0.1", "--memory-gb", "1000000"),
+        ("run", "study.toml", "--store", "huge.zarr", "--worker-memory", "1000TB"),
+    ],
+)
+def test_the_old_names_of_memory_believe_no_more_either(folder: Path, arguments: tuple[str, ...]) -> None:
+    for name, x in (("one.off", 1), ("two.off", 2)):
+        (folder / name).write_text(f"OFF\n3 1 0\n0 0 0\n{x} 0 0\n0 1 0\n3 0 1 2\n")
+    done = call(*arguments, folder=folder)
+    assert done.returncode == 2
+    assert re.search(r"error: (the )?memory (of a worker )?of 1\.0PB is more than there is", done.stderr), done.stderr
 
 
 COMMANDS = "compare fit init league plan plot release report run status submit table verify witness"

@@ -12,7 +12,20 @@ import sobolev_batch
 from tests.support.repository import PACKAGE, imported
 
 # Each may import those before it.
-LAYERS = ("errors", "parameters", "html", "surfaces", "spectral", "fitting", "batch", "results", "testing", "cli")
+LAYERS = (
+    "visible",
+    "errors",
+    "parameters",
+    "machine",
+    "html",
+    "surfaces",
+    "spectral",
+    "fitting",
+    "batch",
+    "results",
+    "testing",
+    "cli",
+)
 MOST_NAMES_OF_A_FOLDER = 12
 
 Path = tuple[str, ...]

@@ -14,11 +14,12 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.compare import Comparer
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
-from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
+from sobolev_batch.batch.cluster import GIVE_UP_AFTER
+from sobolev_batch.batch.cluster.clients import available_cores, local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_store_access
-from sobolev_batch.batch.cluster.worker_plugin import waiting_reason
+from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.reuse import first_choice, take_over
@@ -35,8 +36,8 @@ from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.html import reasons, table_html
+from sobolev_batch.machine import require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.spectral.backends.machine import require_machine_memory
 from sobolev_batch.spectral.errors.budget import NormEstimate
 
 _log = logging.getLogger(__name__)
@@ -111,6 +112,7 @@ def run(
     memory: float | str | None = None,
     on_progress: Notify | None = None,
     reuse: Sequence[str | Path | Location] = (),
+    give_up_after: float = GIVE_UP_AFTER,
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
@@ -129,6 +131,8 @@ def run(
             surface, reference, scaling, accuracy and lattice, whatever the mesh is called there. So the stores of parts
             of a study become one. Of the store of a collection, those of the same object are. If the study asks for an
             accuracy, a new store takes the lattice of the first one.
+        give_up_after: Time in seconds after which a worker that says nothing is given up: its tasks are given to
+            others. A scheduler that says nothing for so long counts as lost.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
@@ -142,7 +146,7 @@ def run(
         ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice; or
             the scheduler was lost.
         InputError: The memory is not a size, or too little for a worker; or the study or its workers ask for more than
-            there is.
+            there is; or give_up_after is less than 10 seconds.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -161,6 +165,7 @@ def run(
     >>> tree["distances"]["distance"].sizes["mesh"]
     2
     """
+    require_give_up_after(give_up_after)
     location, reusable = Location.of(store), _Reusable.of([Location.of(other) for other in reuse])
     cluster: AbstractContextManager[Client]
     if client is None:
@@ -170,14 +175,14 @@ def run(
                 require_machine_memory(one.accuracy.allowed_bytes, "[accuracy]: memory")
         if memory is not None:
             # Otherwise a store would be made before the cluster refuses it.
-            memory_limit(memory)
+            memory_limit(memory, workers or available_cores())
         # In threads, where no other process would see the store.
         cluster = thread_client(workers) if location.is_in_memory else local_client(workers, memory)
     else:
         location, cluster = location.absolute(), nullcontext(client)
     for other in reusable.of_all():
         Store.open(other)
-    job = _Job(cluster, client, on_progress or (lambda progress: None))
+    job = _Job(cluster, client, on_progress or (lambda progress: None), give_up_after)
     if isinstance(study, StudyCollection):
         return job.run_every(study, location, reusable)
     return job.run(study, location, reusable.of_all())
@@ -221,11 +226,13 @@ class _Job:
         clients: Context that gives the client of the cluster.
         client: Client that the caller has given, if any.
         notify: Callback for each step.
+        give_up_after: Seconds after which what is silent is given up.
     """
 
     clients: AbstractContextManager[Client]
     client: Client | None
     notify: Notify
+    give_up_after: float
 
     def run(self, study: Study, location: Location, others: Sequence[Location]) -> Summary:
         """Run one study, and take over fields of other stores."""
@@ -233,8 +240,9 @@ class _Job:
         require_usable(location)
         with locked(location, lock):
             if self.client is not None:
-                require_store_access(self.client, location, lock)
-            return carry_out(study, location, lock, self.clients, self.notify, others)
+                with Watch(self.client, False, self.give_up_after).kept():
+                    require_store_access(self.client, location, lock)
+            return carry_out(study, location, lock, self.clients, self.notify, self.give_up_after, others)
 
     def telling(self, part: str) -> Self:
         """Return the job of a part of a collection, whose progress names it."""
@@ -290,6 +298,7 @@ def carry_out(
     lock: Lock,
     clients: AbstractContextManager[Client],
     notify: Notify,
+    give_up_after: float,
     others: Sequence[Location] = (),
 ) -> Summary:
     """Run a study in a store that this process has locked; see `run`.
@@ -300,19 +309,21 @@ def carry_out(
         lock: Lock of the store.
         clients: Context that gives the client, entered if anything is missing.
         notify: Callback for each step.
+        give_up_after: Seconds after which what is silent is given up.
         others: Other stores, whose fields are taken over.
     """
     plan = make_plan(study, first_choice([location, *others]))
     # Planning may take minutes.
     lock.require(location)
-    workspace = Workspace.prepared(location, plan)
+    workspace = Workspace.prepared(location.fenced(lock.fence), plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
         if others:
             workspace.withdraw_results_of(take_over(workspace, others))
         if not workspace.pending and are_tabulated(workspace) and Comparer.of(workspace).is_done:
             return Summary._of(workspace, set(), {})
-        with clients as client:
+        with clients as client, Watch(client, study.backend == "gpu", give_up_after).kept() as watch:
+            heartbeat.find_obstacle = lambda: watch.obstacle
             heartbeat.cluster = client.scheduler.address
             heartbeat.write("running")
             notify(Progress("cluster", 0, 0, client.dashboard_link))
@@ -326,7 +337,6 @@ def carry_out(
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend)
             cluster.workers.require_accuracy(study.accuracy)
-            heartbeat.find_obstacle = lambda: waiting_reason(client, study.backend)
             workspace.store.scratch.discard()
             return _Run(cluster, heartbeat).carry_out(workspace)
 

@@ -13,7 +13,9 @@ from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
+from sobolev_batch.batch.cluster import GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.store_access import require_store_access
+from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
@@ -51,7 +53,14 @@ class Submission:
     missing: int
 
 
-def submit(study: Study, store: str | Path | Location, client: Client, *, timeout_seconds: float = 60.0) -> Submission:
+def submit(
+    study: Study,
+    store: str | Path | Location,
+    client: Client,
+    *,
+    timeout_seconds: float = 60.0,
+    give_up_after: float = GIVE_UP_AFTER,
+) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
@@ -62,10 +71,12 @@ def submit(study: Study, store: str | Path | Location, client: Client, *, timeou
         store: Path or URL of a new or existing store, which this process and all workers reach under this name.
         client: Client of the cluster; it may be closed afterwards.
         timeout_seconds: Time within which the scheduler has to take the study.
+        give_up_after: Time in seconds after which a worker that says nothing is given up; see `run`.
 
     Raises:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
         ClusterError: No worker has the GPU that the study asks for, or the scheduler did not take the study in time.
+        InputError: See `run`.
 
     >>> import tempfile
     >>> from distributed import Client, wait
@@ -82,36 +93,40 @@ def submit(study: Study, store: str | Path | Location, client: Client, *, timeou
     ...         sb.submit(study, f"{folder}/results.zarr", client).missing
     2
     """
+    require_give_up_after(give_up_after)
     location = Location.of(store).absolute()
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
     try:
-        require_store_access(client, location, lock)
-        workers = prepare_workers(client, study.libraries)
+        with Watch(client, False, give_up_after).kept():
+            require_store_access(client, location, lock)
+            workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
         plan = make_plan(study, stored_choice(location))
-        workspace = Workspace.prepared(location, plan)
+        workspace = Workspace.prepared(location.fenced(lock.fence), plan)
         heartbeat = Heartbeat(workspace.store, lock)
         heartbeat.cluster = client.scheduler.address
         heartbeat.write("submitted")
-        _hand_over(study, workspace.store, lock, client, timeout_seconds)
+        arguments = dict(study.table), str(study.folder.absolute()), workspace.store.path, lock.run, give_up_after
+        _hand_over(arguments, client, timeout_seconds)
     except BaseException:
         release(location, lock)
         raise
     return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
 
 
-def _hand_over(study: Study, store: Store, lock: Lock, client: Client, timeout_seconds: float) -> None:
-    folder, key = str(study.folder.absolute()), f"sobolev-batch-drive-{uuid4().hex}"
+def _hand_over(arguments: tuple[Any, ...], client: Client, timeout_seconds: float) -> None:
+    """Have a worker call `drive`."""
+    key = f"sobolev-batch-drive-{uuid4().hex}"
     # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-    future = client.submit(drive, dict(study.table), folder, store.path, lock.run, key=key, pure=False, priority=1)
+    future = client.submit(drive, *arguments, key=key, pure=False, priority=1)
     fire_and_forget(future)
     _await_acceptance(client, future, timeout_seconds)
 
 
-def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
+def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_after: float) -> None:
     """Run a study from a worker of the cluster that computes it, with the lock of its submission.
 
     This does not raise: the store says what went wrong, and trying again would not help.
@@ -121,6 +136,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         folder: Folder that paths in the study are relative to.
         store: Path or URL of the store.
         run: Run that the store is locked for.
+        give_up_after: Seconds after which what is silent is given up.
     """
     location = Location.of(store)
     lock = Lock.of_this_process(run, outlives_process=True)
@@ -132,7 +148,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         acquire(location, lock)
         with worker_client() as client:
             study = Study.from_table(table, folder=folder)
-            carry_out(study, location, lock, nullcontext(client), lambda progress: None)
+            carry_out(study, location, lock, nullcontext(client), lambda progress: None, give_up_after)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.
@@ -143,7 +159,9 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
         # on this machine.
         with suppress(StoreError):  # it may be what failed
             if lock.is_held(location):
-                Heartbeat(Store(store), lock).write("failed", f"{error} (on the worker that drove the study)")
+                Heartbeat(Store(location.fenced(lock.fence)), lock).write(
+                    "failed", f"{error} (on the worker that drove the study)"
+                )
     release(location, lock)
 
 

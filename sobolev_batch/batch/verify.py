@@ -15,6 +15,7 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
+from sobolev_batch.batch.store.hierarchy import RECORDS
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
@@ -153,14 +154,18 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
 
 def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
     """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
-    tasks = (Task(_damage_of, (workspace.store, i, record), row=i) for i, record in workspace.complete.items())
+    tasks = (
+        Task(_damage_of, (workspace.store, i, record), row=i, label=workspace.labels[i])
+        for i, record in workspace.complete.items()
+    )
     return sorted(task.row for task, damage in cluster.results(tasks) if damage)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
     labels, complete = store.labels(), complete_records(store.records())
     damaged = {row: f"its completion record is damaged ({what})" for row, what in store.record_table.damaged().items()}
-    tables = Tables(store).damaged()
+    documents = store.differing_documents() | _damaged_run(store)
+    tables = Tables(store).damaged() | documents
     if not tables:
         lost = Tables(store).without_records(store.records())
         damaged |= {row: "its completion record is missing" for row in lost if row not in damaged}
@@ -181,6 +186,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
     if lock is not None and withdraw:
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
+        store.restore_documents(documents)
         _withdraw(store, damaged, comparisons)
     return Verification(
         store.path,
@@ -203,6 +209,14 @@ def _withdraw(store: Store, fields: Iterable[int], comparisons: Mapping[Kind, It
     for kind, rows in comparisons.items():
         for row in rows:
             ComparisonRecords(store, kind).write(row, None)
+
+
+def _damaged_run(store: Store) -> dict[str, str]:
+    try:
+        store.read_run()
+    except DamageError as error:
+        return {RECORDS: error.what}
+    return {}
 
 
 def _damaged_records(store: Store, kind: Kind) -> dict[int, str]:

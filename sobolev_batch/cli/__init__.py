@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import traceback
 from contextlib import suppress
 from typing import NoReturn
 
@@ -20,7 +21,9 @@ from sobolev_batch.cli.interruption import (
     ignore_requests,
     raise_when_asked,
 )
+from sobolev_batch.cli.output import echo, echo_lines, show_usage_error
 from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.visible import make_messages_visible
 
 __all__ = ["cli", "main"]
 
@@ -37,10 +40,11 @@ def main() -> None:
     # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
     deadline = Deadline(_REMARKS.get(command, ""), _SECONDS_WITH_LOCK.get(command, SECONDS_TO_END))
     raise_when_asked(deadline)
+    make_messages_visible()
     try:
         status = cli.main(standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        show_usage_error(error)
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         # Some work takes SIGTERM for an interrupt.
@@ -49,10 +53,11 @@ def main() -> None:
         _end(signal.SIGTERM, command)
     except Exception as error:
         if debug:
-            raise
+            echo_lines(traceback.format_exc().removesuffix("\n"), err=True)
+            sys.exit(EXIT_OTHER)
         is_ours = isinstance(error, SobolevBatchError)
         message = str(error) if is_ours else f"{type(error).__name__}: {error} (--debug shows where)"
-        click.echo(f"error: {message}", err=True)
+        echo(f"error: {message}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
     sys.exit(status or 0)
 

@@ -9,6 +9,7 @@ from click.core import ParameterSource
 
 from sobolev_batch.cli.group import EXIT_DIFFERENT, EXIT_UNDECIDED
 from sobolev_batch.cli.options import fraction_of_norm
+from sobolev_batch.cli.output import echo
 from sobolev_batch.cli.points import read_pair
 from sobolev_batch.testing.defaults import DEFAULT_ORDER
 
@@ -31,7 +32,6 @@ def judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
     Raises:
         click.UsageError: Other options ask for numbers, or there are several orders.
     """
-    from sobolev_batch.surfaces.sources.names import legible
     from sobolev_batch.testing.verdict import same_surface
 
     given = {
@@ -51,5 +51,5 @@ def judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
     settings = {"scaling": not context.params["no_scaling"], "memory": context.params["memory"]}
     first, second = read_pair(a, b, context.params["weight"], context.params["area"])
     verdict = same_surface(first, second, rtol=below, order=order, **settings)
-    click.echo(f"{legible(a.name)}: {verdict}")
+    echo(f"{a.name}: {verdict}")
     return _STATUSES[verdict.outcome]

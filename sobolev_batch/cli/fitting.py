@@ -14,6 +14,7 @@ import click
 
 from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.interruption import Deadline
+from sobolev_batch.cli.output import echo, progress_bar
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 
@@ -102,11 +103,11 @@ def fit_command(
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
     result = Mesh(vertices, fitted.mesh.triangles)
     write_mesh(result, output)
-    click.echo(f"{len(fitted.mesh.triangles):,} triangles; {fitted.steps} steps; {fitted.end}")
-    click.echo(f"before: {_text(fitted.before, similarity.scale)}")
-    click.echo(f"after:  {_text(fitted.after, similarity.scale)}")
+    echo(f"{len(fitted.mesh.triangles):,} triangles; {fitted.steps} steps; {fitted.end}")
+    echo(f"before: {_text(fitted.before, similarity.scale)}")
+    echo(f"after:  {_text(fitted.after, similarity.scale)}")
     for remark in (*fitted.remarks, *_lost_digits(result, output, similarity)):
-        click.echo(f"note: {remark}")
+        echo(f"note: {remark}")
 
 
 def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str]:
@@ -135,7 +136,7 @@ class _Steps:
 
     def __init__(self) -> None:
         self._has_begun = False
-        self._bar: Any = click.progressbar(length=1, label="steps", file=sys.stderr) if sys.stderr.isatty() else None
+        self._bar: Any = progress_bar(1, "steps", show_count=False) if sys.stderr.isatty() else None
 
     def has_begun(self) -> bool:
         """Return whether a step has been taken."""

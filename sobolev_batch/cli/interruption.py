@@ -35,6 +35,9 @@ def raise_when_asked(deadline: Deadline) -> None:
     Args:
         deadline: Deadline for the end of the process from then on.
     """
+    # Python's tracker of semaphores outlives a process that ends at once and cleans up after it, with a warning that
+    # would be the last word.
+    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
     signal.signal(signal.SIGTERM, _terminate)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
         signal.signal(signal.SIGINT, _interrupt)

@@ -8,6 +8,7 @@ import click
 
 from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.options import format_option, location, orders_option, store_argument
+from sobolev_batch.cli.output import echo_lines
 from sobolev_batch.results.tables.defaults import Format
 
 if TYPE_CHECKING:
@@ -38,6 +39,6 @@ def league_command(
     from sobolev_batch.results.league.text import format_changes, format_league
 
     if against is not None:
-        click.echo(format_changes(compare_studies(store, against, orders or None), style))
+        echo_lines(format_changes(compare_studies(store, against, orders or None), style))
     else:
-        click.echo(format_league(league(store, orders or None, x=x, methods=methods or None), style))
+        echo_lines(format_league(league(store, orders or None, x=x, methods=methods or None), style))

@@ -11,7 +11,9 @@ import click
 from sobolev_batch.cli.below import below_option, judge_files
 from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.options import best_effort_option, memory_of, memory_option, orders_option
+from sobolev_batch.cli.output import echo, echo_lines
 from sobolev_batch.cli.points import point_options, read_pair, require_mesh, two_meshes
+from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -111,7 +113,7 @@ def compare_command(
     pair = similarity.apply(first), similarity.apply(second)
     doubt = placement_doubt(*(surface.extent for surface in pair))
     if doubt is not None:
-        click.echo(f"note: {a.name}: {doubt}", err=True)
+        echo(f"note: {a.name}: {doubt}", err=True)
     # Refused before a long computation where its library is not installed.
     nearness = proximity(*two_meshes("--proximity", pair)) if with_proximity else None
     orders = orders or (-2.0,)
@@ -122,15 +124,15 @@ def compare_command(
         results = distance(*pair, orders, **accuracy)
     parts = "triangles" if isinstance(first, Mesh) else "points"
     _print_answers(a.name, b.name, results, first.area / second.area - 1, parts, rtol)
-    click.echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
+    echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
     if nearness is not None:
-        click.echo(
+        echo(
             f"Hausdorff at least {nearness.hausdorff:.2e}, "
             f"Chamfer {nearness.chamfer:.4e} ± {nearness.chamfer_error:.0e} (s.e.)"
         )
     if witness_path is not None:
         difference = write_difference(first, second, witness_path, orders[0], scaling=not no_scaling)
-        click.echo(difference.sentence(a.name))
+        echo(difference.sentence(a.name))
 
 
 def _print_answers(
@@ -141,15 +143,15 @@ def _print_answers(
 
     by_order = [results.sel(order=order) for order in results["order"].values]
     for sentence in dict.fromkeys(answer(name, reference, result, area_change, parts) for result in by_order):
-        click.echo(sentence)
+        echo(sentence)
     # Of equal meshes there is no more to tell.
     unequal = [result for result in by_order if result["distance"] > 0]
     for result in unequal if "moved" in results else ():
-        click.echo(likeness(name, reference, result))
+        echo_lines(likeness(visible(name), visible(reference), result))
     for result in unequal:
-        click.echo(_details(result, rtol))
+        echo(_details(result, rtol))
     if rtol is not None and "M" in results.attrs:
-        click.echo(_settings_text(results.attrs))
+        echo(_settings_text(results.attrs))
 
 
 def _details(result: xr.Dataset, rtol: float | None) -> str:

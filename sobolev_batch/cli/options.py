@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from sobolev_batch.batch.cluster import GIVE_UP_AFTER, LEAST_GIVE_UP_AFTER
+from sobolev_batch.cli.output import echo
 from sobolev_batch.results.tables.defaults import FORMATS
 
 if TYPE_CHECKING:
@@ -90,6 +92,14 @@ best_effort_option = click.option(
     is_flag=True,
     help="Compute the nearest accuracy that can be had where the one asked for is out of reach. Mark what falls short.",
 )
+give_up_option = click.option(
+    "--give-up-after",
+    type=click.FloatRange(min=LEAST_GIVE_UP_AFTER),
+    default=GIVE_UP_AFTER,
+    show_default=True,
+    metavar="SECONDS",
+    help="Give up a worker that has said nothing for this time, and give its tasks to others.",
+)
 trust_option = click.option(
     "--trust-network",
     is_flag=True,
@@ -127,7 +137,7 @@ def memory_of(memory: int | None, old: str, old_memory: int | None) -> int | Non
         return memory
     if memory is not None:
         raise click.UsageError(f"{old} is the old name of --memory; give --memory alone")
-    click.echo(f"{old} is now called --memory and takes sizes such as 4GB; {old} will be removed", err=True)
+    echo(f"{old} is now called --memory and takes sizes such as 4GB; {old} will be removed", err=True)
     return old_memory
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-import click
+from sobolev_batch.cli.output import echo, overwrite, progress_bar
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.cluster.progress import Progress
-
-_CLEAR_LINE = "\r\x1b[K"
 
 
 class ProgressLine:
@@ -24,16 +21,15 @@ class ProgressLine:
     def show(self, text: str) -> None:
         """Replace the line."""
         if sys.stdout.isatty():
-            # A longer line would wrap, and stay.
-            click.echo(_CLEAR_LINE + text[: shutil.get_terminal_size().columns - 1], nl=False)
+            overwrite(text)
         elif text != self._shown:
-            click.echo(text)
+            echo(text)
         self._shown = text
 
     def close(self) -> None:
         """Remove the line from a terminal."""
         if self._shown and sys.stdout.isatty():
-            click.echo(_CLEAR_LINE, nl=False)
+            overwrite()
 
 
 class Reporter:
@@ -54,24 +50,24 @@ class Reporter:
         """Show one step."""
         part = f"{progress.part}: " if progress.part else ""
         if progress.stage == "cluster":
-            click.echo(f"dashboard: {progress.label}", err=True)
+            echo(f"dashboard: {progress.label}", err=True)
         elif sys.stderr.isatty():
             self._draw(progress)
         elif progress.record is not None:
             outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
             count = f"[{progress.done}/{progress.total}]"
-            click.echo(f"{part}{count} {progress.label}: {progress.record.status}, {outcome}", err=True)
+            echo(f"{part}{count} {progress.label}: {progress.record.status}, {outcome}", err=True)
         elif progress.stage == "reduction" and progress.done == progress.total:
-            click.echo(f"{part}tables reduced", err=True)
+            echo(f"{part}tables reduced", err=True)
         elif progress.stage == "comparisons" and progress.done == progress.total:
-            click.echo(f"{part}{progress.total} comparisons with the reference finished", err=True)
+            echo(f"{part}{progress.total} comparisons with the reference finished", err=True)
 
     def _draw(self, progress: Progress) -> None:
         if progress.done == 0:
             self._close()
             stage = {"fields": "transforms", "reduction": "tables    ", "comparisons": "comparisons"}[progress.stage]
             label = f"{progress.part}: {stage}" if progress.part else stage
-            self._bar = click.progressbar(length=progress.total, label=label, file=sys.stderr, show_pos=True)
+            self._bar = progress_bar(progress.total, label)
             self._bar.__enter__()
         else:
             self._bar.update(1)

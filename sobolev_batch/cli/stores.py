@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +19,7 @@ from sobolev_batch.cli.options import (
     store_argument,
     up_option,
 )
+from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.reporter import ProgressLine
 from sobolev_batch.errors import SobolevBatchError, StoreError
 from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
@@ -66,7 +66,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
             time.sleep(_FOLLOW_SECONDS)
             current = status(store)
     line.close()
-    click.echo(current)
+    echo_lines(current)
     if current.failed or current.not_compared:
         context.exit(EXIT_SOME_FAILED)
     if current.lost or (current.run is not None and current.run.state == "failed"):
@@ -84,7 +84,7 @@ def verify_command(context: click.Context, store: Location) -> None:
     """
     from sobolev_batch.batch.verify import verify
 
-    with click.progressbar(label="fields", file=sys.stderr, show_pos=True, length=0) as bar:
+    with progress_bar(0, "fields") as bar:
 
         def show(done: int, total: int) -> None:
             if done == 1:
@@ -95,12 +95,12 @@ def verify_command(context: click.Context, store: Location) -> None:
         result = verify(store, show)
     for name, one in (result.objects or {str(store): result}).items():
         counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
-        click.echo(f"{name}: {counts if one.total else 'it has no results yet'}")
+        echo(f"{name}: {counts if one.total else 'it has no results yet'}")
     tables = {f"table {name}": damage for name, damage in result.tables.items()}
     for name, damage in (*result.fields.items(), *result.comparisons.items(), *tables.items()):
-        click.echo(f"{name}: {damage}")
+        echo(f"{name}: {damage}")
     if result.is_sound:
-        click.echo("nothing is damaged")
+        echo("nothing is damaged")
         return
     remedy = (
         "run the study again to repair it"
@@ -108,7 +108,7 @@ def verify_command(context: click.Context, store: Location) -> None:
         else "the store cannot be written from here, so nothing was withdrawn"
     )
     surfaces = len({*result.fields, *result.comparisons})
-    click.echo(f"{surfaces} surfaces and {len(result.tables)} arrays of tables are damaged; {remedy}")
+    echo(f"{surfaces} surfaces and {len(result.tables)} arrays of tables are damaged; {remedy}")
     context.exit(EXIT_OTHER)
 
 
@@ -121,9 +121,9 @@ def release_command(store: Location, force: bool) -> None:
 
     lock = release(store, force=force)
     if lock is None:
-        click.echo(f"{store}: not locked by any run")
+        echo(f"{store}: not locked by any run")
     else:
-        click.echo(f"{store}: released from {lock.driver}, which had locked it since {lock.since}")
+        echo(f"{store}: released from {lock.driver}, which had locked it since {lock.since}")
 
 
 @cli.command("table")
@@ -186,15 +186,15 @@ def table_command(
     if collection is not None:
         if matrix or over_time or below is not None:
             raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
-        click.echo(format_tables(collection.begun, style, chosen, x=x))
+        echo_lines(format_tables(collection.begun, style, chosen, x=x))
         return
     tree = open_store(store)
     if over_time:
-        click.echo(format_evolution(tree, style, chosen, truth=truth, factor=factor or REMESHING_FACTOR))
+        echo_lines(format_evolution(tree, style, chosen, truth=truth, factor=factor or REMESHING_FACTOR))
     elif below is not None:
-        click.echo(format_smallest(tree, style, chosen, below=below))
+        echo_lines(format_smallest(tree, style, chosen, below=below))
     else:
-        click.echo(format_matrix(tree, style, chosen) if matrix else format_table(tree, style, chosen, x=x))
+        echo_lines(format_matrix(tree, style, chosen) if matrix else format_table(tree, style, chosen, x=x))
 
 
 @cli.command("plot")
@@ -261,7 +261,7 @@ def plot_command(
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
         leagues = league(store, orders or None, x=x or "triangles", methods=families or None)
         for path in write_league_plots(leagues, output, written_as):
-            click.echo(path)
+            echo(path)
         return
     selection = Selection(orders or None, families or None, x or EDGE_LENGTH)
     with fields_read(store):
@@ -270,15 +270,15 @@ def plot_command(
         witness_paths, missing = write_witness_plots(tree, output, folder, meshes, up, selection, written_as)
         plots = write_plots(tree, output, selection, written_as)
     for path in (*plots.paths, *witness_paths):
-        click.echo(path)
+        echo(path)
     for name, notes in plots.notes.items():
-        click.echo(f"{name}: {'; '.join(notes)}", err=True)
+        echo(f"{name}: {'; '.join(notes)}", err=True)
     if missing:
         labels_by_reason: dict[str, list[str]] = {}
         for label, reason in missing.items():
             labels_by_reason.setdefault(reason, []).append(label)
         parts = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in labels_by_reason.items())
-        click.echo(f"not drawn with their witness functions: {parts}", err=True)
+        echo(f"not drawn with their witness functions: {parts}", err=True)
         if meshes:
             context.exit(EXIT_SOME_FAILED)
 
@@ -325,12 +325,12 @@ def witness_command(
         try:
             field = exporter.field(label)
         except SobolevBatchError as error:
-            click.echo(f"{label}: {error}", err=True)
+            echo(f"{label}: {error}", err=True)
             is_complete = False
             continue
         path = output / f"{exporter.stem(label)}.{style}"
         field.write(path)
-        click.echo(path)
+        echo(path)
     if not is_complete:
         context.exit(EXIT_SOME_FAILED)
 
@@ -350,6 +350,6 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     from sobolev_batch.results.report.build import write_report
 
     written = write_report(store, output, folder=folder, witnesses=meshes, up=up)
-    click.echo(written.path)
+    echo(written.path)
     for omission in written.omissions:
-        click.echo(f"left out: {omission}", err=True)
+        echo(f"left out: {omission}", err=True)

@@ -13,6 +13,7 @@ import click
 from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.options import (
     best_effort_option,
+    give_up_option,
     location,
     memory_of,
     memory_option,
@@ -20,6 +21,7 @@ from sobolev_batch.cli.options import (
     study_argument,
     trust_option,
 )
+from sobolev_batch.cli.output import echo, echo_lines
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -48,7 +50,7 @@ def init_command(folder: Path, output: Path) -> None:
     """
     from sobolev_batch.batch.study.draft.init import init_study
 
-    click.echo(init_study(folder, output))
+    echo_lines(init_study(folder, output))
 
 
 @cli.command("run")
@@ -71,6 +73,7 @@ def init_command(folder: Path, output: Path) -> None:
     metavar="STORE",
     help="Copy fields of this store that the study would compute again; may be repeated.",
 )
+@give_up_option
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -83,6 +86,7 @@ def run_command(
     worker_memory: int | None,
     best_effort: bool,
     reuse: tuple[Location, ...],
+    give_up_after: float,
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -108,7 +112,7 @@ def run_command(
     with Reporter() as reporter:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=reporter, reuse=reuse)
+                summary = run(parsed, place, client, on_progress=reporter, reuse=reuse, give_up_after=give_up_after)
         else:
             summary = run(
                 parsed,
@@ -117,20 +121,23 @@ def run_command(
                 memory=None if memory is None else f"{memory}B",
                 on_progress=reporter,
                 reuse=reuse,
+                give_up_after=give_up_after,
             )
-    click.echo(format_table(open_store(place)) if isinstance(parsed, Study) else _league_text(place))
-    click.echo(
-        f"\n{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
+    if isinstance(parsed, Study):
+        echo_lines(format_table(open_store(place)))
+    else:
+        _print_league(place)
+    echo()
+    echo(
+        f"{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
         f"store: {summary.store}"
     )
     for label, reason in summary.not_compared.items():
-        click.echo(f"{label}: {reason}", err=True)
+        echo(f"{label}: {reason}", err=True)
     for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:
-        click.echo(
-            f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True
-        )
+        echo(f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True)
     if len(summary.imprecise) > _MOST_IMPRECISE:
-        click.echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
+        echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
     is_short = bool(summary.imprecise) and not _is_best_effort(parsed)
     if summary.failed or summary.not_compared or is_short:
         context.exit(EXIT_SOME_FAILED)
@@ -147,6 +154,7 @@ def run_command(
 @trust_option
 @store_option
 @best_effort_option
+@give_up_option
 @click.pass_context
 def submit_command(
     context: click.Context,
@@ -155,6 +163,7 @@ def submit_command(
     trust_network: bool,
     store: Location | None,
     best_effort: bool,
+    give_up_after: float,
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
@@ -172,13 +181,11 @@ def submit_command(
             CollectionStore.prepared(location, parsed)
 
         def hand_over(one: Study, place: Location) -> None:
-            submission = submit(one, place, client)
-            click.echo(
-                f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}"
-            )
+            submission = submit(one, place, client, give_up_after=give_up_after)
+            echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
 
         refused = _for_each_object(parsed, location, hand_over, "submitted")
-    click.echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
+    echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
     if refused:
         context.exit(EXIT_SOME_FAILED)
 
@@ -217,13 +224,13 @@ def plan_command(
 
     def show(one: Study, place: Location) -> None:
         plans.append(plan(one, place, client=client))
-        click.echo(plans[-1])
+        echo_lines(plans[-1])
 
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         refused = _for_each_object(parsed, store or default_store(parsed), show, "planned")
     if len(plans) > 1:
         seconds, stored = sum(one.seconds for one in plans), sum(one.total_bytes for one in plans)
-        click.echo(f"{len(plans)} objects: about {duration(seconds, digits=2)}, {format_bytes(stored)} of fields")
+        echo(f"{len(plans)} objects: about {duration(seconds, digits=2)}, {format_bytes(stored)} of fields")
     if refused:
         context.exit(EXIT_SOME_FAILED)
 
@@ -258,27 +265,27 @@ def _for_each_object(
         return False
     stores, is_refused = CollectionStore.of(place, study).stores, False
     for name, one in study.studies.items():
-        click.echo(f"{name}:")
+        echo(f"{name}:")
         try:
             act(one, stores[name])
         except StoreError:
             raise
         except InputError as error:
-            click.echo(f"not {done}: {error}", err=True)
+            echo(f"not {done}: {error}", err=True)
             is_refused = True
     return is_refused
 
 
-def _league_text(place: Location) -> str:
-    """Return the league of a collection, or why there is none."""
+def _print_league(place: Location) -> None:
+    """Print the league of a collection, or why there is none."""
     from sobolev_batch.errors import InputError
     from sobolev_batch.results.league.league import league
     from sobolev_batch.results.league.text import format_league
 
     try:
-        return format_league(league(place))
+        echo_lines(format_league(league(place)))
     except InputError as error:
-        return f"no league: {error}"
+        echo(f"no league: {error}")
 
 
 def _made_default_store(study: Study | StudyCollection) -> Location:

@@ -9,18 +9,20 @@ from typing import Any
 
 import xarray as xr
 
+from sobolev_batch.batch.storage.checked import document_digest
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.hierarchy import DIGEST, DIGESTS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.metrics.datasets import describe
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
 
-_SOURCE = "source"
+# Entries of the encoding of a tree: where it was opened, and the digest of the digests of its tables then.
+_SOURCE, _STATE = "source", "state"
 
 
 @renamed_parameters(place="store")
@@ -57,7 +59,7 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     keys: Any = opened.zarr_store(recorded=opened.recorded_chunks)
     with opened.location.access("read"):
         tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
-    tree.encoding = {**tree.encoding, _SOURCE: str(store)}
+    tree.encoding = {**tree.encoding, _SOURCE: str(store), _STATE: document_digest(opened.digests)}
     for name in (DIGEST, DIGESTS):
         tree.attrs.pop(name, None)
     for node in tree.subtree:
@@ -75,6 +77,20 @@ def source_of(tree: xr.DataTree) -> str | None:
     """Return the path or URL at which a tree was opened by `open_store`; None for other trees."""
     source = tree.encoding.get(_SOURCE)
     return None if source is None else str(source)
+
+
+def require_unchanged(tree: xr.DataTree) -> None:
+    """Check that no run has changed a store since it was opened: then all that was read is one state of it.
+
+    Raises:
+        StoreError: Its tables are not those that it had, or it is gone.
+    """
+    source = source_of(tree)
+    if source is not None and document_digest(Store.open(source).digests) != tree.encoding.get(_STATE):
+        raise StoreError(
+            f"{source}: a run has changed the store while it was read; once that run has ended, open the store again, "
+            "or give the same command again"
+        )
 
 
 def location_of(store: AnyStore) -> str | Path | Location:

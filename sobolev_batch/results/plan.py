@@ -27,6 +27,7 @@ from sobolev_batch.results.forecast import Forecast
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.surfaces.shapes.placement import placement_doubt
 from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.visible import visible
 
 DEFAULT_FOLDER = Path("storage")
 # More would hide the rest of a plan.
@@ -140,7 +141,7 @@ class StudyPlan:
         return self.field_bytes * len(self.labels)
 
     def __str__(self) -> str:
-        return "\n".join(f"{name + ':' * bool(name):<14} {text}" for name, text in self._lines())
+        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self._lines())
 
     def _repr_html_(self) -> str:
         return table_html("Plan", self._lines())

@@ -19,6 +19,7 @@ from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.formatting import duration
+from sobolev_batch.visible import visible
 
 # A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
 _PATIENCE_SECONDS = 600.0
@@ -183,7 +184,7 @@ class Status:
         return self.silence_seconds > (LOST_AFTER_SECONDS if has_heartbeat else _PATIENCE_SECONDS)
 
     def __str__(self) -> str:
-        return "\n".join(self.lines())
+        return "\n".join(map(visible, self.lines()))
 
     def _repr_html_(self) -> str:
         run = [] if self.run is None else [("run", line) for line in self._run_lines(self.run)]

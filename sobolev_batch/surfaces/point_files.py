@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import textwrap
 from array import array
@@ -18,6 +17,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.ply import parse_ply_points
 from sobolev_batch.surfaces.formats.raw_files import is_gzipped, read_unpacked
 from sobolev_batch.surfaces.formats.readers import expected_size, mesh_format
+from sobolev_batch.surfaces.formats.text_formats import text_lines
 from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 
 Raw = tuple[NDArray[Any], NDArray[Any] | None]
@@ -69,7 +69,7 @@ def read_points(path: str | Path, *, weight: str | int | None = None, area: floa
     if suffix not in (".ply", *_TEXT_FORMATS):
         known = ", ".join((".ply", *_TEXT_FORMATS))
         raise MeshError(f"{path}: no format of points has this name; known are {known}, each also with .gz")
-    data = read_unpacked(path)
+    data = read_unpacked(path, _MEMORY_FACTOR)
     try:
         with np.errstate(all="ignore"):
             points, weights = _parsed_ply(data, weight) if suffix == ".ply" else _parsed_text(data, weight)
@@ -143,7 +143,7 @@ def _parsed_text(data: bytes, weight: str | int | None) -> Raw:
 
 def _numbered_cells(data: bytes) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of each line that is not empty, counted from 1, and its cells."""
-    for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8-sig"), 1):
+    for number, line in enumerate(text_lines(data, errors="strict"), 1):
         # CloudCompare writes two slashes before the names.
         content = line.partition("#")[0].strip().removeprefix("//")
         if content:

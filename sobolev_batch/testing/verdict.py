@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sobolev_batch.html import table_html
-from sobolev_batch.parameters import byte_count
+from sobolev_batch.machine import available
 from sobolev_batch.results.tables.formatting import Digits, rounded_outwards
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -124,7 +124,7 @@ def same_surface(
         The verdict, with the distance and its error.
 
     Raises:
-        InputError: An argument is no surface, or out of range.
+        InputError: An argument is no surface, or out of range; or there is less memory.
         MeshError: A file or arrays hold no valid mesh.
         OrderError: The order is not below -1/2, or for point clouds -3/2.
 
@@ -135,7 +135,7 @@ def same_surface(
     >>> sb.same_surface(coarse, fine).outcome
     'different'
     """
-    accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, byte_count(memory))
+    accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, available(memory))
     checked_order = single_order(order)
     surface, reference = (as_surface(one, (checked_order,)) for one in (a, b))
     area_change = surface.area / reference.area - 1

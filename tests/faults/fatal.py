@@ -1,4 +1,4 @@
-"""Loaded into a worker before it starts: ends it at one moment of the tasks of one row, like an OOM killer would.
+"""Loaded into a worker before it starts: ends or stops it at one moment of the tasks of one row.
 
 The moment is in the environment, which workers have from the process that starts them.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -33,21 +34,28 @@ class Moment:
         row: whose.
         log: a file with one line for each worker that ended.
         times: how many end, of all workers together.
+        number: of the signal that they get: by default that of an OOM killer; one that is stopped may be continued.
     """
 
     what: str
     row: int
     log: str
     times: int = 1
+    number: int = signal.SIGKILL
+
+    @property
+    def pids(self) -> list[int]:
+        """The processes that got the signal."""
+        path = Path(self.log)
+        return list(map(int, path.read_text().split())) if path.exists() else []
 
     @property
     def deaths(self) -> int:
         """How many workers have ended."""
-        path = Path(self.log)
-        return len(path.read_text().splitlines()) if path.exists() else 0
+        return len(self.pids)
 
     def strike(self) -> None:
-        """End this process, unless enough have ended."""
+        """End or stop this process, unless enough have."""
         for number in range(self.times):
             try:
                 os.close(os.open(f"{self.log}.{number}", os.O_CREAT | os.O_EXCL))
@@ -55,7 +63,9 @@ class Moment:
                 continue
             with Path(self.log).open("a") as log:
                 log.write(f"{os.getpid()}\n")
-            os.kill(os.getpid(), signal.SIGKILL)
+            # To this thread, which goes no further then; the rest of the process stops or ends with it.
+            signal.pthread_kill(threading.get_ident(), self.number)
+            return
 
     def before(self, function: Callable[..., Any], concerns: Callable[..., bool]) -> Callable[..., Any]:
         """A function before whose calls the worker ends, if they concern the row."""

@@ -63,6 +63,27 @@ def test_a_change_of_the_study(
     assert np.isfinite(variable(tree, "convergence", "distance").values).all()
 
 
+def test_tables_in_another_unit_of_length_are_withdrawn_first(folder: Path, store_path: Path, client: Client) -> None:
+    run(study_of(folder), store_path, client)
+
+    def interrupt(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(study_of(folder, scaling={"mode": "fixed", "scale": 0.5}), store_path, client, on_progress=interrupt)
+    assert "convergence" not in open_store(store_path).children
+
+
+def test_distances_are_those_to_the_reference_of_the_study(folder: Path, store_path: Path, client: Client) -> None:
+    trimesh.creation.box((1.0, 1.0, 0.5)).export(folder / "b.off")
+    for name, computed in (("a", ("f/a", "f/b")), ("b", ())):
+        reference = {"source": "family", "family": "f", "member": name}
+        study = study_of(folder, scaling={"mode": "fixed", "scale": 1.0}, reference=reference)
+        assert run(study, store_path, client).computed == computed
+        distances = variable(open_store(store_path), "convergence", "distance")
+        assert distances.mesh[(distances == 0).all("order")].values.tolist() == [f"f/{name}"]
+
+
 def test_a_changed_file_and_changed_numerics(
     folder: Path, store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:

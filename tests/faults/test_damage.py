@@ -100,6 +100,15 @@ def test_a_run_with_nothing_to_do_sees_what_is_missing(
     assert run(study, store, client).computed == ("ico/3",)
 
 
+@pytest.mark.parametrize("damage", [truncate, empty, delete])
+def test_a_run_with_nothing_to_do_sees_what_tables_lack(
+    damage: Damage, store: Path, study: Study, finished_store: Path, client: Client
+) -> None:
+    damage(store / "convergence/distance/c/0/0")
+    assert run(study, store, client).computed == ()
+    assert_same_tables(store, finished_store)
+
+
 def test_what_is_damaged_again_and_again_ends_the_run(
     store: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -99,6 +99,31 @@ def test_records_that_trade_places_are_none(store: Path, study: Study, client: C
     assert status(store).lost_records == ()
 
 
+@pytest.mark.parametrize("row", [0, 1])
+def test_records_that_are_read_by_themselves_are_held_against_their_rows(row: int, store: Path) -> None:
+    path = store / RECORD.format(row=row)
+    if row:
+        path.write_bytes(path.read_bytes()[:-1])
+    else:
+        exchange(store, RECORD.format(row=0), RECORD.format(row=2))
+    with pytest.raises(DamageError, match=f"row {row} of records/record is damaged .it is not what was written"):
+        variable(open_store(store), "records", "record").load()
+
+
+@pytest.mark.parametrize("name", ["meshes/area", "fourier", "norms/norm"])
+@pytest.mark.parametrize("what", ["cut short", "altered", "deleted"])
+def test_metadata_of_one_node_are_held_against_those_at_the_root(name: str, what: str, store: Path) -> None:
+    path = store / name / "zarr.json"
+    content = json.loads(path.read_text())
+    if what == "deleted":
+        path.unlink()
+    else:
+        path.write_text(json.dumps({**content, "attributes": {"units": "m"}}) if what == "altered" else "{")
+    assert set(verify(store).tables) == {name}
+    assert json.loads(path.read_text())["attributes"] == content["attributes"]
+    assert verify(store).is_sound
+
+
 def test_a_record_that_is_gone_is_told(store: Path, study: Study, client: Client) -> None:
     (store / RECORD.format(row=2)).unlink()
     found = status(store)
@@ -183,6 +208,8 @@ def test_the_record_of_a_run_that_was_altered_is_noticed(store: Path) -> None:
     path.write_text(path.read_text().replace('"state": "done"', '"state": "failed"'))
     with pytest.raises(DamageError, match="the record of the latest run is damaged"):
         status(store)
+    assert verify(store).tables == {"records": "it is not what was written"}
+    assert verify(store).is_sound
 
 
 def test_stores_without_digests_are_read_and_get_some(store: Path, study: Study, client: Client) -> None:

@@ -52,6 +52,23 @@ def test_a_run_ends_and_goes_on(
     assert "taken over" not in again.stderr
 
 
+SEMAPHORE_LEFT = """
+import multiprocessing, signal
+from sobolev_batch.cli.interruption import Deadline, end_process, raise_when_asked
+
+if __name__ == "__main__":
+    raise_when_asked(Deadline("", 30.0))
+    lock = multiprocessing.get_context("spawn").Lock()
+    end_process(signal.SIGINT, "")
+"""
+
+
+def test_the_last_word_is_that_of_the_command() -> None:
+    # Of a local cluster, semaphores may be left.
+    done = subprocess.run([sys.executable, "-c", SEMAPHORE_LEFT], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
 # Says when the command line is about to be imported.
 IMPORTING = """
 import sys
@@ -200,6 +217,6 @@ def test_a_status_that_is_followed_ends_without_a_traceback(store_path: Path, tm
         with started("status", store_path, "--follow") as follower:
             assert follower.stdout is not None
             line = follower.stdout.readline()
-            assert re.match(r"[1-5] of 5 done, 0 failed, ", line), line
+            assert re.match(r"[1-5] of 5 done, 0 failed", line), line
             output, rest = interrupted(follower, signal.SIGTERM)
             assert (follower.returncode, rest) == (143, "terminated\n"), output

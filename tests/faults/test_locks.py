@@ -11,14 +11,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
+from typing import Any
+from uuid import uuid4
 
 import pytest
 
 from sobolev_batch import Study, release, run
+from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire, locked
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.errors import LockError
 from tests.support.commands import call, command, write_toml
 
@@ -37,7 +41,7 @@ def pause(progress):
         print("paused", flush=True)
         if sys.stdin.readline() == "released\\n":
             for thread in threading.enumerate():
-                if thread.name.startswith("sobolev-batch"):
+                if thread.name == "sobolev-batch-heartbeat":
                     thread.join()
 
 if __name__ == "__main__":
@@ -87,7 +91,28 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
     _, said = first.communicate("released\n")
     assert first.returncode != 0
     assert "LockError" in said
-    assert "is no longer its own" in said
+    assert "nothing more is written by a run that no longer has the store" in said
+
+
+def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
+    study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(study, store_path, workers=1)
+    other = Lock("r", "h", "process 12 on far.example", utc_now())
+    under_way = store_path / f"zarr.json.{uuid4().hex}.partial"
+
+    def plan_slowly(*arguments: Any) -> Plan:
+        planned = make_plan(*arguments)
+        release(store_path, force=True)
+        acquire(Location.of(store_path), other)
+        under_way.write_text("what the other run is writing")
+        return planned
+
+    monkeypatch.setattr(run_module, "make_plan", plan_slowly)
+    with pytest.raises(LockError, match="the store was released"):
+        run(study, store_path, workers=1)
+    assert under_way.exists()
+    assert Lock.read(Location.of(store_path)) == other
 
 
 def test_the_lock_of_another_machine_is_released_by_hand(

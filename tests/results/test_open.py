@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 import xarray as xr
 
 import sobolev_batch as sb
+from sobolev_batch import Study
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from tests.support.studies import small_table
 
 
 def test_opening_nothing(tmp_path: Path) -> None:
@@ -21,6 +26,19 @@ def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
         result = function(finished_store)
         assert function(tree) is not result
         assert str(function(tree)) == str(result)
+
+
+def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Path) -> None:
+    shutil.copytree(finished_store, store_path)
+    tree = sb.open_store(store_path)
+    before = [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)]
+    # As a run does before it replaces them.
+    Tables(Store.open(store_path)).invalidate()
+    for function in (sb.table, sb.matrix):
+        with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
+            function(tree, -5.0)
+    sb.run(Study.from_table(small_table()), store_path, workers=1)
+    assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before
 
 
 def test_a_tree_from_nowhere_has_no_status(tree: xr.DataTree) -> None:

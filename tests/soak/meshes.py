@@ -14,7 +14,7 @@ STUDY = """
 name = "soak"
 [lattice]
 xi_max = 2.0
-M = 10
+M = {cells}
 [norm]
 orders = [-4.0, -2.0]
 pairs = "reference"
@@ -27,13 +27,17 @@ paths = ["*.off"]
 """
 
 
-def write_study(folder: Path, count: int, seed: int) -> Path:
-    """Write icospheres whose vertices are moved in or out at random, and the study of them; its file."""
-    random = np.random.default_rng(seed)
-    sphere = icosphere(1)
-    for number in range(count):
-        vertices = sphere.vertices * random.uniform(0.7, 1.0, (len(sphere.vertices), 1))
-        (folder / f"{number:06}.off").write_bytes(off(vertices, sphere.triangles.tolist()))
+def write_study(folder: Path, count: int, seed: int, cells: int = 10, level: int = 1) -> Path:
+    """Write icospheres whose vertices are moved in or out at random, and the study of them; return its file."""
+    write_meshes(folder, range(count), np.random.default_rng(seed), level)
     path = folder / "study.toml"
-    path.write_text(STUDY)
+    path.write_text(STUDY.format(cells=cells))
     return path
+
+
+def write_meshes(folder: Path, numbers: range, chance: np.random.Generator, level: int = 1) -> None:
+    """Write icospheres of these numbers, whose vertices are moved in or out at random."""
+    sphere = icosphere(level)
+    for number in numbers:
+        vertices = sphere.vertices * chance.uniform(0.7, 1.0, (len(sphere.vertices), 1))
+        (folder / f"{number:06}.off").write_bytes(off(vertices, sphere.triangles.tolist()))

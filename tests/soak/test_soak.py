@@ -9,7 +9,9 @@ import pytest
 
 from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
+from tests.soak.corruptions import BAD, answer_to, corruptions
 from tests.soak.havoc import HavocPlan
+from tests.soak.sequences import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, strikes_of
 from tests.soak.trial import Outcome, soak
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
@@ -55,3 +57,32 @@ def test_kills_depend_on_the_seed_alone() -> None:
     assert plan == HavocPlan.of(3, range(100, 1000), 5, 2) != HavocPlan.of(4, range(100, 1000), 5, 2)
     assert (len(plan.workers), len(plan.drivers)) == (5, 2)
     assert set(plan.workers + plan.drivers) <= set(range(100, 1000))
+
+
+def test_a_cluster_that_is_struck_loses_nothing(tmp_path: Path) -> None:
+    strikes = (Strike(2, "nanny", "killed"), Strike(4, *EXCHANGED), Strike(6, "worker", "stopped"))
+    (sequence,) = strike_all(tmp_path, {0: strikes})
+    assert sequence.differences == ()
+    assert sequence.strikes == strikes
+
+
+def test_strikes_are_of_all_kinds() -> None:
+    kinds = {(one.role, one.what) for seed in range(30) for one in strikes_of(seed, 5)}
+    assert kinds == {(role, what) for role in ROLES for what in SIGNALS} | {EXCHANGED}
+
+
+def test_no_number_changes_without_a_word(tmp_path: Path) -> None:
+    found = list(corruptions(tmp_path, 6, seed=1))
+    assert len(found) == 6
+    for one in found:
+        assert not set(one.answers.values()) & set(BAD), one
+    assert any("told" in one.answers.values() for one in found)
+
+
+def test_a_changed_number_would_be_noticed() -> None:
+    assert answer_to({"output": "1.0"}, {"output": "2.0"}) == "silent"
+    assert answer_to({"output": "1.0"}, {"output": "1.0"}) == "same"
+    assert answer_to({"output": "2.0", "remarks": "a chunk is gone"}, {"output": "1.0", "remarks": ""}) == "told"
+    assert answer_to({"/a": "told: damaged"}, {"/a": "1.0"}) == "told"
+    assert answer_to({"/a": "told: damaged", "/b": "2.0"}, {"/a": "1.0", "/b": "3.0"}) == "silent"
+    assert answer_to({}, {"/a": "1.0"}) == "told"

@@ -59,8 +59,10 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["sobolev-batch", *map(str, arguments)])
-        # Signals are the test runner's, and so are its log handlers: the command is to set up its own.
+        # Signals, warnings and log records are the test runner's, and so are its log handlers: the command is to set up
+        # its own.
         patch.setattr(cli, "raise_when_asked", lambda deadline: None)
+        patch.setattr(cli, "make_messages_visible", lambda: None)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)
         # It tells of connections that earlier tests of this process left open.

@@ -168,6 +168,17 @@ def _packed_zeros(size: int) -> bytes:
     return base64.b64encode(zlib.compress(bytes(size), 9))
 
 
+def _gzipped(content: Callable[[], bytes]) -> Callable[[], bytes]:
+    """A packed file that unpacks to no more than the harmless size, or to less than a hundredfold."""
+    return lambda: gzip.compress(content(), 6, mtime=0)
+
+
+def _with_noise(start: bytes, end: bytes) -> bytes:
+    """A hundred megabytes of ones in XML, beside so much that cannot be packed that they are not refused as a bomb."""
+    noise = np.random.default_rng(1).bytes(3 * _MEGABYTE // 2).hex().encode()
+    return start + b"1" * (100 * _MEGABYTE) + end + noise
+
+
 def _sparse(ending: str, start: bytes, size: int) -> Attack:
     """A file that seems large and takes no room on the disk."""
 
@@ -212,6 +223,8 @@ def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
 
 
 _DIGITS = b"9" * 5000
+_MANY_ARRAYS = _GIFTI.replace(b'NumberOfDataArrays="2"', b'NumberOfDataArrays="60002"')
+_EMPTY_ARRAY = b'<DataArray Dimensionality="1" Dim0="0"><Data/></DataArray>'
 _FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", ".vtk", ".vtp", ".vtu", "_lh.pial")
 
 ATTACKS: dict[str, Attack] = {
@@ -351,6 +364,48 @@ ATTACKS: dict[str, Attack] = {
         ".gii",
         _changed(_GIFTI, b'Encoding="GZipBase64Binary"', b'Encoding="ExternalFileBinary"').replace(
             b'ExternalFileName=""', b'ExternalFileName="/etc/passwd"', 1
+        ),
+    ),
+    # Small on the disk, and long once they are unpacked.
+    "gifti, long attribute unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b'<GIFTI Version="', b'">'))),
+    "gifti, long name unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b"<GIFTI", b">"))),
+    "gifti, long comment unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b"<GIFTI><!--", b"-->"))),
+    "gifti, deep elements unpacked": _file(".gii.gz", _gzipped(lambda: b"<GIFTI>" + b"<a>" * 5 * _MEGABYTE)),
+    "gifti, many elements unpacked": _file(
+        ".gii.gz", _gzipped(lambda: _GIFTI.replace(b"<DataArray", b"<MD/>" * 3 * _MEGABYTE + b"<DataArray", 1))
+    ),
+    "gifti, many arrays": _file(
+        ".gii.gz",
+        _gzipped(lambda: _MANY_ARRAYS.replace(b"</GIFTI>", _EMPTY_ARRAY * 60_000 + b"</GIFTI>")),
+    ),
+    "vtp, long attribute unpacked": _file(
+        ".vtp.gz", _gzipped(lambda: _with_noise(b'<VTKFile type="', b'">') + b"</VTKFile>")
+    ),
+    "vtp, deep elements unpacked": _file(
+        ".vtp.gz", _gzipped(lambda: b'<VTKFile type="PolyData">' + b"<a>" * 5 * _MEGABYTE + b"</VTKFile>")
+    ),
+    "vtk, numbers unpacked": _file(
+        ".vtk.gz", _gzipped(lambda: _vtk_start(f"POINTS {5 * _MEGABYTE // 3} float") + b"11 " * 5 * _MEGABYTE)
+    ),
+    "obj, short lines unpacked": _file(".obj.gz", _gzipped(lambda: b"v\n" * 7 * _MEGABYTE)),
+    "obj, long line unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11" * 5 * _MEGABYTE + b"\n")),
+    "obj, continued lines unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11\\\n" * 3 * _MEGABYTE)),
+    "obj, faces unpacked": _file(".obj.gz", _gzipped(lambda: b"v 0 0 0\n" + b"f 1 1 1\n" * (3 * _MEGABYTE // 2))),
+    "off, short lines unpacked": _file(".off.gz", _gzipped(lambda: b"OFF\n" + b"1\n" * 7 * _MEGABYTE)),
+    "stl ascii, short lines unpacked": _file(".stl.gz", _gzipped(lambda: b"solid\n" + b"facet\n" * 2 * _MEGABYTE)),
+    "ply ascii, short lines unpacked": _file(
+        ".ply.gz",
+        _gzipped(lambda: _ply_header(*_vertices(3), "element face 1", encoding="ascii") + b"1\n" * 7 * _MEGABYTE),
+    ),
+    "ply ascii, long line unpacked": _file(
+        ".ply.gz",
+        _gzipped(
+            lambda: (
+                _ply_header("element vertex 1", "property list uint uchar x", "element face 1", encoding="ascii")
+                + b"5242880"
+                + b" 11" * 5 * _MEGABYTE
+                + b"\n1\n"
+            )
         ),
     ),
     # VTK.

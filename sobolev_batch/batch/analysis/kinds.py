@@ -186,7 +186,8 @@ class WitnessKind(ComparisonKind):
         plan, projected_bytes = self.meshes.workspace.plan, self.projected_bytes(i)
         transform_bytes = LEAST_TRANSFORM_BYTES + max(0.0, allowed_bytes - projected_bytes)
         settings = WitnessSettings(plan.lattice, plan.blocks, plan.study.witness, transform_bytes)
-        return Task(compare_by_witness, (self.comparison(i), settings), projected_bytes, row=i)
+        label = self.meshes.workspace.labels[i]
+        return Task(compare_by_witness, (self.comparison(i), settings), projected_bytes, row=i, label=label)
 
     def pending(self, records: Records) -> list[int]:
         """Return the meshes without a record, and those of which values are lost."""
@@ -240,7 +241,8 @@ class ProximityKind(ComparisonKind):
     def task(self, i: int, allowed_bytes: float) -> Task:
         """Return the task."""
         arguments = self.comparison(i), self.study.proximity
-        return Task(compare_by_proximity, arguments, self.projected_bytes(i), row=i)
+        label = self.meshes.workspace.labels[i]
+        return Task(compare_by_proximity, arguments, self.projected_bytes(i), row=i, label=label)
 
     def create(self) -> None:
         """Create the table, without values."""

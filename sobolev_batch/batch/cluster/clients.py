@@ -12,11 +12,10 @@ import dask
 from distributed import Client, LocalCluster
 
 from sobolev_batch.batch.cluster import worker_preload
-from sobolev_batch.batch.cluster.address import Address
-from sobolev_batch.batch.cluster.connection import check_connection
+from sobolev_batch.batch.cluster.connection import Address, check_connection
 from sobolev_batch.errors import ClusterError, InputError
+from sobolev_batch.machine import MachineMemory, require_machine_memory
 from sobolev_batch.parameters import byte_count, format_bytes
-from sobolev_batch.spectral.backends.machine import require_machine_memory
 
 _CONNECT_SECONDS = 15
 # In less, a worker with all its libraries has no memory left for any transform.
@@ -39,10 +38,11 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
         memory: Memory of each, in bytes or as a text such as "4GB"; by default the machine's, divided equally.
 
     Raises:
-        InputError: The memory is not a size, or too little for a worker.
+        InputError: The memory is not a size, too little for a worker, or more than there is for all of them.
     """
-    limit = "auto" if memory is None else memory_limit(memory)
     count = workers or available_cores()
+    # Dask's own default knows no limit of an inner control group.
+    limit = MachineMemory.found().total_bytes // count if memory is None else memory_limit(memory, count)
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
         _shielded_from_interrupts() as unshield,
@@ -179,11 +179,15 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         yield client
 
 
-def memory_limit(memory: float | str) -> int:
+def memory_limit(memory: float | str, workers: int) -> int:
     """Return the memory of a worker in bytes.
 
+    Args:
+        memory: Memory of each worker, in bytes or as a text such as "4GB".
+        workers: Number of workers.
+
     Raises:
-        InputError: The memory is not a size, too little for a worker, or more than there is.
+        InputError: The memory is not a size, too little for a worker, or more than there is for all of them.
     """
     limit = byte_count(memory)
     if limit < _LEAST_BYTES:
@@ -191,6 +195,7 @@ def memory_limit(memory: float | str) -> int:
             f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}; give it more"
         )
     require_machine_memory(limit, "the memory of a worker")
+    require_machine_memory(workers * limit, f"the memory of {workers} workers", "for each, or take fewer")
     return limit
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
+from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
 from distributed.comm import CommClosedError
@@ -13,7 +14,7 @@ from distributed.scheduler import KilledWorker
 from sobolev_batch.batch.cluster.progress import Notify
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
-from sobolev_batch.errors import ClusterError, StoreError
+from sobolev_batch.errors import ClusterError, StoreError, one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,7 @@ class Task:
         needs_gpu: True where the call has to run on a worker with a GPU.
         priority: Tasks of higher priority run first.
         row: Row of the store that the task works for, for the caller.
+        label: Label of the mesh that it works for, for people.
     """
 
     function: Callable[..., Any]
@@ -35,6 +37,7 @@ class Task:
     needs_gpu: bool = False
     priority: int = 0
     row: int = -1
+    label: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ class Cluster:
                 except ClusterError as error:
                     refused.append((task, error))
                     continue
-                future = self._submit(task, claims_memory, {})
+                future = self._submit(task, claims_memory, {}, task.label)
                 running[future] = task
                 completed.add(future)
                 count -= 1
@@ -134,13 +137,13 @@ class Cluster:
             for future in running:
                 future.release()
 
-    def _submit(self, task: Task, claims_memory: bool, futures: dict[int, Future]) -> Future:
+    def _submit(self, task: Task, claims_memory: bool, futures: dict[int, Future], label: str) -> Future:
         """Submit a task after those among its arguments, each of these once."""
 
         def submitted(argument: Any) -> Any:
             if isinstance(argument, list):
                 return [submitted(item) for item in argument]
-            return self._submit(argument, claims_memory, futures) if isinstance(argument, Task) else argument
+            return self._submit(argument, claims_memory, futures, label) if isinstance(argument, Task) else argument
 
         if id(task) not in futures:
             resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
@@ -149,7 +152,8 @@ class Cluster:
             futures[id(task)] = self.client.submit(
                 task.function,
                 *map(submitted, task.arguments),
-                pure=False,
+                # A worker that stays silent is told with the meshes that it has.
+                key=(f"{task.function.__name__}-{uuid4().hex}", label),
                 priority=task.priority,
                 resources=resources or None,
             )
@@ -177,7 +181,7 @@ class Cluster:
 
 def describe_failure(error: BaseException) -> str:
     """Return why a task failed, in one line."""
-    return str(error) if isinstance(error, ClusterError) else f"{type(error).__name__}: {error}"
+    return one_line(error) if isinstance(error, ClusterError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def _deadly(error: KilledWorker) -> ClusterError:

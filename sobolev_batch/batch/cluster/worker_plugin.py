@@ -117,16 +117,6 @@ def worker_slowness(client: Client, address: str) -> float:
     return float(client.run(_slowness, workers=[address])[address])
 
 
-def waiting_reason(client: Client, backend: str) -> str:
-    """Return what a study waits for that its cluster has lost; empty where it has all that it takes."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    if not workers:
-        return "no worker is left; waiting for one to start"
-    if backend == "gpu" and not any(worker["resources"].get(GPU) for worker in workers):
-        return "no worker with a GPU is left, and the study asks for one; waiting for one to start"
-    return ""
-
-
 def worker_backend(choice: str) -> Backend:
     """Return the backend of the worker that runs this task; the CPU where the study chose that."""
     if choice == "cpu":

@@ -1,4 +1,4 @@
-"""Preload of workers of a local cluster: the driver tells what went wrong, so that they need not log it."""
+"""Preload of workers of a local cluster, whose messages go to the terminal of the driver."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ import logging
 
 from distributed import Worker
 
+from sobolev_batch.visible import make_messages_visible
+
 
 def dask_setup(worker: Worker) -> None:
-    """Silence Dask's logs of this worker. Dask calls this when the worker starts."""
+    """Make messages of this worker visible, and leave out Dask's: the driver tells what went wrong.
+
+    Dask calls this when the worker starts.
+    """
+    make_messages_visible()
     logging.getLogger("distributed").setLevel(logging.CRITICAL)

@@ -7,9 +7,9 @@ from functools import cached_property
 
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import ClusterError, InputError
+from sobolev_batch.machine import MachineMemory
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends.machine import MachineMemory
 
 # Dask resources that tasks claim of a worker.
 MEMORY = "sobolev-batch-memory"
@@ -46,9 +46,10 @@ def allowed_bytes(limit: float | None) -> float:
     """Return the memory that tasks of a worker may take together.
 
     Args:
-        limit: Memory limit of the worker; without one, the machine's memory.
+        limit: Memory limit of the worker; without one, the machine's memory, which no limit can exceed.
     """
-    return _ALLOWED_FRACTION * (limit or MachineMemory.found().total_bytes) - _IDLE_BYTES
+    total = MachineMemory.found().total_bytes
+    return _ALLOWED_FRACTION * min(limit or total, total) - _IDLE_BYTES
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,11 @@ def field_task(job: Job, sizes: TaskSizes, rank: int = 0) -> Task:
     needs_gpu = job.settings.backend == "gpu"
     if len(sizes.block_groups) == 1:
         (blocks,) = sizes.block_groups
-        return Task(compute_mesh, (job, blocks), sizes.loading_bytes, needs_gpu, row=job.index)
+        return Task(compute_mesh, (job, blocks), sizes.loading_bytes, needs_gpu, row=job.index, label=job.row.label)
     groups = [Task(compute_blocks, (job, blocks), sizes.loading_bytes, needs_gpu) for blocks in sizes.block_groups]
     if job.settings.tail is not None:
         groups.append(Task(compute_octaves, (job,), sizes.loading_bytes, needs_gpu))
-    return Task(finish_mesh, (job, groups), row=job.index)
+    return Task(finish_mesh, (job, groups), row=job.index, label=job.row.label)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class _Batches:
             needs_gpu = self.job.settings.backend == "gpu"
             last = first - 2 * len(blocks) - 1
             stored.append(Task(octaves_of_batches, (self.job, split), self.sizes.batch_bytes, needs_gpu, priority=last))
-        return Task(finish_mesh, (self.job, stored), priority=first, row=self.job.index)
+        row = self.job.row
+        return Task(finish_mesh, (self.job, stored), priority=first, row=self.job.index, label=row.label)
 
     def _transform(self, split: Task, batch: int, block: object, priority: int) -> Task:
         needs_gpu = self.job.settings.backend == "gpu"

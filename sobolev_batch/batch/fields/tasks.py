@@ -141,17 +141,15 @@ class Job:
 
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
-        if isinstance(error, LatticeError):
-            if self.distance_target is None:
-                return str(error)
-            return (
-                f"{error}; it was chosen for surfaces that reach less far. Is this one in the same unit of length? "
+        reason = one_line(error)
+        if isinstance(error, LatticeError) and self.distance_target is not None:
+            reason = (
+                f"{reason}; it was chosen for surfaces that reach less far. Is this one in the same unit of length? "
                 "If it is, name another store, for which the lattice is chosen anew"
             )
-        if isinstance(error, InputError):
-            return str(error)
-        _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
-        return one_line(error)
+        if not isinstance(error, InputError):
+            _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
+        return reason
 
 
 @dataclass(frozen=True)

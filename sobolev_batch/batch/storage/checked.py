@@ -127,6 +127,8 @@ class CheckedStore(WrapperStore[ZarrStore]):
         for array in self._recorded:
             if (place := array.place(key)) is not None:
                 await self._require_recorded(array, place, found, prototype)
+        if found is not None and self._is_record(key):
+            self._require_record(key, found.to_bytes())
         return found
 
     def _require_digest(self, key: str, found: Buffer | None) -> None:
@@ -136,6 +138,22 @@ class CheckedStore(WrapperStore[ZarrStore]):
                 f"{self._name}: {_array_of(key)} is damaged ({problem}), or a run has replaced it since it was opened; "
                 "open the store again, and run the study again if it stays so",
                 problem,
+            )
+
+    def _is_record(self, key: str) -> bool:
+        groups = {array.records.partition("/")[0] for array in self._recorded}
+        return "/c/" in key and key.partition("/")[0] in groups
+
+    def _require_record(self, key: str, content: bytes) -> None:
+        row = int(key.rpartition("/")[2])
+        values, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
+        is_whole = google_crc32c.value(values).to_bytes(_CHECKSUM_BYTES, "little") == checksum
+        if not is_whole or _table_of(content).get("row", row) != row:
+            raise DamageError(
+                f"{self._name}: row {row} of {_array_of(key)} is damaged ({CHANGED}); sobolev-batch verify names the "
+                "mesh, and run computes it again",
+                CHANGED,
+                row,
             )
 
     async def _require_recorded(

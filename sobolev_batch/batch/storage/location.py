@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from fsspec import available_protocols
 from zarr.abc.store import Store as ZarrStore
@@ -22,6 +23,13 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
 
 
+class Fence(Protocol):
+    """Condition on every write to a location."""
+
+    def require(self, location: Location) -> None:
+        """Raise a `StoreError` unless the location may be written."""
+
+
 @dataclass(frozen=True)
 class Location:
     """Location of a store. It is cheap to make, to compare and to pickle, and nothing is accessed in advance.
@@ -30,9 +38,11 @@ class Location:
 
     Attributes:
         name: Path, or URL such as s3://bucket/name.zarr, without credentials.
+        fence: Condition on every write, if there is one.
     """
 
     name: str
+    fence: Fence | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, store: str | Path | Location) -> Location:
@@ -72,7 +82,11 @@ class Location:
 
     def absolute(self) -> Location:
         """Return the same location for processes that were started in another folder."""
-        return self if self.scheme else Location(str(Path(self.name).absolute()))
+        return self if self.scheme else replace(self, name=str(Path(self.name).absolute()))
+
+    def fenced(self, fence: Fence) -> Location:
+        """Return the same location for writers that have to stop once a condition fails."""
+        return replace(self, fence=fence)
 
     def below(self, name: str) -> Location:
         """Return the location of a name below this one."""
@@ -177,7 +191,12 @@ class Location:
 
         Put nothing but access to the location inside. Drivers of object storage have exceptions without a common
         base, so every exception counts as a failure of the access.
+
+        Args:
+            verb: Kind of access: "read", or "written", which the fence has to allow.
         """
+        if verb == "written" and self.fence is not None:
+            self.fence.require(self)
         try:
             yield
         except SobolevBatchError:

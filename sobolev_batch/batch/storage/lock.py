@@ -4,6 +4,9 @@ Tasks of one run never write the same chunk, but those of two runs would. The lo
 drivers on different machines see it, and is created by an operation that succeeds for one of them only. It is
 removed when its run ends. The lock of a killed driver is taken over if its process is certainly gone, and is
 otherwise released by hand.
+
+A task may outlive its driver: a worker that was stopped goes on when it is continued, perhaps after another run has
+stored something newer. Before each write it looks whether the lock is still that of its run.
 """
 
 from __future__ import annotations
@@ -32,6 +35,28 @@ LOCK_KEY = "claim.json"
 # Held during a takeover, since several drivers may try.
 _TAKEOVER_KEY = "claim.succession.json"
 LOCK_KEYS = frozenset({LOCK_KEY, _TAKEOVER_KEY})
+
+
+@dataclass(frozen=True)
+class RunFence:
+    """Condition that a run has the store to itself. Tasks take it along.
+
+    Attributes:
+        run: Run that has to hold the lock.
+    """
+
+    run: str
+
+    def require(self, location: Location) -> None:
+        """Check that the run still has the store.
+
+        Raises:
+            LockError: The run is over, its store was released, or another run has it.
+        """
+        lock = Lock.read(location)
+        if lock is None or lock.run != self.run:
+            others = "the store was released, or its run is over" if lock is None else f"{lock.driver} has it now"
+            raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 @dataclass(frozen=True)
@@ -79,6 +104,11 @@ class Lock:
         except (ValueError, TypeError, AttributeError):
             # Its holder was killed while it wrote this, or is still writing.
             return cls("", "", "a process that has not written its name", "an unknown time")
+
+    @property
+    def fence(self) -> RunFence:
+        """Condition that the run of this lock has the store."""
+        return RunFence(self.run)
 
     @property
     def holder_is_gone(self) -> bool:

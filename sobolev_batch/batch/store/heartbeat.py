@@ -13,7 +13,7 @@ from sobolev_batch.batch.storage.lock import Lock, this_process
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import RunRecord, RunState
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.errors import LockError, StoreError, one_line
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class Heartbeat:
             # If another driver took over, as when this one's worker was retired, its own end counts.
             if self._lock.is_held(self._store.location):
                 ended = isinstance(error, KeyboardInterrupt | SystemExit)
-                self.write("failed", "interrupted" if ended else str(error) or repr(error))
+                self.write("failed", "interrupted" if ended else one_line(error))
         except StoreError as failure:
             # It may be what ended the run, and must not hide that.
             _log.warning("how the run ended could not be written: %s", failure)
@@ -99,16 +99,6 @@ class Heartbeat:
                     self._is_lost = True
                     return
                 with self._writing:
-                    obstacle = self._obstacle()
-                    if obstacle:
-                        _log.warning("%s: %s", self._store.path, obstacle)
-                    self.write("running", obstacle)
+                    self.write("running", self.find_obstacle())
             except Exception as error:  # the store may answer again at the next beat
                 _log.warning("the run's record could not be written: %s", error)
-
-    def _obstacle(self) -> str:
-        try:
-            return self.find_obstacle()
-        except Exception as error:  # a cluster that is closing does not answer, but the run is alive
-            _log.debug("the cluster could not be asked: %r", error)
-            return ""

@@ -214,6 +214,25 @@ class Hierarchy:
         root["attributes"][DIGESTS] = self.digests
         self.location.write({ROOT: json.dumps(sealed(root)).encode()})
 
+    def differing_documents(self) -> dict[str, str]:
+        """Return what is wrong with the metadata that nodes have of their own, which readers of one array take."""
+        differing = {}
+        for name in filter(None, self.documents):
+            try:
+                document = self._read_document(name)
+            except StoreError as error:
+                differing[name] = error.what if isinstance(error, DamageError) else str(error)
+                continue
+            if document is None:
+                differing[name] = "its metadata are not there"
+            elif _shared(name, document) != _shared(name, self.documents[name]):
+                differing[name] = "its metadata are not those at the root of the store"
+        return differing
+
+    def restore_documents(self, names: Iterable[str]) -> None:
+        """Write the metadata of nodes again as the root has them."""
+        self.location.write({f"{name}/{ROOT}": json.dumps(self.documents[name]).encode() for name in names})
+
     def digest_stored(self, name: str) -> None:
         """Take what is stored of a small array for what was written."""
         for key in self.location.sizes(f"{name}/c"):
@@ -240,6 +259,12 @@ class Hierarchy:
             require_intact(self.path, document)
         check_documents(self.path, {name: document})
         return document
+
+
+def _shared(name: str, document: Document) -> Document:
+    """Return what a node and the root both say of it. The state of the latest run is in the group of records alone."""
+    alone = {"consolidated_metadata", *(["attributes"] if name == RECORDS else [])}
+    return {key: value for key, value in document.items() if key not in alone}
 
 
 def sealed(root: Document) -> Document:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.results.tables.formatting import middle_cut
 from sobolev_batch.results.tables.groups import families_of
+from sobolev_batch.visible import visible
 
 Reals = NDArray[np.float64]
 # Width and height in inches.
@@ -102,12 +103,12 @@ def notes_of(figure: Figure) -> list[str]:
 
 def escaped(text: str) -> str:
     """Return a name as Matplotlib shows it unchanged: dollars would begin a formula, a leading underscore hides it."""
-    return re.sub(r"^_", "\u2009_", text.replace("$", r"\$"))
+    return re.sub(r"^_", "\u2009_", visible(text).replace("$", r"\$"))
 
 
 def shortened(label: str, longest: int = _LONGEST_LABEL) -> str:
     """Return a label for a place with little room."""
-    return escaped(middle_cut(label, longest))
+    return escaped(middle_cut(visible(label), longest))
 
 
 def family_styles(tree: xr.DataTree) -> Mapping[str, Style]:

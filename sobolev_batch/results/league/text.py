@@ -33,7 +33,7 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     sections = []
     for one in leagues:
         count = len(one.scores.objects)
-        caption = prose(f"League at order {one.order:g}, over {count} object{'s' if count > 1 else ''}", style)
+        caption = prose([f"League at order {one.order:g}, over {count} object{'s' if count > 1 else ''}"], style)
         rows = [
             [
                 row.method,
@@ -46,10 +46,10 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
             for row in one.table.itertuples()
         ]
         headers = ["method", "rank", "relative", "95 % interval", "rate", "95 % interval"]
-        sections += [caption, printed_table(rows, headers, style), prose("\n".join(pair_lines(one)), style)]
-    notes = [LEAGUE_NOTE.format(x=leagues[0].x)]
+        sections += [caption, printed_table(rows, headers, style), prose(pair_lines(one), style)]
+    notes = LEAGUE_NOTE.format(x=leagues[0].x).splitlines()
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
-    return "\n\n".join([*filter(None, sections), prose("\n".join(notes), style)])
+    return "\n\n".join([*filter(None, sections), prose(notes, style)])
 
 
 def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
@@ -83,15 +83,15 @@ def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
         ]
         headers = ["method", "verdict", "new/old", "95 % interval", "p", "meshes", "largest new/old"]
         sections += [
-            prose(f"New study against the old one at order {order:g}", style),
+            prose([f"New study against the old one at order {order:g}"], style),
             printed_table(rows, headers, style),
         ]
     units = "objects" if (changes["objects"] > 1).all() else "meshes"
-    notes = [_CHANGES_NOTE.format(units=units)]
+    notes = _CHANGES_NOTE.format(units=units).splitlines()
     least = least_objects(changes["method"].nunique())
     if (changes[units] < least).any():
         notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
-    return "\n\n".join([*sections, prose("\n".join(notes), style)])
+    return "\n\n".join([*sections, prose(notes, style)])
 
 
 def pair_lines(one: League) -> list[str]:

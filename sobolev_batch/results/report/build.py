@@ -21,11 +21,12 @@ from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.spectra import Spectra
 from sobolev_batch.results.meshes.views import Axis, make_views
-from sobolev_batch.results.open import AnyStore, as_tree, fields_read, location_of
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read, location_of, require_unchanged
 from sobolev_batch.results.report.charts import chart_data, chart_omissions, league_data
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.report.pictures import league_pictures, study_pictures, unpictured
 from sobolev_batch.results.status import Status
+from sobolev_batch.visible import visible
 
 _FOLDER = "page"
 # Of the extra.
@@ -171,6 +172,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     charts = chart_data(tree, spectra, views, limits)
     pictures = study_pictures(tree, spectra, views)
     text = _filled("study", content, charts, spectra=spectra, views=views, pictures=pictures)
+    require_unchanged(tree)
     return Page(text, (*content.omissions, *chart_omissions(tree, charts, spectra, views), *unpictured(tree, pictures)))
 
 
@@ -196,6 +198,7 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_page_file),
         autoescape=True,
+        finalize=_shown,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -203,7 +206,7 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
     return environment.get_template(f"{template}.html.jinja").render(
         content=content,
         charts=charts,
-        data=htmlsafe_json_dumps(charts, allow_nan=False, separators=(",", ":")),
+        data=htmlsafe_json_dumps(_shown_data(charts), allow_nan=False, separators=(",", ":")),
         style=_page_file("report.css"),
         library=base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii"),
         scripts=scripts,
@@ -213,6 +216,21 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
         written=utc_text(utc_now()),
         **values,
     )
+
+
+def _shown(value: Any) -> Any:
+    """Return what a page shows of a value; style sheet, scripts and JSON are ours, and marked as safe."""
+    return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
+
+
+def _shown_data(value: Any) -> Any:
+    """Return data of charts with texts as they are shown."""
+    match value:
+        case dict():
+            return {key: _shown_data(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return list(map(_shown_data, value))
+    return _shown(value)
 
 
 def _page_file(name: str) -> str:

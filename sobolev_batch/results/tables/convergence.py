@@ -223,7 +223,7 @@ def format_table(
     if style in ("csv", "json"):
         return machine_table(frame, style)
     return "\n\n".join(
-        [*_tables(tree, frame, style), prose("\n".join(_notes(tree, frame, x)), style), *_remarks(tree, frame, style)]
+        [*_tables(tree, frame, style), prose(_notes(tree, frame, x), style), *_remarks(tree, frame, style)]
     )
 
 
@@ -238,8 +238,8 @@ def format_tables(
     sections: list[str] = []
     for name, frame in frames.items():
         tree = trees[name]
-        sections += [prose(f"Object {name}", style), *_tables(tree, frame, style), *_remarks(tree, frame, style)]
-    return "\n\n".join([*sections, prose("\n".join(_notes(tree, frame, x)), style)])
+        sections += [prose([f"Object {name}"], style), *_tables(tree, frame, style), *_remarks(tree, frame, style)]
+    return "\n\n".join([*sections, prose(_notes(tree, frame, x), style)])
 
 
 def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
@@ -257,7 +257,7 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
 def _remarks(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
     """Return what failed and what is doubtful, as one paragraph, or nothing."""
     remarks = [*_failures(tree, frame), *(f"{mesh}: {doubt}" for mesh, doubt in doubts_of(tree).items())]
-    return [prose("\n".join(remarks), style)] if remarks else []
+    return [prose(remarks, style)] if remarks else []
 
 
 def _section(caption: str, frame: pd.DataFrame, group: str, style: Format, sentence: str = "") -> str:
@@ -265,7 +265,11 @@ def _section(caption: str, frame: pd.DataFrame, group: str, style: Format, sente
     columns = [column for column in _COLUMNS if column.group == group]
     headers = ["mesh", *(column.header for column in columns)]
     cells = [[row["mesh"], *(column.text_cell(row) for column in columns)] for row in shown_rows(frame)]
-    parts = [prose(caption, style), printed_table(cells, headers, style), prose(sentence, style) if sentence else ""]
+    parts = [
+        prose([caption], style),
+        printed_table(cells, headers, style),
+        prose([sentence] if sentence else [], style),
+    ]
     return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
 
 
@@ -310,13 +314,13 @@ def shown_rows(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _notes(tree: xr.DataTree, frame: pd.DataFrame, x: str) -> list[str]:
-    notes = [_NOTE, *([] if x == "edge_length" else [f"Rates are those of distance ~ ({x})^-rate."])]
+    notes = [*_NOTE.splitlines(), *([] if x == "edge_length" else [f"Rates are those of distance ~ ({x})^-rate."])]
     if has_proximity(tree):
-        notes.append(_PROXIMITY_NOTE)
+        notes += _PROXIMITY_NOTE.splitlines()
     if "rtol" in frame.attrs:
-        notes.append(_ACCURACY_NOTE.format(rtol=frame.attrs["rtol"]))
+        notes += _ACCURACY_NOTE.format(rtol=frame.attrs["rtol"]).splitlines()
     if "computed" in frame.attrs:
-        notes.append(order_note(tree, frame.attrs["computed"]))
+        notes += order_note(tree, frame.attrs["computed"])
     return notes
 
 

@@ -128,8 +128,8 @@ def format_evolution(
         moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
         separator = "\n" if style == "latex" else "\n\n"
         table = printed_table(cells, ["time", *families], style)
-        sections.append(separator.join([prose(caption, style), table, prose("\n".join(moments), style)]))
-    return "\n\n".join([*sections, prose(_NOTE.format(factor=factor), style)])
+        sections.append(separator.join([prose([caption], style), table, prose(moments, style)]))
+    return "\n\n".join([*sections, prose(_NOTE.format(factor=factor).splitlines(), style)])
 
 
 def _labels_by_time(meshes: xr.Dataset) -> dict[str, dict[float, str]]:

@@ -154,11 +154,13 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     for order in chosen:
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
         rows = _Rows.of(distances, values, errors)
-        caption = prose(f"Sobolev distances of order {order:g}, {unit}", style)
+        caption = prose([f"Sobolev distances of order {order:g}, {unit}"], style)
         tables = [rows.table(columns, style) for columns in rows.column_groups(style)]
         sections.append("\n\n".join([caption, *tables]))
-    notes = [_NOTE, *([order_note(tree, distances.attrs["computed"])] if "computed" in distances.attrs else [])]
-    return "\n\n".join([*sections, prose("\n".join(notes), style)])
+    notes = _NOTE.splitlines()
+    if "computed" in distances.attrs:
+        notes += order_note(tree, distances.attrs["computed"])
+    return "\n\n".join([*sections, prose(notes, style)])
 
 
 def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:

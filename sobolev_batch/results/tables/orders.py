@@ -10,6 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.batch.analysis.datasets import DistancesToReference, convergence_dataset, distances_dataset
+from sobolev_batch.results.open import require_unchanged
 from sobolev_batch.results.store_accessor import StoreAccessor, stored_fields
 from sobolev_batch.results.tables.groups import finished_group, metadata_of, reference_of
 from sobolev_batch.results.tables.sizes import is_sequence
@@ -54,6 +55,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
         return stored.sel(order=chosen)
     fields, meshes, rows = stored_fields(tree), finished_group(tree, "meshes"), _rows(tree)
     results, numbers = fields.results(others, every_pair=False), _numbers(meshes)
+    require_unchanged(tree)
     to_reference = DistancesToReference(
         reference_of(tree),
         NormEstimate(*results.to_reference[..., numbers]),
@@ -82,6 +84,7 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     fields, every_pair = stored_fields(tree), stored.sizes["other"] == stored.sizes["mesh"]
     rows, numbers = _rows(tree), _numbers(finished_group(tree, "meshes"))
     distances = fields.results(others, every_pair=every_pair).distances[..., numbers, :]
+    require_unchanged(tree)
     to_rows = rows if every_pair else [row for row in rows if row.label == reference_of(tree)]
     estimate = NormEstimate(*distances[..., numbers if every_pair else [0]])
     return _joined(stored, distances_dataset(rows, to_rows, others, estimate), chosen)
@@ -99,17 +102,17 @@ def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
     return StoreAccessor(tree).norm(reference, order)
 
 
-def order_note(tree: xr.DataTree, orders: Sequence[float]) -> str:
-    """Return what orders that were computed from the fields rest on, as a note of a table."""
+def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
+    """Return what orders that were computed from the fields rest on, as lines of a note of a table."""
     fields = stored_fields(tree)
     frequencies = f"frequencies up to {fields.lattice.xi_max:g} on each axis"
     if fields.tail is not None:
         frequencies = f"{frequencies}, and samples in octaves up to {fields.tail.highest_frequency:.4g}"
-    return (
-        f"Not of the study, but computed now from its stored fields: order {', '.join(f'{s:g}' for s in orders)}.\n"
-        f"They hold {frequencies}.\n"
-        "What lies beyond is in the errors, which grow at orders nearer to -1/2."
-    )
+    return [
+        f"Not of the study, but computed now from its stored fields: order {', '.join(f'{s:g}' for s in orders)}.",
+        f"They hold {frequencies}.",
+        "What lies beyond is in the errors, which grow at orders nearer to -1/2.",
+    ]
 
 
 def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:

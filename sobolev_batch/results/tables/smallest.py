@@ -90,8 +90,8 @@ def format_smallest(
         cells = [_cells(row) for row in rows.to_dict(orient="records")]
         separator = "\n" if style == "latex" else "\n\n"
         headers = ["family", "mesh", "triangles", "relative", "remark"]
-        sections.append(separator.join([prose(caption, style), printed_table(cells, headers, style)]))
-    return "\n\n".join([*sections, prose(_NOTE, style)])
+        sections.append(separator.join([prose([caption], style), printed_table(cells, headers, style)]))
+    return "\n\n".join([*sections, prose(_NOTE.splitlines(), style)])
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import pandas as pd
 from tabulate import tabulate
 
 from sobolev_batch.results.tables.defaults import Format
 from sobolev_batch.results.tables.formatting import latex_powers, middle_cut
+from sobolev_batch.visible import visible
 
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 
@@ -18,12 +21,22 @@ LINE_LENGTH = 100
 _SHORTEST_LABEL = 20
 # Spaces between columns, and beside headers, by tabulate.
 _GAP, _PADDING = 2, 2
+# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia the wide ones, too.
+_FORMULA_SIGNS = tuple("=+-@＝＋－＠")
+# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
+# underscores within words do not begin.
+_MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
+# After the end of a row, LaTeX takes these for options of that end.
+_LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:
-    """Return a table as CSV or JSON; missing numbers are blank or null."""
+    """Return a table as CSV or JSON, which spells control characters itself; missing numbers are blank or null."""
     if style == "csv":
-        return str(frame.to_csv(index=False, lineterminator="\n")).rstrip("\n")
+        texts = frame.rename(columns=_csv_cell).apply(
+            lambda cells: cells if pd.api.types.is_numeric_dtype(cells) else cells.map(_csv_cell)
+        )
+        return str(texts.to_csv(index=False, lineterminator="\n")).rstrip("\n")
     records = frame.astype(object).where(frame.notna(), None).to_dict(orient="records")
     return json.dumps(records, indent=2, allow_nan=False)
 
@@ -31,10 +44,10 @@ def machine_table(frame: pd.DataFrame, style: Format) -> str:
 def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format) -> str:
     """Return cells as a table whose columns are aligned to the right, but for the first.
 
-    In a text the labels of the first column are cut in their middle where lines would be too long.
+    In a text the labels of the first column are cut in their middle where lines would be too long. LaTeX's special
+    characters are escaped by tabulate.
     """
-    if style == "markdown":
-        rows, headers = [[_escaped(cell) for cell in row] for row in rows], [_escaped(text) for text in headers]
+    rows, headers = [[_shown(cell, style) for cell in row] for row in rows], [_shown(text, style) for text in headers]
     if style == "text":
         rows = _with_short_labels(rows, headers)
     table = str(
@@ -46,7 +59,7 @@ def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: 
             colalign=("left", *["right"] * (len(headers) - 1)),
         )
     )
-    return latex_powers(table) if style == "latex" else table
+    return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
 
 
 def _with_short_labels(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> Sequence[Sequence[str]]:
@@ -57,11 +70,18 @@ def _with_short_labels(rows: Sequence[Sequence[str]], headers: Sequence[str]) ->
     return cut if len({row[0] for row in cut}) == len({row[0] for row in rows}) else rows
 
 
-def _escaped(cell: str) -> str:
-    """Return a cell of Markdown whose bars divide nothing."""
-    return cell.replace("|", "\\|")
-
-
-def prose(text: str, style: Format) -> str:
+def prose(lines: Iterable[str], style: Format) -> str:
     """Return lines that stand beside tables; LaTeX takes them as comments."""
-    return "\n".join(f"% {line}" for line in text.split("\n")) if style == "latex" else text
+    return "\n".join(f"{'% ' * (style == 'latex')}{_shown(line, style)}" for line in lines)
+
+
+def _shown(text: str, style: Format) -> str:
+    """Return a text whose characters have no meaning of their own to terminals and Markdown."""
+    return _MARKDOWN_MARKS.sub(r"\\\g<0>", visible(text)) if style == "markdown" else visible(text)
+
+
+def _csv_cell(value: Any) -> Any:
+    """Return a cell that no spreadsheet takes for a formula; an apostrophe makes it a text."""
+    if not isinstance(value, str):
+        return value
+    return f"'{visible(value)}" if value.startswith(_FORMULA_SIGNS) else visible(value)

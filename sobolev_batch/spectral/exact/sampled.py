@@ -25,7 +25,8 @@ Complexes = NDArray[np.complex128]
 _LEAST_PRODUCT = 2e-3
 # If the longest edge is below this many radians, most triangles would go through the stable form.
 _FINE_MESH = 0.5
-# Pairs of a triangle and a frequency at a time: their temporaries stay in cache.
+# Pairs of a triangle and a frequency at a time, and so many triangles at most: their temporaries stay in cache. Those
+# of all triangles of a fine mesh, on every thread, would take gigabytes.
 _PAIRS = 1 << 14
 
 
@@ -47,14 +48,18 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     values = np.empty(len(frequencies), dtype=np.complex128)
     values[fine] = exact_transform(mesh, frequencies[fine])
     parts = np.array_split(frequencies[~fine], threads)
-    with ThreadPoolExecutor(threads) as pool:
-        values[~fine] = np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.of(mesh)), parts)))
+    others = np.zeros(np.count_nonzero(~fine), dtype=np.complex128)
+    if others.size:
+        with ThreadPoolExecutor(threads) as pool:
+            for _, batch in mesh.batches(_PAIRS):
+                others += np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.of(batch)), parts)))
+    values[~fine] = others
     return values
 
 
 @dataclass(frozen=True, eq=False)
 class _Triangles:
-    """Triangles of a mesh in arrays of one row per axis or corner.
+    """Triangles of a batch in arrays of one row per axis or corner.
 
     Attributes:
         vertices: Coordinates, float64 (3, n).

@@ -16,12 +16,12 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.machine import available
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends.machine import available
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.reference import ReferenceEstimate

@@ -16,6 +16,10 @@ Reals = NDArray[np.float64]
 
 # Normals whose entries agree to this many parts are one direction.
 _DIRECTION_PARTS = 500
+# Numbers that an entry can be rounded to; three of them make a key of 32 bits.
+_KEYS_PER_AXIS = 2 * _DIRECTION_PARTS + 1
+# Triangles whose normals are taken at a time.
+_BATCH = 1 << 14
 # A direction counts if the faces along it hold this fraction of the area; so many directions at most.
 _LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
 # κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
@@ -91,22 +95,38 @@ def without_sign(normals: Reals) -> Reals:
 
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
-    corners = mesh.vertices[mesh.triangles]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(crosses, axis=1)
-    kept = doubled > 0
-    normals, areas, corners = crosses[kept] / doubled[kept, None], doubled[kept] / 2, corners[kept]
-    normals = without_sign(normals)
-    _, members = np.unique(np.round(normals * _DIRECTION_PARTS), axis=0, return_inverse=True)
-    members = members.ravel()
+    count = len(mesh.triangles)
+    normals, areas, keys = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int32)
+    # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
+    for start in range(0, count, _BATCH):
+        part = slice(start, start + _BATCH)
+        normals[part], areas[part] = _normals_and_areas(mesh, part)
+        keys[part] = _keys(normals[part])
+    _, members = np.unique(keys, return_inverse=True)
     sums = np.bincount(members, weights=areas)
     largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
     largest = largest[sums[largest] > _LEAST_SHARE * areas.sum()]
-    faces = [members == group for group in largest]
-    directions = np.array([areas[face] @ normals[face] for face in faces]).reshape(-1, 3)
+    directions, sizes = np.empty((len(largest), 3)), np.empty(len(largest))
+    for number, group in enumerate(largest):
+        face = members == group
+        directions[number] = areas[face] @ normals[face]
+        used = np.zeros(len(mesh.vertices), dtype=bool)
+        used[mesh.triangles[face]] = True
+        # Between the width of one triangle and that of all faces along the normal: spots of both lie there.
+        sizes[number] = np.sqrt(np.ptp(mesh.vertices[used], axis=0).max() * np.sqrt(areas[face].mean()))
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    # Between the width of one triangle and that of all faces along the normal: spots of both lie there.
-    sizes = [
-        np.sqrt(np.ptp(corners[face].reshape(-1, 3), axis=0).max() * np.sqrt(areas[face].mean())) for face in faces
-    ]
-    return directions, sums[largest], np.array(sizes)
+    return directions, sums[largest], sizes
+
+
+def _normals_and_areas(mesh: Mesh, part: slice) -> tuple[Reals, Reals]:
+    """Return the unit normals (k, 3), without sign, and areas (k,) of some triangles; 0 for those without area."""
+    a, b, c = mesh.corners(part)
+    crosses = np.cross(b - a, c - a)
+    doubled = np.linalg.norm(crosses, axis=1)
+    return without_sign(crosses / np.where(doubled > 0, doubled, 1.0)[:, None]), doubled / 2
+
+
+def _keys(normals: Reals) -> NDArray[np.int32]:
+    """Return a number for each unit normal (k, 3), the same for those that count as one direction."""
+    x, y, z = np.round(normals * _DIRECTION_PARTS).astype(np.int32).T
+    return np.asarray((x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z)

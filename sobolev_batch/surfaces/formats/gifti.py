@@ -11,18 +11,19 @@ import math
 import zlib
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import nibabel
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.raw_files import unpacked_limit
+from sobolev_batch.surfaces.formats.raw_files import parse_xml, unpacked_limit
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
 
 _MOST_DIMENSIONS = 6
+# Arrays of a file, for each of which the library makes objects of kilobytes.
+_MOST_ARRAYS = 10_000
 _CHUNK_BYTES = 1 << 20
 
 
@@ -62,18 +63,9 @@ class _XmlCheck:
         self._arrays = 0
         self._encoding, self._bytes = "", 0
         self._texts: list[str] | None = None
-        parser = expat.ParserCreate()
-        parser.buffer_text = True
-        parser.EntityDeclHandler = self._entity
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.CharacterDataHandler = self._text
-        parser.Parse(data, True)
+        parse_xml(data, "GIFTI", self._start, self._end, self._text)
         if self._announced is not None and self._announced != self._arrays:
             raise MeshError(f"the GIFTI header announces {self._announced} arrays, found {self._arrays}")
-
-    def _entity(self, name: str, *_: object) -> None:
-        raise MeshError(f"the XML declares the entity {name[:40]!r}; a GIFTI file has none, write it without")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         # The library, too, takes the text before an inner element as all of the data.
@@ -82,6 +74,8 @@ class _XmlCheck:
             self._announced = int(attributes["NumberOfDataArrays"])
         elif name == "DataArray":
             self._arrays += 1
+            if self._arrays > _MOST_ARRAYS:
+                raise MeshError(f"the file has more than {_MOST_ARRAYS} arrays; save it with the surface alone")
             self._encoding = attributes.get("Encoding", "")
             if attributes.get("ExternalFileName") or "External" in self._encoding:
                 raise MeshError("its data lie in another file; write it with them inside")

@@ -26,6 +26,8 @@ Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Bytes of memory while a byte of a buffer is read.
+_MEMORY_FACTOR = 10.6
 # Required extensions that do not change the positions of vertices.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "KHR_xmp")
 
@@ -132,7 +134,9 @@ class _Buffers:
         beside = _beside(self._path, uri)
         if beside not in self._files:
             try:
-                self._files[beside] = read_regular(beside, gzipped=False)
+                self._files[beside] = read_regular(
+                    beside, gzipped=False, factor=_MEMORY_FACTOR, held_bytes=self.loaded_bytes
+                )
             except MeshError as error:
                 raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
         return self._files[beside]

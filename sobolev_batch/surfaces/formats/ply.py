@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.polygons import triangle_fans_of_lists
+from sobolev_batch.surfaces.formats.text_formats import LONGEST_LINE
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
@@ -24,6 +26,7 @@ Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 HEADER_BYTES = 1 << 16
 
 _END = b"end_header"
+_LINE = re.compile(rb"\S[^\r\n]*")
 _CORNERS = ("vertex_indices", "vertex_index")
 _MOST_DIGITS = 18
 _SHORT, _LONG = (b"short", b"ushort", b"int16", b"uint16"), (b"int", b"uint", b"float", b"int32", b"uint32", b"float32")
@@ -83,10 +86,21 @@ def _checked_header(data: bytes, what: str, *needed: str) -> _Header:
     if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
     entries = sum(counts.values())
-    lines = sum(1 for line in data[start:].splitlines()[1:] if line.strip()) if header.text else entries
+    lines = _line_count(data, start) if header.text else entries
     if lines != entries:
         raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
     return header
+
+
+def _line_count(data: bytes, start: int) -> int:
+    """Return the number of lines of a text that are not empty, after the one that begins at a place."""
+    count = 0
+    # From the first visible character of each line on: no list of all lines, and no line looked through twice.
+    for line in _LINE.finditer(data, start):
+        if line.end() - line.start() > LONGEST_LINE:
+            raise MeshError(f"a line of the PLY file has more than {LONGEST_LINE} characters; cut its polygon")
+        count += 1
+    return count - 1
 
 
 @contextmanager

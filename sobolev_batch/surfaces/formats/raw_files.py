@@ -1,23 +1,34 @@
-"""Bytes of files: regular ones only, unpacked where they are gzipped, and never more than is sensible."""
+"""Bytes and XML of files: regular ones only, unpacked where they are gzipped, and never more than is sensible."""
 
 from __future__ import annotations
 
 import errno
 import gzip
+import io
 import os
 import stat
 import zlib
+from collections.abc import Callable
 from io import BufferedReader
 from pathlib import Path
 from typing import IO, cast
+from xml.parsers import expat
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.machine import MachineMemory
+from sobolev_batch.parameters import format_bytes
 
 # No larger file is read; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
 # Mesh files shrink to a tenth at best: packed ones may grow by such a factor, or to a harmless size.
 _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
 _CHUNK_BYTES = 1 << 20
+# Part of the machine's memory that reading a file may take; others use it too.
+_MEMORY_PART = 0.75
+# XML that parsers would hold in memory many times over: one tag with its attributes, comment or instruction, elements
+# within each other, and elements in all. Those of surfaces are a few hundred bytes, five deep and a few hundred.
+_LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 20, 100, 100_000
+_XML_BYTES = 1 << 16
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -52,8 +63,28 @@ def is_gzipped(path: Path) -> bool:
     return path.name.lower().endswith(".gz")
 
 
-def read_regular(path: Path, *, gzipped: bool) -> bytes:
+def require_memory_to_read(needed_bytes: float) -> None:
+    """Refuse a file, before it is read, that takes more memory than reading may.
+
+    Raises:
+        MeshError: It does; the message does not name the file.
+    """
+    memory = MachineMemory.found()
+    if needed_bytes > _MEMORY_PART * memory.total_bytes:
+        raise MeshError(
+            f"takes up to {format_bytes(needed_bytes)} of memory to read, and may take {_MEMORY_PART:.0%} of "
+            f"{format_bytes(memory.total_bytes)}, {memory.source}; read it where there is more, or give a coarser mesh"
+        )
+
+
+def read_regular(path: Path, *, gzipped: bool, factor: float, held_bytes: int = 0) -> bytes:
     """Return the bytes of a regular file.
+
+    Args:
+        path: Path of the file.
+        gzipped: True where it is to be unpacked.
+        factor: Bytes of memory that reading takes for each byte, unpacked.
+        held_bytes: Bytes that were read before for the same mesh.
 
     Raises:
         MeshError: The file cannot be read, is empty, or is too large; the message does not name it.
@@ -62,29 +93,29 @@ def read_regular(path: Path, *, gzipped: bool) -> bytes:
         with open_regular(path) as file:
             length = checked_length(file)
             if gzipped:
-                most = unpacked_limit(length)
-                with gzip.GzipFile(fileobj=file) as unpacked:
-                    data = _read_bounded(cast(IO[bytes], unpacked), most)
+                data = _read_unpacked_bounded(file, length, factor)
             else:
-                most = _LARGEST_BYTES
-                data = _read_bounded(file, most)
+                require_memory_to_read(factor * (held_bytes + length))
+                data = file.read(length)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if len(data) > most:
-        raise MeshError(f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks so much")
     if not data:
         raise MeshError("the file is empty")
     return data
 
 
-def read_unpacked(path: Path) -> bytes:
+def read_unpacked(path: Path, factor: float) -> bytes:
     """Return the bytes of a file, unpacked if its name ends in .gz.
+
+    Args:
+        path: Path of the file.
+        factor: Bytes of memory that reading takes for each byte, unpacked.
 
     Raises:
         MeshError: The file cannot be read, is empty, or is too large; the message starts with its path.
     """
     try:
-        return read_regular(path, gzipped=is_gzipped(path))
+        return read_regular(path, gzipped=is_gzipped(path), factor=factor)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 
@@ -94,11 +125,84 @@ def unpacked_limit(packed_bytes: int) -> int:
     return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
 
 
-def _read_bounded(file: IO[bytes], most: int) -> bytes:
-    """Return all of a file, or a little more than the bound; one large read would reserve the bound at once."""
-    chunks = []
-    total = 0
-    while total <= most and (chunk := file.read(_CHUNK_BYTES)):
-        chunks.append(chunk)
-        total += len(chunk)
-    return b"".join(chunks)
+def parse_xml(
+    data: bytes,
+    kind: str,
+    start: Callable[[str, dict[str, str]], None],
+    end: Callable[[str], None],
+    text: Callable[[str], None],
+) -> None:
+    """Parse XML a little at a time, and refuse what would take memory out of proportion.
+
+    Args:
+        data: Contents of the file.
+        kind: Name of the format, as messages name it.
+        start: Called with the name and the attributes of each element.
+        end: Called with its name where it ends.
+        text: Called with pieces of text.
+
+    Raises:
+        MeshError: There are entities, or more and longer elements than any surface has.
+    """
+    heard = depth = elements = 0
+
+    def refuse_entity(name: str, *_: object) -> None:
+        raise MeshError(f"the XML declares the entity {name[:40]!r}; a {kind} file has none, write it without")
+
+    def hear(_: str) -> None:
+        nonlocal heard
+        heard += 1
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        nonlocal heard, depth, elements
+        heard, depth, elements = heard + 1, depth + 1, elements + 1
+        if depth > _DEEPEST or elements > _MOST_ELEMENTS:
+            raise MeshError(
+                f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {_MOST_ELEMENTS} "
+                f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
+            )
+        start(name, attributes)
+
+    def finish(name: str) -> None:
+        nonlocal heard, depth
+        heard, depth = heard + 1, depth - 1
+        end(name)
+
+    def take(piece: str) -> None:
+        hear(piece)
+        text(piece)
+
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.EntityDeclHandler = refuse_entity
+    parser.StartElementHandler, parser.EndElementHandler = begin, finish
+    parser.CharacterDataHandler, parser.DefaultHandlerExpand = take, hear
+    silent, before = 0, 0
+    for place in range(0, len(data), _XML_BYTES):
+        parser.Parse(memoryview(data)[place : place + _XML_BYTES], False)
+        # The parser tells of text at once, and keeps everything else until it is complete.
+        silent = silent + _XML_BYTES if heard == before else 0
+        before = heard
+        if silent > _LONGEST_MARKUP:
+            raise MeshError(
+                f"the XML has an attribute, name or comment of more than {_LONGEST_MARKUP} bytes, which goes on "
+                f"at byte {place + _XML_BYTES}; a {kind} file has none, write it without"
+            )
+    parser.Parse(b"", True)
+
+
+def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes:
+    """Return what a packed file holds; it is refused as soon as that exceeds a bound."""
+    most = unpacked_limit(length)
+    data = io.BytesIO()
+    with gzip.GzipFile(fileobj=file) as unpacked:
+        # One large read would reserve the bound at once.
+        while chunk := cast(IO[bytes], unpacked).read(_CHUNK_BYTES):
+            data.write(chunk)
+            if data.tell() > most:
+                raise MeshError(
+                    f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks so much"
+                )
+            if data.tell() > _HARMLESS_BYTES:
+                require_memory_to_read(factor * data.tell())
+    return data.getvalue()

@@ -22,6 +22,7 @@ from sobolev_batch.surfaces.formats.raw_files import (
     is_gzipped,
     open_regular,
     read_unpacked,
+    require_memory_to_read,
     unpacked_limit,
 )
 from sobolev_batch.surfaces.formats.stl import parse_stl
@@ -45,9 +46,9 @@ _TEXT_FACTOR, _VERTEX_MEMORY = 7.0, 70.0
 # Bytes of each triangle, in a file of nothing but positions and triangles, and at the measured peak of reading it.
 _BYTES_PER_TRIANGLE = {
     ".ply": (19, 90),
-    ".obj": (35, 420),
+    ".obj": (35, 240),
     ".stl": (50, 270),
-    ".off": (35, 1050),
+    ".off": (35, 240),
     ".gltf": (18, 190),
     ".glb": (18, 190),
     ".gii": (10, 90),
@@ -86,7 +87,7 @@ def read_mesh(path: str | Path) -> Mesh:
     suffix = mesh_format(path).removesuffix(".gz")
     if suffix not in _PARSERS:
         raise MeshError(f"{path}: {_how_to_convert(path)}")
-    data = [read_unpacked(path)]
+    data = [_checked_bytes(path)]
     try:
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
@@ -104,6 +105,22 @@ def read_mesh(path: str | Path) -> Mesh:
         raise MeshError(
             f"{path}: not a readable {suffix.removeprefix('.')} file: {type(error).__name__}: {_shortened(error)}"
         ) from error
+
+
+def _checked_bytes(path: Path) -> bytes:
+    """Return the bytes of a file that there is the memory to read."""
+    try:
+        # The header of a PLY file tells more than its length.
+        require_memory_to_read(expected_size(path)[1])
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    return read_unpacked(path, memory_factor(path))
+
+
+def memory_factor(path: Path) -> float:
+    """Return the bytes of memory that reading takes for each byte of a mesh file, unpacked."""
+    file_bytes, memory_bytes = _BYTES_PER_TRIANGLE[mesh_format(path).removesuffix(".gz")]
+    return memory_bytes / file_bytes
 
 
 def expected_size(path: Path) -> tuple[int, float]:
@@ -194,7 +211,7 @@ def companion_files(path: Path) -> list[Path]:
     if mesh_format(path).removesuffix(".gz") not in (".gltf", ".glb"):
         return []
     try:
-        return buffer_paths(read_unpacked(path), path)
+        return buffer_paths(read_unpacked(path, memory_factor(path)), path)
     except MeshError:
         raise
     except Exception as error:

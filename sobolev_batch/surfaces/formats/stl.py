@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.polygons import merge_coincident
-from sobolev_batch.surfaces.formats.text_formats import decoded_text, parsed_numbers
+from sobolev_batch.surfaces.formats.text_formats import parsed_numbers, text_lines
 
 Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
 
@@ -37,9 +39,9 @@ def parse_stl(data: bytes) -> Raw:
 
 
 def _text_corners(data: bytes) -> NDArray[np.float64]:
-    corners: list[list[float]] = []
+    corners = array("d")
     facet, facet_corners, in_solid = 0, 0, False
-    for line in decoded_text(data).split("\n"):
+    for line in text_lines(data):
         words = line.split()
         match words[0].lower() if words else "":
             case "":
@@ -51,7 +53,7 @@ def _text_corners(data: bytes) -> NDArray[np.float64]:
             case "vertex":
                 if len(words) != 4:
                     raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
-                corners.append(parsed_numbers(words[1:], f"facet {facet}"))
+                corners.extend(parsed_numbers(words[1:], f"facet {facet}"))
                 facet_corners += 1
             case "endfacet":
                 if facet_corners != 3:
@@ -63,4 +65,4 @@ def _text_corners(data: bytes) -> NDArray[np.float64]:
                 raise MeshError(f"after facet {facet}: {other[:40]!r} is no word of an STL file")
     if in_solid or facet_corners:
         raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
-    return np.array(corners, dtype=np.float64).reshape(-1, 3)
+    return np.array(corners).reshape(-1, 3)

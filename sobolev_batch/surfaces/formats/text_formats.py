@@ -6,7 +6,11 @@ they expect. This reader checks every line and every announced count.
 
 from __future__ import annotations
 
+import io
 import re
+from array import array
+from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +27,8 @@ _OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 # Digits of an index or count: all that fit into 64 bits.
 _MOST_DIGITS = 18
+# Characters of a line: a polygon of a hundred thousand corners.
+LONGEST_LINE = 1 << 20
 
 
 def parse_obj(data: bytes) -> Raw:
@@ -31,27 +37,24 @@ def parse_obj(data: bytes) -> Raw:
     Raises:
         MeshError: A vertex or face line is malformed; the message counts them from 1.
     """
-    vertices: list[list[float]] = []
-    corners: list[int] = []
-    sizes: list[int] = []
-    lines = decoded_text(data).replace("\\\n", " ").split("\n")
-    # Without a line end, the last corner may have lost digits: then it seldom has as many slashes as the others.
-    if lines[-1].startswith("f ") and len({word.count("/") for word in lines[-1].split()[1:]}) > 1:
-        raise MeshError("the OBJ file breaks off in its last line")
-    for line in lines:
-        words = line.partition("#")[0].split()
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    last = ""
+    for last in _joined_lines(data):
+        words = last.partition("#")[0].split()
         if not words:
             continue
         if words[0] == "v":
+            number = len(vertices) // 3 + 1
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
-                raise MeshError(f"vertex {len(vertices) + 1} has {len(words) - 1} coordinates, expected three")
-            vertices.append(parsed_numbers(words[1:4], f"vertex {len(vertices) + 1}"))
+                raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
+            vertices.extend(parsed_numbers(words[1:4], f"vertex {number}"))
         elif words[0] == "f":
-            corners += (_obj_corner(word, len(vertices), len(sizes) + 1) for word in words[1:])
+            corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangle_fans(
-        np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
-    )
+    # Without a line end, the last corner may have lost digits: then it seldom has as many slashes as the others.
+    if last.startswith("f ") and last[-1] != "\n" and len({word.count("/") for word in last.split()[1:]}) > 1:
+        raise MeshError("the OBJ file breaks off in its last line")
+    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
 
 
 def parse_off(data: bytes) -> Raw:
@@ -60,37 +63,73 @@ def parse_off(data: bytes) -> Raw:
     Raises:
         MeshError: The counts do not fit the lines, or a line is malformed.
     """
-    text = decoded_text(data)
-    if text and not text.endswith("\n"):
-        # Without a line end, the last number may have lost digits.
-        last = text.rsplit("\n", 1)[-1].partition("#")[0].split()
-        if last and not _complete_face(last):
-            raise MeshError("the OFF file breaks off in its last line")
-    lines = [words for line in text.split("\n") if (words := line.partition("#")[0].split())]
-    kind = re.fullmatch(r"(C?N?)OFF", lines[0][0]) if lines else None
+    filled, last = 0, ""
+    for last in text_lines(data):
+        filled += bool(last.partition("#")[0].strip())
+    # Without a line end, the last number may have lost digits.
+    if last[-1:] != "\n" and (words := last.partition("#")[0].split()) and not _complete_face(words):
+        raise MeshError("the OFF file breaks off in its last line")
+    lines = (words for line in text_lines(data) if (words := line.partition("#")[0].split()))
+    first = next(lines, [""])
+    kind = re.fullmatch(r"(C?N?)OFF", first[0])
     if kind is None:
         raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
-    counts, rows = (lines[0][1:], lines[1:]) if len(lines[0]) > 1 else (lines[1] if lines[1:] else [], lines[2:])
+    counts = first[1:] or next(lines, [])
     if len(counts) not in (2, 3) or not all(map(_is_count, counts)):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
-    if vertex_count + face_count != len(rows):
+    found = filled - (1 if first[1:] else 2)
+    if vertex_count + face_count != found:
         raise MeshError(
             f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
-            f"{face_count} for faces, found {len(rows)}"
+            f"{face_count} for faces, found {found}"
         )
-    vertices = [
-        _off_vertex(words, number, 3 + _OFF_EXTRAS[kind[1]]) for number, words in enumerate(rows[:vertex_count], 1)
-    ]
-    polygons = [_off_polygon(words, number) for number, words in enumerate(rows[vertex_count:], 1)]
-    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangle_fans(corners, sizes)
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    for number, words in enumerate(islice(lines, vertex_count), 1):
+        vertices.extend(_off_vertex(words, number, 3 + _OFF_EXTRAS[kind[1]]))
+    for number, words in enumerate(lines, 1):
+        polygon = _off_polygon(words, number)
+        corners.extend(polygon)
+        sizes.append(len(polygon))
+    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
 
 
-def decoded_text(data: bytes) -> str:
-    """Return the text of a file with line feeds at the ends of its lines."""
-    return data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+def text_lines(data: bytes, errors: str = "replace") -> Iterator[str]:
+    """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack.
+
+    Args:
+        data: Contents of the file, in UTF-8.
+        errors: What happens to other bytes, as Python names it.
+
+    Raises:
+        MeshError: A line is longer than any mesh needs.
+    """
+    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors=errors)
+    number = 0
+    while line := reader.readline(LONGEST_LINE + 1):
+        number += 1
+        if len(line) > LONGEST_LINE:
+            raise MeshError(f"line {number} has more than {LONGEST_LINE} characters; cut its polygon into smaller ones")
+        yield line
+
+
+def _joined_lines(data: bytes) -> Iterator[str]:
+    """Yield the lines of an OBJ file, where one that ends in a backslash goes on in the next."""
+    parts: list[str] = []
+    length = 0
+    for line in text_lines(data):
+        is_continued = line.endswith("\\\n")
+        parts.append(f"{line[:-2]} " if is_continued else line)
+        length += len(line)
+        if length > LONGEST_LINE:
+            raise MeshError(
+                f"a line goes on for more than {LONGEST_LINE} characters; cut its polygon into smaller ones"
+            )
+        if not is_continued:
+            yield "".join(parts)
+            parts, length = [], 0
+    if parts:
+        yield "".join(parts)
 
 
 def _is_count(word: str) -> bool:

@@ -76,7 +76,7 @@ def shared_triangles(
     """
     in_first, in_second = np.zeros(len(first), dtype=bool), np.zeros(len(second), dtype=bool)
     # Most triangles that only one mesh has are told apart by a sum that needs no order of the corners.
-    sums, other_sums = (_corner_hashes(corners).sum(axis=1) for corners in (first, second))
+    sums, other_sums = _hash_sums(first), _hash_sums(second)
     candidates, others = np.flatnonzero(_occurs(sums, other_sums)), np.flatnonzero(_occurs(other_sums, sums))
     in_first[candidates], in_second[others] = _matched(first[candidates], second[others])
     return in_first, in_second
@@ -110,6 +110,14 @@ def _ordered_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64],
     order = np.argsort(hashes, axis=1, kind="stable")
     low, middle, high = np.take_along_axis(hashes, order, axis=1).T
     return np.take_along_axis(corners, order[:, :, None], axis=1), (low * _MIXERS[0] + middle) * _MIXERS[1] + high
+
+
+def _hash_sums(corners: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
+    sums = np.empty(len(corners), dtype=np.uint64)
+    for start in range(0, len(corners), _BATCH):
+        sums[start : start + _BATCH] = _corner_hashes(corners[start : start + _BATCH]).sum(axis=1)
+    return sums
 
 
 def _corner_hashes(corners: NDArray[np.float64]) -> NDArray[np.uint64]:

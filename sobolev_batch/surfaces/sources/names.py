@@ -38,15 +38,6 @@ def quoted(value: object, longest: int = 80) -> str:
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
-def legible(name: str) -> str:
-    r"""Return a name as it is, or quoted where it holds what a terminal would take as a command or not show.
-
-    >>> legible("a.ply"), legible("a\x1b[31m.ply")
-    ('a.ply', "'a\\x1b[31m.ply'")
-    """
-    return name if name.isprintable() else quoted(name)
-
-
 def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
     """Describe why a text cannot be a name; None where it can.
 

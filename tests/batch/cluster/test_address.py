@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from sobolev_batch import AddressError, ClusterError, InputError
-from sobolev_batch.batch.cluster.address import Address
 from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.cluster.connection import Address
 
 MALFORMED = ["", "tcp://", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
 MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "tcp://a b:1", "tcp://me@host:1", "a://b://c:1"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
-from distributed import Client
+from distributed import Client, KilledWorker
+from distributed.core import Status as WorkerStatus
+from distributed.scheduler import WorkerState
 
 from sobolev_batch import ClusterError, DamageError, StoreError, Study, run
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
@@ -77,6 +79,35 @@ def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
         done += 1
         assert len(read) <= done + 1
     assert (done, read) == (9, list(range(9)))
+
+
+def test_tasks_whose_workers_died_are_tried_alone(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[list[int], int]] = []
+    worker = WorkerState(
+        address="tcp://127.0.0.1:1",
+        status=WorkerStatus.running,
+        pid=1,
+        name="a",
+        memory_limit=1,
+        local_directory="",
+        nanny=None,
+        server_id="",
+    )
+
+    def run_once(
+        self: Cluster, tasks: Iterable[Task], claims_memory: bool, in_flight: int
+    ) -> Iterator[tuple[Task, object]]:
+        given = list(tasks)
+        asked.append(([task.row for task in given], in_flight))
+        for task in given:
+            dies = task.row == 3 or (task.row == 1 and in_flight > 1)
+            yield task, KilledWorker(f"task-{task.row}", worker, 1) if dies else task.row
+
+    monkeypatch.setattr(Cluster, "_run_once", run_once)
+    outcomes = {task.row: outcome for task, outcome in cluster.run(Task(abs, (-4,), row=row) for row in (3, 2, 1))}
+    assert asked[1:] == [([1, 3], 1)]
+    assert (outcomes[1], outcomes[2]) == (1, 2)
+    assert "at last with nothing else beside them" in str(outcomes[3])
 
 
 def _fail(error: Exception) -> None:

@@ -11,7 +11,7 @@ from distributed import Client
 
 from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers, waiting_reason
+from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
@@ -84,13 +84,6 @@ def test_a_memory_that_no_worker_can_live_in(memory: str) -> None:
 def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:
     run(study_on("cpu"), store_path, client)
     assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"closed form", "finufft"}
-
-
-def test_what_a_study_waits_for_is_told(client: Client) -> None:
-    assert waiting_reason(client, "auto") == ""
-    assert waiting_reason(client, "gpu").startswith("no worker with a GPU is left")
-    with tcp_cluster() as (address, _), Client(address) as lonely:
-        assert waiting_reason(lonely, "auto") == "no worker is left; waiting for one to start"
 
 
 def _die_once(marker: Path) -> str:

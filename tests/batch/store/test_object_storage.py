@@ -90,10 +90,11 @@ def test_a_second_run_reuses_and_writes_no_field(server: Server, s3_client: Clie
     root = url.replace("s3:/", "")
     written = {path for method, path in made if method not in ("GET", "HEAD")}
     assert written == {f"{root}/zarr.json", f"{root}/records/zarr.json", f"{root}/claim.json"}
-    assert len(made) < 36
+    # Each write is preceded by a look at the lock.
+    assert len(made) < 42
 
 
-def test_requests_grow_by_six_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
+def test_requests_grow_by_eight_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
     counts = []
     for meshes in (4, 14):
         family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(meshes)]
@@ -101,10 +102,10 @@ def test_requests_grow_by_six_for_a_mesh(server: Server, s3_client: Client, url:
         server.requests()
         run(study, url.replace("results", str(meshes)), s3_client)
         counts.append(len(server.requests()))
-    # The field and its record written; looks for an older record by driver and task; the field read for norms and
-    # for pairs.
-    assert counts[1] - counts[0] <= 6 * 10 + 4
-    assert counts[0] < 200
+    # The field and its record written, each after a look at the lock; looks for an older record by driver and task;
+    # the field read for norms and for pairs.
+    assert counts[1] - counts[0] <= 8 * 10 + 4
+    assert counts[0] < 240
 
 
 def test_an_interrupted_run_goes_on_from_what_is_stored(

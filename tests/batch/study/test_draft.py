@@ -229,7 +229,7 @@ def test_names_that_a_study_or_a_terminal_cannot_take_are_left_out(tmp_path: Pat
         write(tmp_path / "in" / name, 1)
     draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
     assert "differs from that of 'B.ply' only in case" in draft.left_out["b.ply"]
-    assert r"left out: '\x1b[31mred.ply': its name" in str(draft)
+    assert r"left out: \x1b[31mred.ply: its name" in str(draft)
     assert "\x1b" not in str(draft)
     assert [family.name for family in sb.Study.from_toml(draft.path).families] == ["meshes"]
 

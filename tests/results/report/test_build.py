@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -18,6 +19,8 @@ from click.testing import CliRunner
 
 import sobolev_batch as sb
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.spectra import Spectra
 from sobolev_batch.results.meshes.views import make_views
@@ -356,6 +359,23 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
     monkeypatch.setattr(Spectra, "of", damaged)
     with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
         make_report(store)
+
+
+def test_a_page_shows_one_state_of_a_store(
+    finished_store: Path, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(finished_store, store_path)
+
+    def make_views_while_a_run_begins(*arguments: Any, **options: Any) -> Any:
+        views = make_views(*arguments, **options)
+        Tables(Store.open(store_path)).invalidate()
+        return views
+
+    monkeypatch.setattr(build, "make_views", make_views_while_a_run_begins)
+    page = tmp_path / "page.html"
+    with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
+        sb.report(store_path, page)
+    assert not page.exists()
 
 
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

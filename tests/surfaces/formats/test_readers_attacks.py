@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -13,10 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch import MeshError, read_mesh
+from sobolev_batch import MeshError, read_mesh, read_points
+from sobolev_batch.machine import MachineMemory
 from sobolev_batch.surfaces.formats.readers import expected_size
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.mesh_attacks import ATTACKS
+from tests.support.mesh_files import LITTLE, box_scene, ply
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")
 
@@ -24,6 +29,8 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="me
 _LONGEST_SECONDS = 20
 # What refusing may take besides a multiple of the file: what packed data may grow to in any case, and its parsing.
 _SPARE_BYTES, _BYTES_PER_BYTE = 150 << 20, 150
+# It begins like a mesh of which all but the header is zeros.
+BINARY_PLY = ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, vertex_count=5 * 10**8)
 # A lying count would ask for more than this.
 _ADDRESS_BYTES = 8 << 30
 # What any size is told by: no format has less of a file for each triangle, nor takes more memory for it.
@@ -95,7 +102,7 @@ def test_no_size_is_claimed_that_the_file_cannot_hold(tmp_path: Path, name: str)
     path = ATTACKS[name](tmp_path)
     triangles, memory_bytes = expected_size(path)
     # Packed files count as what they may unpack to.
-    held_bytes = disk_bytes(tmp_path) * (4 if name.endswith(".gz") else 1)
+    held_bytes = disk_bytes(tmp_path) * (4 if path.suffix == ".gz" else 1)
     assert 0 <= triangles <= held_bytes / _LEAST_BYTES
     assert 0 <= memory_bytes <= held_bytes / _LEAST_BYTES * _MOST_MEMORY
 
@@ -105,6 +112,54 @@ def test_files_beyond_the_bound_are_refused_unread(tmp_path: Path, ending: str, 
     path = ATTACKS[name](tmp_path)
     with pytest.raises(MeshError, match=rf"scan\{ending}: larger than 8589934592 bytes.*1099511627776"):
         read_mesh(path)
+
+
+@pytest.fixture
+def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine of 4 GB."""
+    monkeypatch.setattr(MachineMemory, "found", lambda: MachineMemory(4 * 10**9, "all of this machine"))
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("ending", [".ply", ".obj", ".stl", ".off", ".glb", ".gii", ".vtk", ".vtp", "_lh.pial"])
+def test_files_beyond_the_memory_are_refused_unread(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"scan{ending}"
+    # What it announces fits its length, and nothing of it is on the disk.
+    path.write_bytes(BINARY_PLY if ending == ".ply" else b"")
+    os.truncate(path, 7 * 10**9)
+    before = time.process_time()
+    expected = rf"scan{re.escape(ending)}: takes up to .*GB of memory to read, and may take 75% of 4\.0GB, all of this"
+    with pytest.raises(MeshError, match=expected):
+        read_mesh(path)
+    assert time.process_time() - before < 1
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("name", ["scan.ply", "scan.xyz"])
+def test_points_beyond_the_memory_are_refused_unread(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(BINARY_PLY)
+    os.truncate(tmp_path / name, 7 * 10**9)
+    with pytest.raises(MeshError, match=rf"{name}: takes up to 49\.0GB of memory to read, and may take 75% of 4\.0GB"):
+        read_points(tmp_path / name, area=1.0)
+
+
+def test_packed_files_are_refused_as_soon_as_they_exceed_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scan.obj.gz").write_bytes(gzip.compress(b"# comment\n" * 3_000_000 + os.urandom(1 << 19)))
+    monkeypatch.setattr(MachineMemory, "found", lambda: MachineMemory(200_000_000, "all of this machine"))
+    with pytest.raises(MeshError, match=r"scan\.obj\.gz: takes up to 15\d\.\dMB of memory to read, and may take 75% "):
+        read_mesh(tmp_path / "scan.obj.gz")
+
+
+@pytest.mark.usefixtures("little_memory")
+def test_buffers_count_together(tmp_path: Path) -> None:
+    scene = box_scene()
+    (tmp_path / "scan.gltf").write_bytes(scene.gltf("data.bin"))
+    (tmp_path / "data.bin").write_bytes(scene.blob)
+    os.truncate(tmp_path / "data.bin", 10**9)
+    with pytest.raises(MeshError, match=r"scan\.gltf: takes up to 1[0-9]\.\dGB of memory to read"):
+        read_mesh(tmp_path / "scan.gltf")
 
 
 @pytest.mark.parametrize(
@@ -123,6 +178,20 @@ def test_files_beyond_the_bound_are_refused_unread(tmp_path: Path, ending: str, 
         ("gifti, entities in UTF-16", "the XML declares the entity 'a0'"),
         ("gifti, data of another file", "its data lie in another file; write it with them inside"),
         ("gifti, negative dimension", r"a negative dimension: \[-8, 3\]"),
+        (
+            "gifti, long attribute unpacked",
+            r"name or comment of more than 1048576 bytes, which goes on at byte \d+; a G",
+        ),
+        ("vtp, long attribute unpacked", "name or comment of more than 1048576 bytes, which .*; a VTK file has none"),
+        (
+            "gifti, deep elements unpacked",
+            "the XML has element 101 at the depth 101; a GIFTI file has at most 100000 el",
+        ),
+        ("gifti, many elements unpacked", "the XML has element 100001 at the depth 2; a GIFTI file has at most 100000"),
+        ("gifti, many arrays", "the file has more than 10000 arrays; save it with the surface alone"),
+        ("obj, long line unpacked", "line 1 has more than 1048576 characters; cut its polygon into smaller ones"),
+        ("obj, continued lines unpacked", "a line goes on for more than 1048576 characters; cut its polygon"),
+        ("ply ascii, long line unpacked", "a line of the PLY file has more than 1048576 characters; cut its polygon"),
         ("vtk, points without end", "POINTS announces 2999999999999999997 numbers, but only 100 bytes follow"),
         ("vtp, bomb", "unpacks to more or fewer than the 96 bytes announced"),
         ("vtp, bomb that is announced", "its arrays unpack to more than [0-9]* bytes: no mesh file shrinks so much"),

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import gzip
+import json
 import math
+import os
 import re
+import resource
+import subprocess
+import sys
 import time
 import warnings
+from contextlib import suppress
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -21,6 +28,9 @@ from tests.support.shapes import BOX_MIXED, BOX_VERTICES
 
 # Of this process alone. Reading the box takes milliseconds.
 _LONGEST_SECONDS = 5.0
+# In a process of their own: damaged files of each kind, and what they may take as multiples of whole ones. A lie that
+# is believed would ask for more addresses.
+_READS, _MOST_TIME, _MOST_GROWTH, _ADDRESS_BYTES = 100, 2.0, 1.2, 8 << 30
 
 _KINDS: dict[str, Content] = {
     **BOXES,
@@ -118,20 +128,20 @@ def _ends_well(path: Path, content: bytes) -> None:
     assert 0 <= memory_bytes <= 1300 * held_bytes
 
 
-@st.composite
-def _damaged(draw: st.DrawFn, content: bytes) -> bytes:
+def _damaged(content: bytes, random: Random) -> bytes:
     """A valid file after a few accidents."""
-    for _ in range(draw(st.integers(1, 4))):
+    for _ in range(random.randint(1, 4)):
         size = len(content)
-        place, other = draw(st.integers(0, size)), draw(st.integers(0, size))
-        accident = draw(st.sampled_from(["flip", "cut", "insert", "repeat", "drop", "number", "number", "word"]))
+        place, other = random.randint(0, size), random.randint(0, size)
+        accident = random.choice(["flip", "cut", "insert", "repeat", "drop", "number", "number", "word"])
         if accident == "flip" and place < size:
-            flipped = content[place] ^ (1 << draw(st.integers(0, 7)))
+            flipped = content[place] ^ (1 << random.randint(0, 7))
             content = content[:place] + bytes([flipped]) + content[place + 1 :]
         elif accident == "cut":
             content = content[:place]
         elif accident == "insert":
-            content = content[:place] + draw(st.binary(max_size=12) | st.sampled_from(_TOKENS)) + content[place:]
+            inserted = random.choice([*_TOKENS, random.randbytes(random.randint(0, 12))])
+            content = content[:place] + inserted + content[place:]
         elif accident == "repeat":
             content = content[: max(place, other)] + content[min(place, other) :]
         elif accident == "drop":
@@ -140,10 +150,43 @@ def _damaged(draw: st.DrawFn, content: bytes) -> bytes:
             pattern = rb"-?\d+(?:\.\d+)?" if accident == "number" else rb"[A-Za-z_]+"
             found = list(re.finditer(pattern, content))
             if found:
-                match = draw(st.sampled_from(found[:40]))
-                new = draw(st.sampled_from(_NUMBERS)).encode() if accident == "number" else draw(st.binary(max_size=8))
+                match = random.choice(found[:40])
+                word = random.randbytes(random.randint(0, 8))
+                new = random.choice(_NUMBERS).encode() if accident == "number" else word
                 content = content[: match.start()] + new + content[match.end() :]
     return content
+
+
+def main(folder: Path) -> None:
+    """Read whole files in this process, then damaged ones; print the processor seconds and the peak of both."""
+    resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_BYTES, _ADDRESS_BYTES))
+    random = Random(0)
+    for is_damaged in (False, True):
+        start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        for ending, content in _KINDS.values():
+            path = folder / f"scan{ending}"
+            for _ in range(_READS):
+                path.write_bytes(_damaged(content, random) if is_damaged else content)
+                with suppress(MeshError):
+                    read_mesh(path)
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        sys.stdout.write(json.dumps([used.ru_utime - start, used.ru_maxrss]) + "\n")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is limited and measured as Linux does it")
+def test_damaged_files_take_little_more_time_and_memory_than_whole_ones(tmp_path: Path) -> None:
+    root = Path(__file__).parents[3]
+    found = subprocess.run(
+        [sys.executable, "-c", f"from {__name__} import main; from pathlib import Path; main(Path({str(tmp_path)!r}))"],
+        capture_output=True,
+        text=True,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    assert found.returncode == 0, found.stderr
+    (whole_seconds, whole_peak), (seconds, peak) = map(json.loads, found.stdout.splitlines())
+    assert seconds < _MOST_TIME * whole_seconds
+    assert peak < _MOST_GROWTH * whole_peak
 
 
 @pytest.mark.parametrize("name", _KINDS)
@@ -151,7 +194,7 @@ def _damaged(draw: st.DrawFn, content: bytes) -> bytes:
 @given(data=st.data())
 def test_damaged_files_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, name: str, data: st.DataObject) -> None:
     ending, content = _KINDS[name]
-    _ends_well(tmp_path / f"scan{ending}", data.draw(_damaged(content)))
+    _ends_well(tmp_path / f"scan{ending}", _damaged(content, data.draw(st.randoms(use_true_random=False))))
 
 
 @pytest.mark.parametrize("ending", _STARTS)

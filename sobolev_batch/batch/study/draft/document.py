@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sobolev_batch.batch.study.draft.mesh_files import MeshFile
+from sobolev_batch.visible import HAZARDOUS
 
 # Explicit lists are broken into lines where they are longer.
 _LINE = 110
@@ -71,8 +72,12 @@ class PathText:
 
 def quoted_text(text: str) -> str:
     """Return a text as TOML spells it."""
-    # JSON spells it in the same way, but leaves this character as it is.
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+    # JSON spells it in the same way, but leaves some characters as they are that a terminal would obey or hide.
+    # Lone surrogates, of names that are no UTF-8, have no spelling, and cannot be written.
+    return HAZARDOUS.sub(
+        lambda found: found[0] if found[0] >= "\ud800" else f"\\u{ord(found[0]):04x}",
+        json.dumps(text, ensure_ascii=False),
+    )
 
 
 def size_text(files: Sequence[MeshFile]) -> str:

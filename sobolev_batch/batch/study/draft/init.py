@@ -32,7 +32,7 @@ from sobolev_batch.errors import StudyError
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.surfaces.sources.files import FileMember, FileSource
 from sobolev_batch.surfaces.sources.globs import expand
-from sobolev_batch.surfaces.sources.names import legible
+from sobolev_batch.visible import visible
 
 # The method that marks the reference of an object in a list.
 _REFERENCE = "reference"
@@ -63,7 +63,7 @@ class StudyDraft:
     left_out: Mapping[str, str]
 
     def __str__(self) -> str:
-        return "\n".join(self._lines())
+        return "\n".join(map(visible, self._lines()))
 
     def _repr_html_(self) -> str:
         rows = [("", line) for line in self.summary[: _MOST_LINES + 1]]
@@ -76,7 +76,7 @@ class StudyDraft:
         if len(others) > _MOST_LINES:
             yield f"and {len(others) - _MOST_LINES} more"
         for name, reason in list(self.left_out.items())[:_MOST_LINES]:
-            yield f"left out: {legible(name)}: {reason}"
+            yield f"left out: {name}: {reason}"
         if len(self.left_out) > _MOST_LINES:
             yield f"left out: {len(self.left_out) - _MOST_LINES} more files"
         file = shlex.quote(str(self.path))

@@ -43,7 +43,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
 
   // A spreadsheet would take such a text for a formula, and run it.
-  const harmless = (text) => (/^[=+\-@\t\r]/.test(text) ? `'${text}` : text);
+  const harmless = (text) => (/^[=+\-@＝＋－＠]/.test(text) ? `'${text}` : text);
   const field = (text) => (/[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
 
   // All orders of a table, with all digits, and the names of columns that the package uses.

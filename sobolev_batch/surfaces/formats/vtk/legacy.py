@@ -36,6 +36,8 @@ _CELLS |= {"UNSTRUCTURED_GRID": {"CELLS": -1}}
 _LONGEST_WORD, _MOST_DIGITS = 100, 18
 # Text that a number takes at least, and that is looked through for it at first.
 _LEAST_TEXT, _USUAL_TEXT = 2, 32
+# Words of a text at a time.
+_WORDS = 1 << 16
 # Since this version offsets of cells stand in place of their sizes.
 _OFFSETS_VERSION = 5
 
@@ -110,11 +112,16 @@ class _Cursor:
             raise MeshError(f"the section {section} announces {count} numbers, but only {left} bytes follow")
         if self._binary:
             return self._packed(count, dtype, section)
-        words = self._words(count)
-        if len(words) < count:
-            raise MeshError(f"the section {section} announces {count} numbers, found {len(words)}")
         parsed = parsed_integers if kind.lower() in _INTEGERS else parsed_numbers
-        return np.array(parsed(words, f"the section {section}"), dtype=dtype.newbyteorder("="))
+        values = np.empty(count, dtype=dtype.newbyteorder("="))
+        # As words, all numbers at once would take forty times the memory of their text.
+        for first in range(0, count, _WORDS):
+            part = values[first : first + _WORDS]
+            words = self._words(len(part))
+            if len(words) < len(part):
+                raise MeshError(f"the section {section} announces {count} numbers, found {first + len(words)}")
+            part[:] = parsed(words, f"the section {section}")
+        return values
 
     def skip_metadata(self) -> None:
         """Go to the next blank line."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.surfaces.formats.raw_files import parse_xml
 from sobolev_batch.surfaces.formats.text_formats import parsed_integers, parsed_numbers
 from sobolev_batch.surfaces.formats.vtk.arrays import Encoded, Packing
 from sobolev_batch.surfaces.formats.vtk.cells import POLYGON, STRIP, cell_triangles, sizes_between
@@ -91,7 +91,8 @@ class _Document:
         if not data.rstrip().endswith(_END):
             raise MeshError(f"the file breaks off: it does not end with {_END.decode()}")
         # Raw bytes are no XML.
-        self._parse(data if raw is None else data[: raw.end()] + b"</AppendedData>" + _END)
+        document = data if raw is None else data[: raw.end()] + b"</AppendedData>" + _END
+        parse_xml(document, "VTK", self._start, self._end, self._text)
         if raw is None:
             text = "".join("".join(self._appended).split())
             self._far = Encoded(text.partition("_")[2].encode(), is_base64=True)
@@ -160,18 +161,6 @@ class _Document:
         if count is not None and len(values) != count:
             raise MeshError(f"the array {name[:40]} of {section} has {len(values)} values, expected {count}")
         return values
-
-    def _parse(self, xml: bytes) -> None:
-        parser = expat.ParserCreate()
-        parser.buffer_text = True
-        parser.EntityDeclHandler = self._entity
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.CharacterDataHandler = self._text
-        parser.Parse(xml, True)
-
-    def _entity(self, name: str, *_: object) -> None:
-        raise MeshError(f"the XML declares the entity {name[:40]!r}; a VTK file has none, write it without")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         section = self._path[-1]

@@ -59,12 +59,13 @@ def available(memory: float | str) -> int:
     return count
 
 
-def require_machine_memory(needed_bytes: float, what: str) -> None:
+def require_machine_memory(needed_bytes: float, what: str, advice: str = "") -> None:
     """Refuse to take more memory than there is.
 
     Args:
         needed_bytes: Memory that is asked for.
         what: What asks for it, as the subject of a message.
+        advice: What follows "ask for less" in the message.
 
     Raises:
         InputError: There is less, in all.
@@ -73,7 +74,7 @@ def require_machine_memory(needed_bytes: float, what: str) -> None:
     if needed_bytes > memory.total_bytes:
         raise InputError(
             f"{what} of {format_bytes(needed_bytes)} is more than there is: {format_bytes(memory.total_bytes)}, "
-            f"{memory.source}; ask for less"
+            f"{memory.source}; {' '.join(filter(None, ('ask for less', advice)))}"
         )
 
 
@@ -86,11 +87,13 @@ def _limit_files(root: Path) -> Iterator[Path]:
     for line in lines:
         _, controllers, place = line.split(":", 2)
         if controllers == "":
-            top, name = root / "sys/fs/cgroup", "memory.max"
+            # Beyond the lower limit the kernel takes memory back, and the process all but stands still.
+            top, names = root / "sys/fs/cgroup", ["memory.max", "memory.high"]
         elif "memory" in controllers.split(","):
-            top, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+            top, names = root / "sys/fs/cgroup/memory", ["memory.limit_in_bytes"]
         else:
             continue
         group = top / place.lstrip("/")
         # Within a container, the group has the name that it has outside, and lies at the top.
-        yield from (folder / name for folder in (group, *group.parents) if folder.is_relative_to(top))
+        folders = [folder for folder in (group, *group.parents) if folder.is_relative_to(top)]
+        yield from (folder / name for folder in folders for name in names)

@@ -1,0 +1,218 @@
+"""The watch over a cluster: what keeps a run from going on is told, and what stays silent is given up.
+
+Dask takes a process for alive as long as its connection is open. A process that was stopped, or whose machine hangs,
+keeps it open and says nothing, and a run would wait for it for ever.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any, Self
+from uuid import uuid4
+
+from distributed import CancelledError, Client
+from distributed.comm import CommClosedError
+
+from sobolev_batch.batch.cluster import LEAST_GIVE_UP_AFTER
+from sobolev_batch.batch.cluster.workers import GPU
+from sobolev_batch.errors import ClusterError, InputError
+
+_log = logging.getLogger(__name__)
+
+# A silence is told after this time. Workers tell of themselves every half a second, among thousands every half a
+# minute.
+_TELL_AFTER_SECONDS = 30.0
+_POLL_SECONDS = 5.0
+_RESTART_SECONDS = 15.0
+_MOST_NAMED = 4
+
+
+@dataclass(frozen=True)
+class _Silence:
+    """Time for which a process has said nothing, while this process was looking.
+
+    Attributes:
+        heard: When it was last heard of. It is compared with nothing else: clocks differ, and this process may itself
+            be stopped for a while, in which it hears nobody.
+        since: Time at which the silence was noticed.
+        seconds: Seconds that it has lasted since.
+    """
+
+    heard: object
+    since: str
+    seconds: float = 0.0
+
+    @classmethod
+    def begun(cls, heard: object) -> Self:
+        """Return a silence that begins now."""
+        return cls(heard, f"{datetime.now(UTC):%H:%M:%S} UTC")
+
+    def lasting(self, heard: object, elapsed: float) -> _Silence:
+        """Return the silence after some time, which ends it if the process was heard of since."""
+        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else _Silence.begun(heard)
+
+
+class Watch:
+    """A watch over the cluster of a run, in a thread of its own.
+
+    Args:
+        client: Client of the cluster.
+        needs_gpu: True if the run waits for a worker with a GPU.
+        give_up_after: Seconds of silence after which a worker is started again if it can be, and its tasks are given
+            to others; and after which a scheduler counts as lost.
+
+    Attributes:
+        obstacle: What keeps the run from going on, for people; empty if nothing does.
+    """
+
+    def __init__(self, client: Client, needs_gpu: bool, give_up_after: float) -> None:
+        self.obstacle = ""
+        self._client, self._needs_gpu, self._give_up_after = client, needs_gpu, give_up_after
+        self._address = str(client.scheduler.address)
+        self._workers: dict[str, _Silence] = {}
+        self._scheduler = _Silence.begun(None)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look_out, name="sobolev-batch-watch", daemon=True)
+
+    @contextmanager
+    def kept(self) -> Iterator[Watch]:
+        """Keep the watch.
+
+        Raises:
+            ClusterError: The scheduler was silent for too long.
+        """
+        self._thread.start()
+        try:
+            yield self
+        except (OSError, CommClosedError, CancelledError, TimeoutError) as error:
+            if not self._has_lost_scheduler:
+                raise
+            raise ClusterError(
+                f"{self._silent_scheduler()}, and was given up; the same command goes on from what is stored"
+            ) from error
+        finally:
+            self._ended.set()
+            # It may wait for an answer of the cluster.
+            self._thread.join(2 * _POLL_SECONDS)
+
+    @property
+    def _has_lost_scheduler(self) -> bool:
+        return self._scheduler.seconds > self._give_up_after
+
+    def _look_out(self) -> None:
+        before = time.monotonic()
+        while not self._has_lost_scheduler and not self._ended.wait(_POLL_SECONDS):
+            now = time.monotonic()
+            # More has passed only if this process was stopped too.
+            elapsed, before = min(now - before, 2 * _POLL_SECONDS), now
+            try:
+                obstacle = self._look(elapsed)
+            except Exception as error:  # a cluster that is closing does not answer, but the run is alive
+                _log.debug("the cluster could not be asked: %r", error)
+                continue
+            if obstacle != self.obstacle and obstacle:
+                _log.warning("%s", obstacle)
+            self.obstacle = obstacle
+
+    def _look(self, elapsed: float) -> str:
+        try:
+            workers = self._ask("identity", n_workers=-1)["workers"]
+        except TimeoutError:
+            self._scheduler = self._scheduler.lasting(None, elapsed)
+            if self._has_lost_scheduler:
+                # What waits for its answer wakes up, as if it had ended.
+                self._client.loop.add_callback(self._hang_up)
+            return self._silent_scheduler() if self._scheduler.seconds > _TELL_AFTER_SECONDS else ""
+        self._scheduler = _Silence.begun(None)
+        self._workers = {
+            address: self._workers.get(address, _Silence.begun(None)).lasting(worker["last_seen"], elapsed)
+            for address, worker in workers.items()
+        }
+        for address, silence in self._workers.items():
+            if silence.seconds > self._give_up_after:
+                self._give_up(address, silence)
+        silent = {name: one for name, one in self._workers.items() if one.seconds > _TELL_AFTER_SECONDS}
+        if silent:
+            return self._silent_workers(silent)
+        if not workers:
+            return "no worker is left; waiting for one to start"
+        if self._needs_gpu and not any(worker["resources"].get(GPU) for worker in workers.values()):
+            return "no worker with a GPU is left, and the study asks for one; waiting for one to start"
+        return ""
+
+    def _silent_workers(self, silences: Mapping[str, _Silence]) -> str:
+        tasks = self._ask("processing", workers=list(silences))
+        told = []
+        for address, silence in list(silences.items())[:_MOST_NAMED]:
+            labels = list(dict.fromkeys(_label_of(key) for key in tasks.get(address, ())))
+            more = f" and {len(labels) - _MOST_NAMED} more" if len(labels) > _MOST_NAMED else ""
+            held = f", and has {', '.join(labels[:_MOST_NAMED])}{more}" if labels else ""
+            told.append(f"the worker {address} has said nothing since {silence.since}{held}")
+        if len(silences) > _MOST_NAMED:
+            told.append(f"and {len(silences) - _MOST_NAMED} more workers have")
+        return (
+            f"{'; '.join(told)}. Whoever says nothing for {self._give_up_after:g} s is given up, and the tasks are "
+            "given to others"
+        )
+
+    def _silent_scheduler(self) -> str:
+        return f"the scheduler at {self._address} has said nothing since {self._scheduler.since}"
+
+    def _give_up(self, address: str, silence: _Silence) -> None:
+        """Have a worker started again by its nanny, or forgotten; its tasks go to others."""
+        _log.warning(
+            "the worker %s has said nothing since %s and is given up; its tasks are given to others",
+            address,
+            silence.since,
+        )
+        reason = f"sobolev-batch-silent-{uuid4().hex}"
+        try:
+            self._ask(
+                "restart_workers",
+                _seconds=2 * _RESTART_SECONDS,
+                workers=[address],
+                timeout=_RESTART_SECONDS,
+                wait_for_workers=False,
+                on_error="return",
+                stimulus_id=reason,
+            )
+        except Exception as error:  # whatever has become of its nanny
+            _log.debug("%s could not be started again: %r", address, error)
+            self._ask("unregister", address=address, stimulus_id=reason)
+
+    def _hang_up(self) -> None:
+        self._client.rpc.remove(self._address)
+        self._client.scheduler_comm.comm.abort()
+
+    def _ask(self, operation: str, *, _seconds: float = _POLL_SECONDS, **arguments: Any) -> Any:
+        """Return what the scheduler answers.
+
+        Raises:
+            TimeoutError: It does not answer in time.
+        """
+        return self._client.sync(getattr(self._client.scheduler, operation), callback_timeout=_seconds, **arguments)
+
+
+def require_give_up_after(seconds: float) -> float:
+    """Return a time after which what is silent is given up.
+
+    Raises:
+        InputError: It is too short: a worker is silent for some seconds now and then.
+    """
+    if not seconds >= LEAST_GIVE_UP_AFTER:
+        raise InputError(
+            f"give_up_after must be at least {LEAST_GIVE_UP_AFTER:g} seconds, found {seconds!r}: a worker that is busy "
+            "says nothing for some seconds now and then"
+        )
+    return seconds
+
+
+def _label_of(key: object) -> str:
+    """Return what a task works for."""
+    return str(key[-1]) if isinstance(key, tuple) else "a task of something else"

@@ -1,0 +1,118 @@
+"""Tasks that outlive their run: what they still write must not replace what is newer."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from distributed import Client, wait
+
+from sobolev_batch import LockError, Study, run, verify
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock, locked
+from sobolev_batch.batch.store.store import Store
+from tests.faults.fatal import Moment, fatal
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
+from tests.support.stores import assert_same_fields, assert_same_tables
+
+_POLL_SECONDS = 0.05
+# Moved by so much, the mesh is another one, of equal size in the store.
+SHIFT = 0.125
+
+DRIVER = """
+import sys
+import sobolev_batch as sb
+from distributed import Client
+if __name__ == "__main__":
+    with Client(sys.argv[1]) as client:
+        sb.run(sb.Study.from_toml(sys.argv[2]), sys.argv[3], client)
+"""
+STUDY = """
+[study]
+name = "small"
+[lattice]
+xi_max = 3.0
+M = 16
+[norm]
+orders = [-2.0]
+[reference]
+source = "sphere"
+[[family]]
+name = "file"
+source = "files"
+paths = ["part.ply"]
+"""
+
+
+def write_mesh(folder: Path, shift: float) -> None:
+    mesh = [(shift, 0, 0), (1 + shift, 0, 0), (shift, 1, 0), (shift, 0, 1)]
+    triangles = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    lines = [" ".join(map(str, vertex)) for vertex in mesh] + [f"3 {i} {j} {k}" for i, j, k in triangles]
+    (folder / "part.ply").write_text(header + "\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("what", ["field", "record"])
+def test_a_worker_that_goes_on_after_another_run_writes_nothing(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its worker is stopped, its driver killed, the mesh changed, another run done, and the worker continued."""
+    study, store, undisturbed = tmp_path / "study.toml", tmp_path / "store.zarr", tmp_path / "undisturbed.zarr"
+    study.write_text(STUDY)
+    write_mesh(tmp_path, 0.0)
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", str(Path(__file__).with_name("fatal.py")))
+    with (
+        fatal(monkeypatch, Moment(what, 0, str(tmp_path / "stops"), number=signal.SIGSTOP)) as moment,
+        tcp_cluster([]) as (address, (worker,)),
+    ):
+        driver = subprocess.Popen([sys.executable, "-c", DRIVER, address, str(study), str(store)])
+        while not (moment.pids and _is_stopped(worker.pid)):
+            assert driver.poll() is None
+            time.sleep(_POLL_SECONDS)
+        driver.kill()
+        driver.wait()
+        write_mesh(tmp_path, SHIFT)
+        monkeypatch.delenv("DASK_DISTRIBUTED__WORKER__PRELOAD")
+        assert run(Study.from_toml(study), store, workers=1).failed == {}
+        before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+        os.kill(worker.pid, signal.SIGCONT)
+        with Client(address) as client:
+            # The worker has one thread: it has ended its task when it does another.
+            wait(client.submit(os.getpid), timeout=PATIENCE_SECONDS)
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    assert verify(store).is_sound
+    run(Study.from_toml(study), undisturbed, workers=1)
+    assert_same_fields(store, undisturbed)
+    assert_same_tables(store, undisturbed)
+
+
+def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store: Path) -> None:
+    location, lock = Location(str(finished_store)), Lock.of_this_process()
+    store = Store(location.fenced(lock.fence))
+    record = store.read_record(0)
+    with pytest.raises(LockError, match="the store was released, or its run is over"):
+        store.write_record(0, record)
+    with locked(location, lock):
+        store.write_record(0, record)
+        with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
+            Store(location.fenced(Lock.of_this_process().fence)).write_record(0, record)
+    assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
+
+
+def test_a_fence_goes_with_a_location() -> None:
+    fenced = Location("results.zarr").fenced(Lock.of_this_process().fence)
+    assert fenced.absolute().fence == fenced.fence
+    assert fenced == Location("results.zarr")
+    assert str(fenced) == "results.zarr"
+
+
+def _is_stopped(pid: int) -> bool:
+    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)

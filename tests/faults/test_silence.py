@@ -1,0 +1,139 @@
+"""Workers and schedulers that are stopped, and never say so: a run tells of them, and ends or goes on without them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from sobolev_batch import ClusterError, InputError, Study, run
+from sobolev_batch.batch.cluster import watch
+from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.watch import Watch
+from tests.faults.fatal import Moment, fatal
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.stores import assert_same_fields, assert_same_tables
+
+pytestmark = pytest.mark.slow
+
+LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watch, "_POLL_SECONDS", 1.0)
+    monkeypatch.setattr(watch, "_TELL_AFTER_SECONDS", 3.0)
+
+
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Moment]:
+    """A worker of any cluster that is started meanwhile is stopped before it writes the field of ico/2."""
+    with fatal(monkeypatch, Moment("field", 2, str(tmp_path / "stops"), number=signal.SIGSTOP)) as moment:
+        yield moment
+    for pid in moment.pids:
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+
+
+@pytest.mark.parametrize("nanny", ["--nanny", "--no-nanny"])
+def test_what_a_silent_worker_has_is_told_and_done_by_others(
+    nanny: str,
+    stopped: Moment,
+    study: Study,
+    store_path: Path,
+    finished_store: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # A worker reads its preload from the environment, as it is started by the command.
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", str(Path(__file__).with_name("fatal.py")))
+    with tcp_cluster([nanny], [nanny]) as (address, _), Client(address) as client, caplog.at_level(logging.WARNING):
+        summary = run(study, store_path, client, give_up_after=10)
+    assert len(stopped.pids) == 1
+    assert (summary.computed, summary.failed) == (LABELS, {})
+    assert_same_fields(store_path, finished_store)
+    assert_same_tables(store_path, finished_store)
+    told = re.search(
+        r"the worker (\S+) has said nothing since \d\d:\d\d:\d\d UTC, and has (.*?)\. Whoever", caplog.text
+    )
+    assert told is not None, caplog.text
+    assert "ico/2" in told[2]
+    assert f"the worker {told[1]} has said nothing since" in caplog.text
+    assert "and is given up; its tasks are given to others" in caplog.text
+
+
+def test_a_worker_of_a_cluster_of_ones_own_is_started_again(
+    stopped: Moment, study: Study, store_path: Path, finished_store: Path
+) -> None:
+    with local_client(1) as client:
+        summary = run(study, store_path, client, give_up_after=10)
+    assert len(stopped.pids) == 1
+    assert (summary.computed, summary.failed) == (LABELS, {})
+    assert_same_fields(store_path, finished_store)
+
+
+def test_a_worker_that_was_stopped_before_the_run_is_given_up(study: Study, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, workers), Client(address) as client:
+        os.kill(workers[0].pid, signal.SIGSTOP)
+        try:
+            assert run(study, store_path, client, give_up_after=10).computed == LABELS
+        finally:
+            os.kill(workers[0].pid, signal.SIGCONT)
+
+
+def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path, finished_store: Path) -> None:
+    scheduler = dask(*SCHEDULER)
+    address = scheduler_address(scheduler)
+    worker = dask("worker", address, *WORKER)
+
+    def stop_scheduler(progress: object) -> None:
+        if getattr(progress, "label", "") == "ico/1":
+            os.kill(scheduler.pid, signal.SIGSTOP)
+
+    try:
+        with Client(address, timeout=5) as client:
+            client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
+            with pytest.raises(ClusterError, match="the same command goes on from what is stored"):
+                run(study, store_path, client, on_progress=stop_scheduler, give_up_after=10)
+    finally:
+        os.kill(scheduler.pid, signal.SIGCONT)
+        stop(worker)
+        stop(scheduler)
+    assert "ico/0" in run(study, store_path, workers=1).reused
+    assert_same_fields(store_path, finished_store)
+
+
+def test_a_cluster_without_workers_is_told() -> None:
+    def told(address: str, needs_gpu: bool) -> str:
+        with Client(address) as client, Watch(client, needs_gpu, 60).kept() as kept:
+            for _ in range(PATIENCE_SECONDS):
+                if kept.obstacle or threading.Event().wait(1.0):
+                    break
+            return kept.obstacle
+
+    with tcp_cluster() as (address, _):
+        assert told(address, False) == "no worker is left; waiting for one to start"
+    with tcp_cluster([]) as (address, _):
+        assert told(address, True).startswith("no worker with a GPU is left, and the study asks for one")
+
+
+@pytest.mark.parametrize("seconds", [0, 9.9, float("nan"), -1])
+def test_a_patience_that_is_too_short(seconds: float, study: Study, store_path: Path) -> None:
+    with pytest.raises(InputError, match="give_up_after must be at least 10 seconds, found"):
+        run(study, store_path, give_up_after=seconds)
+    assert not store_path.exists()
+
+
+def test_a_silence_counts_only_what_was_heard_missing() -> None:
+    silence = watch._Silence.begun(1.0).lasting(1.0, 5.0).lasting(1.0, 2.5)
+    assert silence.seconds == 7.5
+    assert silence.lasting(2.0, 100.0).seconds == 0.0

@@ -1,0 +1,63 @@
+"""Guards are found, taken out and missed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.mutants.guards import guards_of
+from tests.mutants.trial import mirrors_of, try_one
+
+SOURCE = b'''"""Roots."""
+
+
+def root(number):
+    "\xe2\x88\x9a"
+    if (number
+            < 0):
+        raise ValueError(number)
+    if number == 1:
+        return 1
+    require_number(number)
+    return number ** 0.5
+
+
+def require_number(number):
+    if not isinstance(number, int | float):
+        raise TypeError(number)
+'''
+TEST = """
+import pytest
+from package.layer.roots import root
+
+
+def test_root():
+    with pytest.raises(ValueError):
+        root(-1.0)
+"""
+
+
+def test_guards_are_conditions_that_raise_and_calls_that_check() -> None:
+    found = list(guards_of(SOURCE, "roots.py"))
+    assert sorted((guard.line, guard.text) for guard in found) == [
+        (6, "number < 0"),
+        (11, "require_number(number)"),
+        (16, "not isinstance(number, int | float)"),
+    ]
+    without = {guard.line: guard.taken_out(SOURCE).decode() for guard in found}
+    assert "if (False):" in without[6]
+    assert "    None\n    return number" in without[11]
+    for text in without.values():
+        compile(text, "roots.py", "exec")
+
+
+def test_a_guard_without_a_test_survives(tmp_path: Path) -> None:
+    module, test = tmp_path / "package" / "layer" / "roots.py", tmp_path / "tests" / "layer" / "test_roots.py"
+    for path, content in ((module, SOURCE), (test, TEST.encode())):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content)
+    name = "package/layer/roots.py"
+    assert mirrors_of(tmp_path, name) == ["tests/layer/test_roots.py", "tests/layer"]
+    held, _, unheld = sorted(guards_of(SOURCE, name), key=lambda guard: guard.line)
+    assert try_one(tmp_path, held).killed_by == "FAILED tests/layer/test_roots.py::test_root"
+    assert try_one(tmp_path, unheld).killed_by == ""
+    assert module.read_bytes() == SOURCE

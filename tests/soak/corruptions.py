@@ -1,0 +1,270 @@
+"""Files of a finished store that are damaged at random, one at a time, and what each way to read it then says."""
+
+from __future__ import annotations
+
+import random
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch import SobolevBatchError, Study, open_store, run
+from sobolev_batch.batch.cluster.clients import local_client
+from tests.soak.meshes import write_meshes
+from tests.support.commands import call
+
+STUDY = """
+[study]
+name = "corruptions"
+[lattice]
+xi_max = 2.0
+M = 10
+octaves = 1
+[norm]
+orders = [-4.0, -2.0]
+pairs = "all"
+[reference]
+source = "sphere"
+[[family]]
+name = "bumpy"
+source = "files"
+paths = ["*.off"]
+[[family]]
+name = "ico"
+source = "icosphere"
+levels = [0, 1]
+"""
+_MESHES = 2
+BAD = ("silent", "unnamed")
+ANSWERS = ("same", "told", *BAD)
+# Charts take most of the time. A report reads what the other ways read.
+_REPORTS_EVERY = 5
+# What a page or a status says of the moment at which it was made.
+_MOMENTS = re.compile(r"\d+(\.\d+)? (s|min|h|seconds|minutes|hours)\b( ago)?|\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d)?\S*")
+
+
+@dataclass(frozen=True)
+class Stores:
+    """Stores that a corruption is made from.
+
+    Attributes:
+        whole: A finished store.
+        earlier: An earlier state of it, before a mesh changed.
+        foreign: A store of the same study with other meshes.
+    """
+
+    whole: Path
+    earlier: Path
+    foreign: Path
+
+    @classmethod
+    def made(cls, folder: Path) -> Stores:
+        """Compute the stores."""
+        stores = cls(folder / "whole.zarr", folder / "earlier.zarr", folder / "foreign.zarr")
+        study = folder / "study.toml"
+        study.write_text(STUDY)
+        chance = np.random.default_rng(0)
+        with local_client(1) as client:
+            write_meshes(folder, range(_MESHES), chance)
+            run(Study.from_toml(study), stores.foreign, client)
+            write_meshes(folder, range(_MESHES), chance)
+            run(Study.from_toml(study), stores.whole, client)
+            shutil.copytree(stores.whole, stores.earlier)
+            write_meshes(folder, range(1), chance)
+            run(Study.from_toml(study), stores.whole, client)
+        return stores
+
+
+@dataclass(frozen=True)
+class Corruption:
+    """A file of a store that was damaged.
+
+    Attributes:
+        kind: What was done to it.
+        keys: Keys of the files whose content changed.
+        answers: What each way to read the store that was tried then did, one of `ANSWERS`: a number differs without a
+            word where it is silent, and an exception was not one of this package where it is unnamed.
+    """
+
+    kind: str
+    keys: tuple[str, ...]
+    answers: Mapping[str, str]
+
+
+def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
+    """Yield so many corruptions of one store."""
+    stores = Stores.made(folder)
+    chance = random.Random(seed)
+    keys = sorted(str(path.relative_to(stores.whole)) for path in stores.whole.rglob("*") if path.is_file())
+    damaged = folder / "damaged.zarr"
+    shutil.copytree(stores.whole, damaged)
+    truths = {name: read(damaged) for name, read in WAYS.items()}
+    while count:
+        kind = chance.choice(sorted(KINDS))
+        changed = KINDS[kind](damaged, chance.choice(keys), stores, chance)
+        if not changed:
+            continue
+        answers = {
+            name: _answer(read, damaged, truths[name])
+            for name, read in WAYS.items()
+            if name != "report" or not count % _REPORTS_EVERY
+        }
+        yield Corruption(kind, changed, answers)
+        shutil.rmtree(damaged)
+        shutil.copytree(stores.whole, damaged)
+        count -= 1
+
+
+def _answer(read: Callable[[Path], dict[str, str]], store: Path, truth: dict[str, str]) -> str:
+    """Return what a way to read a store did."""
+    try:
+        found = read(store)
+    except _ToldError:
+        return "told"
+    except Exception:
+        return "unnamed"
+    return answer_to(found, truth)
+
+
+def answer_to(found: Mapping[str, str], truth: Mapping[str, str]) -> str:
+    """Return what texts say beside those of a whole store."""
+    if found.get(_REMARKS) != truth.get(_REMARKS):
+        return "told"
+    told = {key for key, text in found.items() if text.startswith(_TOLD) or _IS_TOLD.search(text)}
+    if any(found.get(key, text) != text for key, text in truth.items() if key not in told):
+        return "silent"
+    return "told" if told or found.keys() < truth.keys() else "same"
+
+
+class _ToldError(Exception):
+    """A way to read a store has said that something is wrong."""
+
+
+_TOLD = "told: "
+# How a status names records that are gone or damaged.
+_IS_TOLD = re.compile("completion record is (gone|damaged)")
+# What a command says besides its output.
+_REMARKS = "remarks"
+
+
+def _command(*arguments: str) -> Callable[[Path], dict[str, str]]:
+    def read(store: Path) -> dict[str, str]:
+        done = call(*(str(store) if argument == "STORE" else argument for argument in arguments), folder=store.parent)
+        if "Traceback" in done.stderr or "report this" in done.stderr:
+            raise RuntimeError(done.stderr)
+        if done.returncode:
+            raise _ToldError(done.stderr)
+        return {_REMARKS: _MOMENTS.sub("", done.stderr), "output": _MOMENTS.sub("", done.stdout)}
+
+    return read
+
+
+def _page(store: Path) -> dict[str, str]:
+    page = store.with_name("page.html")
+    said = _command("report", "STORE", "--witness", "ico/0", "--output", str(page))(store)
+    return said | {"page": _MOMENTS.sub("", page.read_text(encoding="utf-8"))}
+
+
+def _arrays(store: Path) -> dict[str, str]:
+    """Return the content of each array, or what is said about it."""
+    try:
+        tree = open_store(store)
+    except SobolevBatchError as error:
+        raise _ToldError from error
+    return {
+        f"{node.path}/{name}": _content(str(name), array)
+        for node in tree.subtree
+        for name, array in node.to_dataset(inherit=False).variables.items()
+    } | {node.path: str(node.attrs) for node in tree.subtree}
+
+
+def _content(name: str, array: xr.Variable) -> str:
+    try:
+        values = array.values
+    except SobolevBatchError as error:
+        return f"{_TOLD}{error}"
+    if name == "record":
+        # The records of one mesh differ in where and when it was computed. One that is gone reads as none yet does.
+        return f"{array.dims}"
+    return f"{array.dims} {array.attrs} {values.dtype} {values.tolist()}"
+
+
+WAYS: dict[str, Callable[[Path], dict[str, str]]] = {
+    "table": _command("table", "STORE", "--format", "csv"),
+    "status": _command("status", "STORE"),
+    "report": _page,
+    "open_store": _arrays,
+    # Last, since it withdraws what is damaged.
+    "verify": _command("verify", "STORE"),
+}
+
+
+def _rewrite(store: Path, key: str, content: bytes) -> tuple[str, ...]:
+    path = store / key
+    if path.read_bytes() == content:
+        return ()
+    path.write_bytes(content)
+    return (key,)
+
+
+def _flip(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+    content = bytearray((store / key).read_bytes())
+    content[chance.randrange(len(content))] ^= chance.randrange(1, 256)
+    return _rewrite(store, key, bytes(content))
+
+
+def _truncate(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+    content = (store / key).read_bytes()
+    return _rewrite(store, key, content[: chance.randrange(len(content))])
+
+
+def _zero(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+    content = (store / key).read_bytes()
+    start = chance.randrange(len(content))
+    end = chance.randrange(start, len(content)) + 1
+    return _rewrite(store, key, content[:start] + bytes(end - start) + content[end:])
+
+
+def _delete(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+    (store / key).unlink()
+    return (key,)
+
+
+def _swap(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+    """Exchange a file with another one, of equal size where there is one."""
+    content = (store / key).read_bytes()
+    others = [path for path in store.rglob("*") if path.is_file() and path.read_bytes() != content]
+    alike = [path for path in others if path.stat().st_size == len(content)]
+    other = chance.choice(sorted(alike or others))
+    (store / key).write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    return (key, str(other.relative_to(store)))
+
+
+def _from(state: str) -> Callable[[Path, str, Stores, random.Random], tuple[str, ...]]:
+    def replace(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+        source = getattr(stores, state) / key
+        return _rewrite(store, key, source.read_bytes()) if source.exists() else ()
+
+    return replace
+
+
+KINDS: dict[str, Callable[[Path, str, Stores, random.Random], tuple[str, ...]]] = {
+    "byte flipped": _flip,
+    "cut short": _truncate,
+    "stretch zeroed": _zero,
+    "deleted": _delete,
+    "exchanged with another": _swap,
+    "from an earlier state": _from("earlier"),
+    "from another store": _from("foreign"),
+}
+
+
+def counts(found: list[Corruption]) -> list[tuple[str, Counter[str]]]:
+    """Count the answers of each way."""
+    return [(way, Counter(one.answers[way] for one in found if way in one.answers)) for way in WAYS]
