@@ -13,7 +13,6 @@ from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEF
 from sobolev_batch.fitting.fit import Fit, concluded, measured
 from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run
-from sobolev_batch.fitting.subdivision import Edges
 from sobolev_batch.fitting.task import FitTask, welded
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
@@ -21,6 +20,7 @@ from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_opera
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.subdivision import Edges
 
 # While the goal is so many times as large, all edges are split. A choice of triangles came no nearer then: fits pull
 # vertices to where they are needed, and even splits leave better triangles.

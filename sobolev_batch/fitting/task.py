@@ -15,13 +15,13 @@ from sobolev_batch.fitting.closeness import Closeness
 from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run, stages_of
-from sobolev_batch.fitting.subdivision import Edges
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, quality_of, refuse_points
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.subdivision import Edges
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]

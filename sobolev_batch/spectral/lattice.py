@@ -13,7 +13,6 @@ from typing import ClassVar, Self
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from sobolev_batch.errors import LatticeError
@@ -288,6 +287,8 @@ class OctaveLattice(FrequencyLattice):
     @classmethod
     def random(cls, lowest: float, highest: float, M: int, rng: np.random.Generator) -> Self:
         """Draw the rotation and shift of a lattice."""
+        from scipy.spatial.transform import Rotation
+
         x, y, z, w = Rotation.random(rng=rng).as_quat().tolist()
         i, j, k = rng.random(3).tolist()
         return cls(lowest, highest, M, (x, y, z, w), (i, j, k))
@@ -316,6 +317,8 @@ class OctaveLattice(FrequencyLattice):
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
         """Rotation R as a matrix (3, 3)."""
+        from scipy.spatial.transform import Rotation
+
         matrix: NDArray[np.float64] = Rotation.from_quat(self.quaternion).as_matrix()
         return matrix
 

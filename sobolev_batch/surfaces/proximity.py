@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
@@ -99,6 +98,8 @@ def proximity(a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, seed: i
 
 def _with_points(pyvista: Any, mesh: Mesh, scale: float, points: int, rng: np.random.Generator) -> Any:
     """Return a mesh for VTK, in units of the scale, with random points on it before its vertices."""
+    import trimesh
+
     vertices, triangles = np.asarray(mesh.vertices) / scale, np.asarray(mesh.triangles, dtype=np.int64)
     surface = trimesh.Trimesh(vertices, triangles, process=False)
     random_points, _ = trimesh.sample.sample_surface(surface, points, seed=rng)

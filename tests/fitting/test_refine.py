@@ -9,7 +9,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.fitting import refine as module
-from sobolev_batch.fitting.subdivision import Edges
+from sobolev_batch.surfaces.shapes.subdivision import Edges
 from tests.support.members import loaded, members
 
 # A ball with a sharp bump at its top: most triangles belong there.

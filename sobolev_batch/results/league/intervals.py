@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 Reals = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Interval:
         if count == 1:
             return cls(mean, math.nan, math.nan)
         deviation = float(np.std(values, ddof=1)) if spread is None else spread
-        half = stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * deviation / math.sqrt(count) + float(np.mean(errors))
+        half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2)) * deviation / math.sqrt(count) + float(np.mean(errors))
         return cls(mean, mean - half, mean + half)
 
     def exp(self) -> Interval:

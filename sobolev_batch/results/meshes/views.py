@@ -9,7 +9,6 @@ from typing import Literal, get_args
 
 import fast_simplification
 import numpy as np
-import trimesh
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group, reference_of
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.subdivision import subdivided
 
 Reals = NDArray[np.float64]
 Triangles = NDArray[np.int32]
@@ -180,5 +180,6 @@ def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Real
         simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
         return np.asarray(simplified[0], dtype=np.float64), np.asarray(simplified[1], dtype=np.int32)
     while 4 * len(triangles) <= min(most, _ENOUGH_TRIANGLES):
-        vertices, triangles = trimesh.remesh.subdivide(vertices, triangles)
-    return np.asarray(vertices), np.asarray(triangles, dtype=np.int32)
+        finer = subdivided(Mesh(vertices, triangles))
+        vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
+    return vertices, triangles

@@ -12,15 +12,17 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import beta, betainc
 
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, merged_weights
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Reals = NDArray[np.float64]
 
@@ -73,7 +75,7 @@ class PointPairs:
         Points that lie too close to each other are a sample there.
         """
         places, weights = _difference(clouds)
-        tree = cKDTree(places)
+        tree = _tree(places)
         starts = [cutoff * 2.0**octaves for octaves in range(_MOST_SAMPLED_OCTAVES + 1)]
         few = (start for start in starts if tree.n * _neighbours(tree, _RANGE / start) <= _MOST_EXACT_PAIRS)
         return cls._of_difference(places, weights, next(few, starts[-1]), 2 * _MOST_EXACT_PAIRS)
@@ -237,6 +239,13 @@ def _difference(clouds: Sequence[PointCloud]) -> tuple[Reals, Reals]:
     return merged_weights(points, signs * np.concatenate([cloud.weights for cloud in clouds]))
 
 
+def _tree(points: Reals) -> cKDTree:
+    """Return the points (n, 3) as a tree of neighbours. Only clouds need its library, which takes a while to load."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points)
+
+
 def _neighbours(tree: cKDTree, reach: float) -> float:
     """Return the mean number of points around a point, itself included, from a few of them."""
     counted = np.random.default_rng(tree.n).integers(tree.n, size=_COUNTED)
@@ -246,7 +255,7 @@ def _neighbours(tree: cKDTree, reach: float) -> float:
 def _pair_sums(points: Reals, weights: Reals, reach: float, most: int) -> Reals:
     """Return Σ w_i w_j over ordered pairs of different points, by classes of their distance, (groups, classes)."""
     classes = _CLASSES * _MOST_OCTAVES
-    tree = cKDTree(points)
+    tree = _tree(points)
     neighbours = _neighbours(tree, reach)
     count = max(_FEWEST_POINTS, int(most / neighbours))
     if count >= len(points):
@@ -260,7 +269,7 @@ def _pair_sums(points: Reals, weights: Reals, reach: float, most: int) -> Reals:
     counts = np.asarray(tree.query_ball_point(points[chosen], reach, return_length=True), dtype=np.int64)
     for batch in _batches(counts, _HELD_PAIRS):
         own = chosen[batch]
-        pairs = cKDTree(points[own]).sparse_distance_matrix(tree, reach, output_type="ndarray")
+        pairs = _tree(points[own]).sparse_distance_matrix(tree, reach, output_type="ndarray")
         pairs = pairs[own[pairs["i"]] != pairs["j"]]
         numbers = _CLASSES * np.log2(reach / np.maximum(pairs["v"], np.finfo(np.float64).tiny))
         numbers = np.clip(numbers, 1, classes - 3)

@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import IntegrationWarning, quad
 from scipy.special import gamma, kv
 
 from sobolev_batch.errors import OrderError
@@ -117,6 +116,8 @@ def _matern_difference(nu: float, shorter: float, longer: float) -> float:
 
 
 def _integral(function: Callable[[float], float], low: float, high: float) -> float:
+    from scipy.integrate import IntegrationWarning, quad
+
     with warnings.catch_warnings():
         # The tolerance asks for the last digits; quad warns if rounding prevents one of them.
         warnings.simplefilter("ignore", IntegrationWarning)

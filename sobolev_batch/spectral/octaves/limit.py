@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import quad
 from scipy.special import beta, betainc
 
 from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
@@ -175,6 +174,7 @@ def _regular_fall(limit: float, gaps: Reals) -> float | None:
 @lru_cache(maxsize=1024)
 def tail_integral(cutoff: float, order: float) -> float:
     """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
+    from scipy.integrate import quad
 
     def integrand(radius: float) -> float:
         return float((1 - smooth_step(np.array(radius), cutoff)) * (1 + radius**2) ** order)

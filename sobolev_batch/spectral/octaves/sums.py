@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import quad
-from scipy.stats import t as students_t
+from scipy.special import stdtrit
 
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
@@ -122,11 +121,12 @@ def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
     total = variances.sum(axis=0)
     tiny = np.finfo(np.float64).tiny
     effective = total**2 / np.maximum(np.sum(variances**2 / np.maximum(degrees, 1)[:, None], axis=0), tiny)
-    return np.asarray(np.sqrt(total) * students_t.ppf((1 + _CONFIDENCE) / 2, np.maximum(effective, 1.0)))
+    return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
 
 
 def window_integral(octave: Octave, order: float) -> float:
     """Return ∫ window(r) (1+r²)^s dr over an octave."""
+    from scipy.integrate import quad
 
     def integrand(radius: float) -> float:
         return float(octave.window(np.array(radius)) * (1 + radius**2) ** order)

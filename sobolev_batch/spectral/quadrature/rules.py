@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from pathlib import Path
 
 import modepy
 import numpy as np
@@ -16,6 +17,9 @@ Reals = NDArray[np.float64]
 HIGHEST_DEGREE = 50
 # Below this, rounding hides the error of a rule.
 FINEST_TOLERANCE = 1e-15
+# Sizes 2π|ξ|ρ of triangles (radians) at which the largest and the typical errors of rules are tabulated.
+_SIZES, _SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
+_MEASURED = Path(__file__).with_name("rule_errors.npz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +103,12 @@ def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
         direction of ξ. Rules with a smaller range than a cheaper one are left out.
     """
     tolerance = max(tolerance, FINEST_TOLERANCE)
-    sizes, errors = _error_table()
     rules: list[TriangleRule] = []
     ranges: list[float] = []
-    for rule, row in zip(_candidates(), errors, strict=True):
+    for rule, row in zip(candidate_rules(), measured_errors()["largest"], strict=True):
         beyond = np.flatnonzero(row > tolerance)
-        last = beyond[0] - 1 if beyond.size else len(sizes) - 1
-        limit = float(sizes[last]) if last >= 0 else 0.0
+        last = beyond[0] - 1 if beyond.size else len(_SIZES) - 1
+        limit = float(_SIZES[last]) if last >= 0 else 0.0
         while rules and rules[-1].cost >= rule.cost and ranges[-1] <= limit:
             rules.pop()
             ranges.pop()
@@ -115,7 +118,6 @@ def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
     return tuple(rules), np.array(ranges)
 
 
-@lru_cache(maxsize=128)
 def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
     """Return the root mean square of a rule's error on one triangle over all directions of ξ.
 
@@ -125,7 +127,49 @@ def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
         neighbours that point opposite ways, and mostly cancels. Each is the larger one of the equilateral and the
         flat triangle.
     """
-    sizes = np.geomspace(1e-3, 200.0, 64)
+    stored, measured = measured_errors(), candidate_rules()
+    if rule in measured:
+        row = measured.index(rule)
+        return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]
+    return _SIZES_ON_AVERAGE, *measure_typical_errors(rule)
+
+
+@cache
+def candidate_rules() -> tuple[TriangleRule, ...]:
+    """Return the 52 rules from which each tolerance takes its own: corners, midpoints, and the symmetric ones."""
+    symmetric = [symmetric_rule(degree) for degree in range(1, HIGHEST_DEGREE + 1)]
+    return (corner_rule(), symmetric[0], midpoint_rule(), *symmetric[1:])
+
+
+@cache
+def measured_errors() -> dict[str, Reals]:
+    """Return what was measured of each candidate: "largest" (52, 160), "even" and "odd" (52, 64), float64.
+
+    They depend on the rules alone, and measuring takes a second of each process, so the package carries them.
+    `python -m sobolev_batch.spectral.quadrature.rules` writes them anew.
+    """
+    with np.load(_MEASURED) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def measure_largest_errors(rule: TriangleRule) -> Reals:
+    """Return the largest relative error of a rule on triangles of each size (160,).
+
+    On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
+    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon, of which symmetry leaves one twelfth to
+    sample.
+    """
+    fractions = np.linspace(0.5, 1.0, 5)
+    largest = np.repeat(_SIZES, len(fractions))
+    second = -largest * np.tile(fractions, len(_SIZES))
+    errors = np.abs(_rule_errors(rule, np.stack([largest, second, -largest - second])))
+    return np.asarray(errors.reshape(len(_SIZES), -1).max(axis=1))
+
+
+@lru_cache(maxsize=16)
+def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
+    """Return the even and the odd part of a rule's error at each size (64,): see `typical_errors`."""
+    sizes = _SIZES_ON_AVERAGE
     cosines, weights = np.polynomial.legendre.leggauss(4)
     sines = np.sqrt(1 - ((1 + cosines) / 2) ** 2)
     angles = (np.arange(4) + 0.5) * np.pi / 24
@@ -137,33 +181,16 @@ def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
         difference = _rule_errors(rule, phases.reshape(3, -1)).reshape(len(sizes), len(sines), -1)
         even.append(np.sqrt(weights / 2 @ np.mean(difference.real**2, axis=2).T))
         odd.append(np.sqrt(weights / 2 @ np.mean(difference.imag**2, axis=2).T))
-    return sizes, np.maximum(*even), np.maximum(*odd)
-
-
-@cache
-def _candidates() -> tuple[TriangleRule, ...]:
-    symmetric = [symmetric_rule(degree) for degree in range(1, HIGHEST_DEGREE + 1)]
-    return (corner_rule(), symmetric[0], midpoint_rule(), *symmetric[1:])
-
-
-@lru_cache(maxsize=1)
-def _error_table() -> tuple[Reals, Reals]:
-    """Return sizes 2π|ξ|ρ (S,) and the largest relative error of each candidate on triangles of that size (52, S).
-
-    On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
-    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon, of which symmetry leaves one twelfth to
-    sample.
-    """
-    sizes = np.geomspace(1e-4, 200.0, 160)
-    fractions = np.linspace(0.5, 1.0, 5)
-    largest = np.repeat(sizes, len(fractions))
-    second = -largest * np.tile(fractions, len(sizes))
-    phases = np.stack([largest, second, -largest - second])
-    errors = [np.abs(_rule_errors(rule, phases)).reshape(len(sizes), -1).max(axis=1) for rule in _candidates()]
-    return sizes, np.stack(errors)
+    return np.maximum(*even), np.maximum(*odd)
 
 
 def _rule_errors(rule: TriangleRule, phases: Reals) -> NDArray[np.complex128]:
     """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
     exact = 2 * second_difference(phases[1] - phases[0], phases[2] - phases[0])
     return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - exact)
+
+
+if __name__ == "__main__":
+    _largest = [measure_largest_errors(rule) for rule in candidate_rules()]
+    _even, _odd = zip(*(measure_typical_errors(rule) for rule in candidate_rules()), strict=True)
+    np.savez_compressed(_MEASURED, largest=_largest, even=_even, odd=_odd)

@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
 
-import nibabel.freesurfer
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
@@ -56,11 +55,13 @@ def parse_freesurfer(data: bytes, path: Path) -> Raw:
                 f"it begins with the bytes {magic.hex(' ')} and is no surface of FreeSurfer's, which begin with "
                 f"{_TRIANGLES.hex(' ')}; give a surface such as lh.pial, or a name with the suffix of its own format"
             )
+    from nibabel.freesurfer import read_geometry
+
     # The library reads files by their names alone.
     with NamedTemporaryFile() as file:
         file.write(data)
         file.flush()
-        vertices, triangles = nibabel.freesurfer.read_geometry(file.name)
+        vertices, triangles = read_geometry(file.name)
     return vertices, triangles
 
 

@@ -12,7 +12,6 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,8 +37,10 @@ def parse_gifti(data: bytes, path: Path) -> Raw:
         MeshError: The file has not exactly one point set and one triangle array, or its data do not fit
             their announced sizes.
     """
+    from nibabel import GiftiImage
+
     _XmlCheck(data)
-    image = nibabel.GiftiImage.from_bytes(data)
+    image = GiftiImage.from_bytes(data)
     points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
     triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
     if len(points) != 1 or len(triangles) != 1:
@@ -119,11 +120,13 @@ class _XmlCheck:
 
 def _array_bytes(attributes: dict[str, str]) -> int:
     """Return the size that a DataArray announces."""
+    from nibabel.nifti1 import data_type_codes
+
     count = int(attributes.get("Dimensionality", 0))
     if not 1 <= count <= _MOST_DIMENSIONS:
         raise MeshError(f"an array of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
     sizes = [int(attributes[f"Dim{axis}"]) for axis in range(count)]
     if min(sizes) < 0:
         raise MeshError(f"an array of the file has a negative dimension: {sizes}")
-    dtype = nibabel.nifti1.data_type_codes.dtype[attributes.get("DataType", "NIFTI_TYPE_FLOAT32")]
+    dtype = data_type_codes.dtype[attributes.get("DataType", "NIFTI_TYPE_FLOAT32")]
     return math.prod(sizes) * int(np.dtype(dtype).itemsize)

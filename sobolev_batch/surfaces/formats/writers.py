@@ -11,7 +11,6 @@ from typing import IO
 from uuid import uuid4
 
 import numpy as np
-import trimesh
 from plyfile import PlyData, PlyElement
 
 from sobolev_batch.errors import InputError, MeshError
@@ -116,6 +115,8 @@ def _off(mesh: Mesh) -> bytes:
 
 
 def _stl(mesh: Mesh) -> bytes:
+    import trimesh
+
     surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
     return bytes(trimesh.exchange.stl.export_stl(surface))
 

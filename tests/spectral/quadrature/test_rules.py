@@ -12,7 +12,11 @@ from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.quadrature.rules import (
     HIGHEST_DEGREE,
     TriangleRule,
+    candidate_rules,
     gauss_rule,
+    measure_largest_errors,
+    measure_typical_errors,
+    measured_errors,
     rule_ranges,
     symmetric_rule,
 )
@@ -65,6 +69,15 @@ def test_no_triangle_within_range_exceeds_the_tolerance(tolerance: float) -> Non
             found = mesh.area * rule.weights @ np.exp(-2j * np.pi * (rule.barycentric @ corners @ frequency))
             exact = exact_transform(mesh, frequency[None, :])[0]
             assert abs(found - exact) <= max(tolerance, 1e-14) * mesh.area
+
+
+@pytest.mark.parametrize("row", [0, 2, 9, 51])
+def test_the_errors_that_the_package_carries_are_those_of_its_rules(row: int) -> None:
+    rule, carried = candidate_rules()[row], measured_errors()
+    assert carried["largest"][row] == pytest.approx(measure_largest_errors(rule), rel=1e-6, abs=1e-15)
+    even, odd = measure_typical_errors(rule)
+    assert carried["even"][row] == pytest.approx(even, rel=1e-6, abs=1e-15)
+    assert carried["odd"][row] == pytest.approx(odd, rel=1e-6, abs=1e-15)
 
 
 def test_rules_are_not_wastefully_far_within_the_tolerance() -> None:

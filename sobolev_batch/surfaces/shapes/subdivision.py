@@ -16,6 +16,12 @@ Indices = NDArray[np.int64]
 Marks = NDArray[np.bool_]
 
 
+def subdivided(mesh: Mesh) -> Mesh:
+    """Return the mesh with every triangle split into four at the middles of its edges."""
+    edges = Edges.of(mesh)
+    return edges.split(np.ones(len(edges.ends), dtype=bool))
+
+
 @dataclass(frozen=True, eq=False)
 class Edges:
     """The edges of a mesh.
@@ -34,8 +40,11 @@ class Edges:
     def of(cls, mesh: Mesh) -> Self:
         """Return the edges of a mesh."""
         sides = np.sort(np.asarray(mesh.triangles)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        ends, edges = np.unique(sides, axis=0, return_inverse=True)
-        return cls(mesh, ends, edges.reshape(-1, 3))
+        # One number for each pair of vertices: they are sorted ten times as fast as rows.
+        count = len(mesh.vertices)
+        pairs, edges = np.unique(sides[:, 1] * count + sides[:, 0], return_inverse=True)
+        larger, smaller = np.divmod(pairs, count)
+        return cls(mesh, np.stack([smaller, larger], axis=1), edges.reshape(-1, 3))
 
     @property
     def on_boundary(self) -> Marks:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.subdivision import Edges
+from sobolev_batch.surfaces.shapes.subdivision import Edges
 
 
 def open_mesh() -> sb.Mesh:
