@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere league test test-fast coverage soak mutants check bench gpu docs audit format clean
+.PHONY: study icosphere league test test-fast test-all durations coverage soak mutants check bench gpu docs audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -21,14 +21,22 @@ $(MESHES): workflows/remeshers/make_meshes.py $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[remeshers]'
 	$(BIN)/python $< $(@D)
 
-# Whole files, in the order of tests/conftest.py. Three for two cores, since many tests wait for processes to start.
+# Whole files, longest first: see tests/conftest.py. Three for two cores, since many tests wait for processes to start.
 PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+# Compiled modules are kept, or each of the processes that tests start would compile the package anew.
+test test-all durations: export PYTHONDONTWRITEBYTECODE =
 
-test: $(READY)  ## the tests
+test: $(READY)  ## the tests: what must pass before a change is trusted, eight minutes
+	$(PYTEST) -n 3 -m "not all"
+
+test-fast: $(READY)  ## those that start no process and take no longer than two seconds, one minute
+	$(PYTEST) -n 2 -m "not (all or process or slow)"
+
+test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; an hour
 	$(PYTEST) -n 3
 
-test-fast: $(READY)  ## the tests of surfaces and numerics, one to two minutes
-	$(PYTEST) -n 2 -m "not slow" tests/surfaces tests/spectral
+durations: $(READY)  ## run the tests and record the seconds of each file in tests/durations.tsv
+	$(PYTEST) -n 3 -m "not all" --record-durations
 
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage

@@ -2,35 +2,75 @@
 
 from __future__ import annotations
 
+import platform
 import signal
-from collections.abc import Iterator
+import subprocess
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack
+from functools import wraps
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from distributed import Client
 
 from sobolev_batch import Mesh, Study, read_mesh, run
-from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
+from tests.support import durations
 from tests.support.mesh_files import Read
+from tests.support.processes import forked_workers
+from tests.support.repository import ROOT
 from tests.support.spheres import make_study
 from tests.support.studies import small_table
 
 # A test that asks for one of these fixtures, or calls one of these functions, has the marker.
 _SIGNS = {
-    "cluster": {
-        *("client", "cluster", "driving", "finished_store", "mixed", "s3_client", "spheres"),
-        *("local_client", "remote_client", "run", "run_icospheres", "started", "tcp_cluster"),
+    "process": {
+        *("client", "cluster", "driving", "finished_store", "mixed", "s3_client"),
+        *("local_client", "started", "tcp_cluster"),
+        *("served", "server", "serving", "storage"),
     },
-    "s3": {"served", "server", "serving", "storage"},
-    "browser": {"browser", "reader"},
+    "all": {"browser", "reader"},
 }
-_CLUSTER_FOLDERS = ("faults", "soak")
+_running: list[pytest.Item] = []
+_seconds: dict[str, float] = defaultdict(float)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option of `make durations`."""
+    parser.addoption("--record-durations", action="store_true", help="write the seconds of each file to durations.tsv")
 
 
 def pytest_configure() -> None:
-    """Let processes that tests start hear Ctrl-C, also where the shell runs the tests in the background."""
+    """Let processes that tests start hear Ctrl-C, and refuse to start any in tests without the marker for it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Dask asks for it once in each process, for which Python starts another.
+    platform.processor()
+    for owner, name in ((subprocess.Popen, "__init__"), (BaseProcess, "start")):
+        setattr(owner, name, _only_if_marked(getattr(owner, name)))
+
+
+def _only_if_marked(start: Callable[..., None]) -> Callable[..., None]:
+    @wraps(start)
+    def checked(*arguments: Any, **options: Any) -> None:
+        if _running and not any(map(_running[-1].get_closest_marker, ("process", "all"))):
+            raise AssertionError(f"{_running[-1].nodeid} starts a process: mark it with pytest.mark.process")
+        start(*arguments, **options)
+
+    return checked
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Know which test runs."""
+    _running.append(item)
+    try:
+        return (yield)
+    finally:
+        _running.pop()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -41,16 +81,37 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             for marker, signs in _SIGNS.items():
                 if used & signs:
                     item.add_marker(marker)
-        if any(f"tests/{folder}/" in item.nodeid for folder in _CLUSTER_FOLDERS):
-            item.add_marker("cluster")
-    slow, clustered = ({item.path for item in items if item.get_closest_marker(name)} for name in ("slow", "cluster"))
-    items.sort(key=lambda item: (item.path not in slow, item.path not in clustered))
+    seconds = durations.recorded_seconds()
+    items.sort(key=lambda item: -seconds.get(item.path.relative_to(ROOT).as_posix(), 0.0))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Add up what each file takes."""
+    _seconds[report.location[0]] += report.duration
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Print the slowest files, or record all."""
+    if config.getoption("record_durations"):
+        durations.record(_seconds)
+    terminalreporter.section("slowest files")
+    for line in durations.summary(_seconds):
+        terminalreporter.line(line)
 
 
 @pytest.fixture(scope="session")
 def client() -> Iterator[Client]:
     """Two worker processes, shared by all tests that only submit to them."""
-    with local_client(2) as client:
+    with ExitStack() as stack:
+        with forked_workers():
+            client = stack.enter_context(local_client(2))
+        yield client
+
+
+@pytest.fixture(scope="session")
+def threads() -> Iterator[Client]:
+    """A worker that is a thread of this process, for what does not depend on processes."""
+    with thread_client(1) as client:
         yield client
 
 

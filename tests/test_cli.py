@@ -15,6 +15,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import pytest
 import trimesh
@@ -532,9 +533,10 @@ def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path) -> N
 
 
 def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
-    done = call("run", "study.toml", "--store", "new.zarr", "--scheduler", "tcp://127.0.0.1:9", folder=folder)
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
+        done = call("run", "study.toml", "--store", "new.zarr", "--scheduler", "tcp://127.0.0.1:9", folder=folder)
     assert done.returncode == 1
-    assert "error: no Dask scheduler answers" in done.stderr
+    assert "error: no Dask scheduler answers at 'tcp://127.0.0.1:9' within 0.5 s" in done.stderr
     assert not (folder / "new.zarr").exists()
 
 

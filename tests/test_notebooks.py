@@ -14,8 +14,6 @@ from tests.support.repository import ROOT
 FOLDER = ROOT / "workflows" / "notebooks"
 NAMES = ["compare", "study", "cluster"]
 
-pytestmark = pytest.mark.slow
-
 
 def shown(outputs: list[str], name: str, text: str) -> str:
     """Return what the only cell shows that holds a text."""
@@ -48,6 +46,7 @@ def test_notebooks_are_linked_and_have_no_outputs(name: str) -> None:
         assert f"notebooks/{name}.ipynb)" in (ROOT / page).read_text(encoding="utf-8")
 
 
+@pytest.mark.all
 def test_two_meshes(tmp_path: Path) -> None:
     outputs = run_notebook(FOLDER / "compare.ipynb", tmp_path)
     table = shown(outputs, "compare", "pd.DataFrame")
@@ -61,6 +60,7 @@ def test_two_meshes(tmp_path: Path) -> None:
     assert (x - 1.4) ** 2 + y**2 + z**2 < 0.15**2
 
 
+@pytest.mark.all
 def test_a_folder_of_meshes(tmp_path: Path) -> None:
     outputs = run_notebook(FOLDER / "study.ipynb", tmp_path)
     assert "family narrow: 3 meshes" in shown(outputs, "study", "init_study")
@@ -70,7 +70,7 @@ def test_a_folder_of_meshes(tmp_path: Path) -> None:
     assert "even/even_32" in shown(outputs, "study", "sb.table")
 
 
-@pytest.mark.cluster
+@pytest.mark.all
 def test_a_cluster(tmp_path: Path) -> None:
     outputs = run_notebook(FOLDER / "cluster.ipynb", tmp_path)
     assert "6 of 6 complete, 0 failed, 0 to go" in shown(outputs, "cluster", "going_on")

@@ -6,6 +6,10 @@ import json
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.process
+
 # Parts of SciPy that a first field may load: sizes of lattices, step functions, and what these load.
 PARTS_OF_SCIPY = {"scipy.fft", "scipy.fftpack", "scipy.linalg", "scipy.sparse", "scipy.special"}
 # Packages that take 50 ms or more to load and that a first field does without.

@@ -16,7 +16,7 @@ from tests.support.gallery import run_blocks, run_icospheres
 from tests.support.repository import ROOT, blocks
 
 
-@pytest.mark.slow
+@pytest.mark.all
 def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_icospheres(tmp_path, client)
     monkeypatch.chdir(tmp_path)

@@ -33,7 +33,7 @@ def test_every_walkthrough_has_files() -> None:
     assert list(SECTIONS) == list(FILES) == list(SEEN)
 
 
-@pytest.mark.slow
+@pytest.mark.all
 @pytest.mark.parametrize("title", FILES)
 def test_it_runs_as_printed(title: str, tmp_path: Path) -> None:
     FILES[title](tmp_path)

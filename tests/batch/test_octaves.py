@@ -228,6 +228,7 @@ def with_lattice(octaves: int) -> dict[str, Any]:
     return small_table(lattice=lattice, norm={"orders": [-1.5, -2.0]})
 
 
+@pytest.mark.all
 def test_octaves_beyond_a_given_lattice_lower_its_errors(client: Client, tmp_path: Path) -> None:
     datasets = {}
     for octaves in (0, 4):
@@ -316,6 +317,7 @@ def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> 
     )
 
 
+@pytest.mark.all
 def test_a_report_shows_octaves(octave_store: Path, tmp_path: Path) -> None:
     text = report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
     count = len(open_store(octave_store).attrs["study"]["octaves"]["octaves"])

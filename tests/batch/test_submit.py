@@ -38,6 +38,7 @@ def study_path(tmp_path: Path) -> Path:
     return tmp_path / "study.toml"
 
 
+@pytest.mark.all
 def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, _):
         client = subprocess.run(
@@ -71,6 +72,7 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
         assert call("status", store, "--follow").returncode == 0
 
 
+@pytest.mark.all
 def test_the_objects_of_a_collection_are_handed_over_one_after_another(study_path: Path, tmp_path: Path) -> None:
     text = study_path.read_text(encoding="utf-8").replace('[reference]\nsource = "sphere"\n', "")
     objects = {"ball": '{ source = "sphere" }', "gone": '{ source = "files", paths = ["no.ply"] }'}
@@ -105,6 +107,7 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(tmp_path: Path, st
     assert not store_path.exists()
 
 
+@pytest.mark.all
 def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, workers):
         assert command("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
@@ -122,6 +125,7 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
     assert (status.complete, status.total, status.failed) == (6, 6, {})
 
 
+@pytest.mark.all
 def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, store_path: Path) -> None:
     """A file that the client sees and the workers do not: here, one that goes away."""
     mesh = study_path.with_name("mesh.off")

@@ -25,6 +25,8 @@ from sobolev_batch.batch.cluster.connection import check_connection
 from tests.support.processes import stop
 from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, write_study
 
+pytestmark = pytest.mark.all
+
 
 def make_certificates(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False)

@@ -149,6 +149,7 @@ def test_the_image() -> None:
     assert f"USER {user}:{user}" in lines
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("shell", "name"), [("sh", "make-certificates"), ("bash", "slurm.sbatch")])
 def test_scripts_parse(shell: str, name: str) -> None:
     assert subprocess.run([shell, "-n", FOLDER / name], capture_output=True, check=False).returncode == 0

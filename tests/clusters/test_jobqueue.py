@@ -40,6 +40,7 @@ def jobqueue(
     )
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("system", "directives"),
     [
@@ -79,6 +80,7 @@ def test_lifetimes_end_before_the_walltime(system: str) -> None:
     assert settings["cores"] == settings["processes"]
 
 
+@pytest.mark.all
 def test_a_study_on_local_jobs(tmp_path: Path) -> None:
     write_study(tmp_path)
     completed = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")
@@ -122,6 +124,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.all
 def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
     paths = environment(slurm)["PYTHONPATH"]
     completed = subprocess.run(
@@ -137,6 +140,7 @@ def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
+@pytest.mark.all
 def test_a_job_that_is_refused(slurm: Path) -> None:
     write_study(slurm)
     completed = jobqueue(slurm, "--system", "slurm", settings=slurm / "jobqueue.yaml", REFUSE="yes")
@@ -146,6 +150,7 @@ def test_a_job_that_is_refused(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
+@pytest.mark.all
 def test_settings_that_cannot_serve(tmp_path: Path) -> None:
     completed = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")
     assert completed.returncode == 1

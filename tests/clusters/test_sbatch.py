@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import psutil
+import pytest
 
 from tests.support.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
 
@@ -20,6 +21,7 @@ wait
 """
 
 
+@pytest.mark.all
 def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     add_command(tmp_path, "srun", SRUN)
     write_study(tmp_path)

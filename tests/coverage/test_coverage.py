@@ -29,8 +29,6 @@ from tests.coverage.truth import (
 from tests.support.rectangles import Rectangles
 from tests.support.shapes import CENTRED_BOX as BOX
 
-pytestmark = pytest.mark.slow
-
 SMALL = Mesh(0.9 * BOX.vertices, BOX.triangles)
 WHOLE = (-2.0, -3.0, -5.0, -10.0)
 # Pairs of the sample, one of each kind, whose truth takes little time.
@@ -44,6 +42,7 @@ def sample() -> Tally:
     return Tally(tuple(verdict for index in SAMPLE for verdict in judge([cases_of(1, index)[-1]]).verdicts))
 
 
+@pytest.mark.all
 def test_reported_errors_cover_the_true_ones_of_random_cases(sample: Tally) -> None:
     assert len(sample.verdicts) >= 20
     assert sample.covered >= len(sample.verdicts) - 1, sample.worst
@@ -52,6 +51,7 @@ def test_reported_errors_cover_the_true_ones_of_random_cases(sample: Tally) -> N
     assert sample.median_ratio < 30
 
 
+@pytest.mark.all
 def test_understated_errors_are_called_uncovered(sample: Tally) -> None:
     telling = [verdict for verdict in sample.verdicts if verdict.telling]
     assert not any(replace(verdict, reported=0.5 * verdict.true_error).covered for verdict in telling)

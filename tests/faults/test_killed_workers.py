@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from distributed import Client
 
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
@@ -20,9 +21,17 @@ from tests.support.studies import variable
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
 
 
-@pytest.mark.parametrize("what", ["field", "rename", "record", "recorded"])
+@pytest.mark.parametrize(
+    "what", ["record", *(pytest.param(what, marks=pytest.mark.all) for what in ("field", "rename", "recorded"))]
+)
 def test_the_result_is_that_of_a_clean_run(
-    what: str, study: Study, store_path: Path, finished_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: str,
+    study: Study,
+    store_path: Path,
+    finished_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    threads: Client,
 ) -> None:
     with fatal(monkeypatch, Moment(what, 2, str(tmp_path / "deaths"))) as moment, local_client(2) as client:
         summary = run(study, store_path, client)
@@ -33,12 +42,18 @@ def test_the_result_is_that_of_a_clean_run(
     strays = list(store_path.rglob("*.partial"))
     assert len(strays) == (what == "rename")
     # The next run sweeps them.
-    run(study, store_path, workers=1)
+    run(study, store_path, threads)
     assert list(store_path.rglob("*.partial")) == []
 
 
+@pytest.mark.all
 def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
-    study: Study, store_path: Path, finished_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Study,
+    store_path: Path,
+    finished_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    threads: Client,
 ) -> None:
     with fatal(monkeypatch, Moment("field", 2, str(tmp_path / "deaths"), times=99)) as moment:
         done = subprocess.run(
@@ -57,7 +72,7 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
     assert_same_fields(store_path, finished_store, besides={"ico/2"})
     assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
     # Without what kills its workers, it is computed and nothing else is.
-    assert run(study, store_path, workers=1).computed == ("ico/2",)
+    assert run(study, store_path, threads).computed == ("ico/2",)
     assert_same_tables(store_path, finished_store)
 
 

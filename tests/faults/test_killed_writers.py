@@ -8,11 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from sobolev_batch import Study
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
 from tests.support.processes import PATIENCE_SECONDS
 from tests.support.studies import small_table
+
+pytestmark = pytest.mark.process
 
 KILLS = 60
 

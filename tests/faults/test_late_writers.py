@@ -60,6 +60,7 @@ def write_mesh(folder: Path, shift: float) -> None:
     (folder / "part.ply").write_text(header + "\n".join(lines) + "\n")
 
 
+@pytest.mark.all
 @pytest.mark.parametrize("what", ["field", "record"])
 def test_a_worker_that_goes_on_after_another_run_writes_nothing(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -15,6 +15,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
+from distributed import Client
 
 from sobolev_batch import Study, release, run
 from sobolev_batch.batch import run as run_module
@@ -95,9 +96,9 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
 
 
 def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
-    study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch, threads: Client
 ) -> None:
-    run(study, store_path, workers=1)
+    run(study, store_path, threads)
     other = Lock("r", "h", "process 12 on far.example", utc_now())
     under_way = store_path / f"zarr.json.{uuid4().hex}.partial"
 
@@ -110,24 +111,25 @@ def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
 
     monkeypatch.setattr(run_module, "make_plan", plan_slowly)
     with pytest.raises(LockError, match="the store was released"):
-        run(study, store_path, workers=1)
+        run(study, store_path, threads)
     assert under_way.exists()
     assert Lock.read(Location.of(store_path)) == other
 
 
 def test_the_lock_of_another_machine_is_released_by_hand(
-    study: Study, store_path: Path, caplog: pytest.LogCaptureFixture
+    study: Study, store_path: Path, caplog: pytest.LogCaptureFixture, threads: Client
 ) -> None:
-    run(study, store_path, workers=1)
+    run(study, store_path, threads)
     elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
     assert Location.of(store_path).create(LOCK_KEY, elsewhere.to_json())
     with pytest.raises(LockError, match=r"process 12 on far\.example, since 2026-01-01"):
-        run(study, store_path, workers=1)
+        run(study, store_path, threads)
     assert release(store_path) == elsewhere
     assert release(store_path) is None
-    assert len(run(study, store_path, workers=1).reused) == 5
+    assert len(run(study, store_path, threads).reused) == 5
 
 
+@pytest.mark.process
 def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     child = subprocess.Popen(
         [sys.executable, "-c", LOCKING, str(tmp_path / "store")], stdout=subprocess.PIPE, text=True
@@ -197,15 +199,17 @@ def test_a_lock_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
         acquire(location, Lock.of_this_process())
 
 
-def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, store_path: Path) -> None:
-    run(study, store_path, workers=1)
+def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(
+    study: Study, store_path: Path, threads: Client
+) -> None:
+    run(study, store_path, threads)
     there = Store.open(store_path)
     latest = there.read_run()
     assert latest is not None
     elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z")
     Location.of(store_path).create(LOCK_KEY, elsewhere.to_json())
     there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
-    with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d s ago"):
+    with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
         release(store_path)
     assert release(store_path, force=True) == elsewhere
     # A lock that was just taken, before any sign of life; a store that cannot be read.
@@ -216,6 +220,7 @@ def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(study: Study, st
     assert release(store_path, force=True) is not None
 
 
+@pytest.mark.process
 def test_the_undead_count_as_gone(tmp_path: Path) -> None:
     """A process that has ended and whose parent has not asked how."""
     child = subprocess.Popen(
@@ -231,6 +236,7 @@ def test_the_undead_count_as_gone(tmp_path: Path) -> None:
     child.communicate()
 
 
+@pytest.mark.process
 def test_a_full_disk_leaves_no_lock(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path / "store")], check=False)
     assert done.returncode == 0

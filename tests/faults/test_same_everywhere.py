@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
+
+import pytest
+from distributed import Client
 
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
@@ -12,16 +18,18 @@ from sobolev_batch.batch.store.store import Store
 from tests.support.stores import assert_same_fields, assert_same_tables
 
 
-def test_workers_and_threads(study: Study, finished_store: Path, tmp_path: Path) -> None:
-    for workers in (1, 3):
-        with local_client(workers) as client:
-            run(study, tmp_path / f"{workers}.zarr", client)
-    with thread_client(4) as client:
-        run(study, tmp_path / "threads.zarr", client)
-    for store in sorted(tmp_path.glob("*.zarr")):
-        # Bit for bit; what is summed over tiles of other sizes, to rounding.
-        assert_same_fields(store, finished_store)
-        assert_same_tables(store, finished_store)
+@pytest.mark.parametrize(
+    "cluster",
+    [partial(thread_client, 4), *(pytest.param(partial(local_client, n), marks=pytest.mark.all) for n in (1, 3))],
+)
+def test_workers_and_threads(
+    cluster: Callable[[], AbstractContextManager[Client]], study: Study, finished_store: Path, store_path: Path
+) -> None:
+    with cluster() as client:
+        run(study, store_path, client)
+    # Bit for bit; what is summed over tiles of other sizes, to rounding.
+    assert_same_fields(store_path, finished_store)
+    assert_same_tables(store_path, finished_store)
 
 
 # Two processes that do the same tasks at the same time, again and again.
@@ -48,8 +56,9 @@ for i, row in Workspace.of(store, plan).rows.items():
 """
 
 
-def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_path: Path) -> None:
-    run(study, store_path, workers=1)
+@pytest.mark.process
+def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_path: Path, threads: Client) -> None:
+    run(study, store_path, threads)
     twins = [
         subprocess.Popen(
             [sys.executable, "-c", TWICE, str(store_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -74,4 +83,4 @@ def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_p
         # As text, since facts of a sphere hold NaN.
         assert str(record.facts) == str(other.facts)
         assert (record.quality, record.checksums) == (other.quality, other.checksums)
-    assert run(study, store_path, workers=1).computed == ()
+    assert run(study, store_path, threads).computed == ()

@@ -21,8 +21,6 @@ from tests.faults.fatal import Moment, fatal
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.stores import assert_same_fields, assert_same_tables
 
-pytestmark = pytest.mark.slow
-
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
 
 
@@ -44,6 +42,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Moment]
             continue
 
 
+@pytest.mark.all
 @pytest.mark.parametrize("nanny", ["--nanny", "--no-nanny"])
 def test_what_a_silent_worker_has_is_told_and_done_by_others(
     nanny: str,
@@ -71,6 +70,7 @@ def test_what_a_silent_worker_has_is_told_and_done_by_others(
     assert "and is given up; its tasks are given to others" in caplog.text
 
 
+@pytest.mark.all
 def test_a_worker_of_a_cluster_of_ones_own_is_started_again(
     stopped: Moment, study: Study, store_path: Path, finished_store: Path
 ) -> None:
@@ -81,6 +81,7 @@ def test_a_worker_of_a_cluster_of_ones_own_is_started_again(
     assert_same_fields(store_path, finished_store)
 
 
+@pytest.mark.all
 def test_a_worker_that_was_stopped_before_the_run_is_given_up(study: Study, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, workers), Client(address) as client:
         os.kill(workers[0].pid, signal.SIGSTOP)
@@ -90,6 +91,7 @@ def test_a_worker_that_was_stopped_before_the_run_is_given_up(study: Study, stor
             os.kill(workers[0].pid, signal.SIGCONT)
 
 
+@pytest.mark.all
 def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path, finished_store: Path) -> None:
     scheduler = dask(*SCHEDULER)
     address = scheduler_address(scheduler)

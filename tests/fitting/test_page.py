@@ -14,6 +14,7 @@ from tests.support.gallery import run_blocks
 from tests.support.repository import ROOT, blocks
 
 
+@pytest.mark.all
 def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert len(blocks("docs/fitting.md", "python")) == 4
@@ -33,6 +34,7 @@ def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.Mo
     assert (outwards < 0).all()
 
 
+@pytest.mark.all
 def test_the_page_of_reconstruction_runs_and_finds_the_shape() -> None:
     results = run_blocks("docs/reconstruction.md")
     assert results["found"].after.distance < results["found"].before.distance / 50
@@ -42,6 +44,7 @@ def test_the_page_of_reconstruction_runs_and_finds_the_shape() -> None:
     assert np.linalg.norm(np.asarray(mesh.vertices)[:, None] - tips, axis=2).min(axis=0).max() < 0.12
 
 
+@pytest.mark.all
 def test_the_page_about_surfaces_that_move_runs(
     client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,21 +44,6 @@ def test_the_target_can_be_a_field_alone() -> None:
     assert refined.after.distance < refined.before.distance / 5
 
 
-def test_far_goals_begin_with_even_splits(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts = []
-    original = module._Refinement._task
-
-    def task(self: Any, mesh: sb.Mesh) -> Any:
-        counts.append(len(mesh.triangles))
-        return original(self, mesh)
-
-    monkeypatch.setattr(module._Refinement, "_task", task)
-    sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=500, steps=1)
-    # The start, two even splits, then a mesh for derivatives and an uneven split.
-    assert counts[:4] == [20, 80, 320, 1280]
-    assert 480 < counts[4] <= 500
-
-
 def test_progress_counts_all_rounds() -> None:
     seen: list[sb.FitProgress] = []
     found = sb.refine(sb.icosphere(0), sb.Ellipsoid((1.3, 1, 1)), -4.0, triangles=70, steps=5, notify=seen.append)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch import Study
@@ -28,7 +29,7 @@ def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
         assert str(function(tree)) == str(result)
 
 
-def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Path) -> None:
+def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Path, threads: Client) -> None:
     shutil.copytree(finished_store, store_path)
     tree = sb.open_store(store_path)
     before = [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)]
@@ -37,7 +38,7 @@ def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Pa
     for function in (sb.table, sb.matrix):
         with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
             function(tree, -5.0)
-    sb.run(Study.from_table(small_table()), store_path, workers=1)
+    sb.run(Study.from_table(small_table()), store_path, threads)
     assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.store.records import Record, RunRecord
@@ -34,10 +35,10 @@ def store() -> Store:
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(tmp_path_factory: pytest.TempPathFactory, threads: Client) -> Path:
     """Return the path of such a store, for commands."""
     path = tmp_path_factory.mktemp("status") / "s.zarr"
-    sb.run(sb.Study.from_table(small_table()), path, workers=1)
+    sb.run(sb.Study.from_table(small_table()), path, threads)
     return path
 
 

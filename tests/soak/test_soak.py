@@ -15,7 +15,7 @@ from tests.soak.sequences import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, 
 from tests.soak.trial import Outcome, soak
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
-pytestmark = [pytest.mark.slow, pytest.mark.s3]
+pytestmark = pytest.mark.all
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -24,16 +25,16 @@ class PlainSums:
         center: Its centre.
         highest: xi_max of the lattice.
         intervals: M of the lattice.
-        order: Order s.
+        orders: Orders s.
     """
 
-    def __init__(self, radius: float, center: Reals, highest: float, intervals: int, order: float) -> None:
+    def __init__(self, radius: float, center: Reals, highest: float, intervals: int, orders: Sequence[float]) -> None:
         indices = np.array(list(product(range(-intervals // 2, intervals // 2 + 1), repeat=3)), dtype=np.float64)
         step = 2 * highest / intervals
         self.frequencies = step * indices
         lengths = np.linalg.norm(self.frequencies, axis=1)
         at_ends = np.sum(np.abs(indices) == intervals // 2, axis=1)
-        self.weights = step**3 * 0.5**at_ends * (1 + lengths**2) ** order
+        self.weights = step**3 * 0.5**at_ends * (1 + lengths**2) ** np.array(orders)[:, None]
         size, phases = 4 * np.pi * radius**2 * np.sinc(2 * radius * lengths), 2 * np.pi * self.frequencies @ center
         self.sphere = size * np.cos(phases), -size * np.sin(phases)
         u, of_u = roots_legendre(_COUNT)
@@ -42,19 +43,19 @@ class PlainSums:
         self.second = ((1 - v)[:, None] / 2 * (1 + u) / 2).ravel()
         self.shares = (of_v[:, None] * of_u / 4).ravel()
 
-    def value_and_derivative(self, vertices: Reals, triangles: NDArray[np.int64]) -> tuple[float, Reals]:
-        """Return the sum and its derivative (n, 3), by steps along the imaginary axis: exact to rounding."""
+    def value_and_derivative(self, vertices: Reals, triangles: NDArray[np.int64]) -> tuple[Reals, Reals]:
+        """Return the sum for each order and its derivative (orders, n, 3), by imaginary steps: exact to rounding."""
         parts = [self._triangle(corners) for corners in vertices[triangles]]
         cosines = sum(cosine for cosine, _ in parts) - self.sphere[0]
         sines = sum(sine for _, sine in parts) - self.sphere[1]
-        found = np.zeros_like(vertices)
+        found = np.zeros((len(self.weights), *vertices.shape))
         for triangle in triangles:
             for corner, axis in product(range(3), range(3)):
                 moved = vertices[triangle].astype(complex)
                 moved[corner, axis] += 1j * _STEP
                 cosine, sine = (part.imag / _STEP for part in self._triangle(moved))
-                found[triangle[corner], axis] += 2 * np.sum(self.weights * (cosines * cosine + sines * sine))
-        return float(np.sum(self.weights * (cosines**2 + sines**2))), found
+                found[:, triangle[corner], axis] += 2 * self.weights @ (cosines * cosine + sines * sine)
+        return self.weights @ (cosines**2 + sines**2), found
 
     def _triangle(self, corners: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Real and imaginary part of a triangle's transform, as analytic functions of its corners."""

@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import dask as dask_settings
 from distributed import Client
+from distributed.utils import get_mp_context
 
 SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
 # Limit of every wait for another process, for a machine that does much else: nothing is to depend on it.
@@ -42,6 +44,17 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     """Return the address of a scheduler that was just started."""
     assert scheduler.stderr is not None
     return next(match[0] for line in scheduler.stderr if (match := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
+
+
+@contextmanager
+def forked_workers() -> Iterator[None]:
+    """Have workers of local clusters forked from one process that has imported everything, five times as fast.
+
+    They have the environment of that process: what a test changes there does not reach them.
+    """
+    with dask_settings.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        get_mp_context().set_forkserver_preload(["sobolev_batch.batch.run"])
+        yield
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import re
 from pathlib import Path
 
@@ -11,15 +10,7 @@ import pytest
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.testing import assertion, verdict
 from sobolev_batch.testing.witness import write_difference
-
-
-@pytest.mark.parametrize("module", [assertion, verdict])
-def test_examples_run(module: object) -> None:
-    result = doctest.testmod(module, optionflags=doctest.ELLIPSIS)  # type: ignore[arg-type]
-    assert result.attempted
-    assert not result.failed
 
 
 def test_it_returns_the_verdict_of_equal_surfaces_and_writes_nothing(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 
 import dask
+from dask.utils import parse_timedelta
 from distributed import Client, LocalCluster
 
 from sobolev_batch.batch.cluster import worker_preload
@@ -17,7 +18,6 @@ from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.machine import MachineMemory, require_machine_memory
 from sobolev_batch.parameters import byte_count, format_bytes
 
-_CONNECT_SECONDS = 15
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
@@ -146,7 +146,7 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 @contextmanager
 def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
-    """Give a client of the scheduler at an address.
+    """Give a client of the scheduler at an address, for which it waits as long as Dask is set up to connect.
 
     Args:
         address: Address of the scheduler, such as tls://host:8786.
@@ -160,12 +160,13 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
     scheduler = Address.of(address)
     if not trust_network:
         scheduler.require_private("the scheduler")
-    check_connection(address, _CONNECT_SECONDS)
+    seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))
+    check_connection(address, seconds)
     try:
-        client = Client(address, timeout=_CONNECT_SECONDS)
+        client = Client(address, timeout=seconds)
     except (OSError, ValueError) as error:
         raise ClusterError(
-            f"no Dask scheduler answers at {address!r} within {_CONNECT_SECONDS} s ({error}); "
+            f"no Dask scheduler answers at {address!r} within {seconds:g} s ({error}); "
             "start one with: dask scheduler"
         ) from error
     with client:

@@ -105,7 +105,9 @@ class Edges:
             (number == 3, [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]),
         )
         cut = [np.stack(corners, axis=1)[chosen] for chosen, pieces_of in pieces for corners in pieces_of]
-        return Mesh(vertices, np.concatenate(cut))
+        parents = np.concatenate([np.flatnonzero(chosen) for chosen, pieces_of in pieces for _ in pieces_of])
+        # Pieces of a triangle follow each other: what is near in space stays near in memory.
+        return Mesh(vertices, np.concatenate(cut)[np.argsort(parents, kind="stable")])
 
     def _completed(self, chosen: Indices) -> Marks:
         """Mark the edges of triangles, and the longest edge of every triangle that has a marked one."""

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.analysis.ordering import _are_graded
 from tests.support.studies import small_table, variable
 
 # Levels of icospheres by the names of their files: names and triangles say different things.
@@ -68,20 +67,6 @@ def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
     assert frame["rate"].isna().all()
     run(tmp_path, order_by="triangles")
     assert sb.table(store_of(tmp_path), -3)["rate"].notna().any()
-
-
-@pytest.mark.parametrize(
-    ("counts", "are_graded"),
-    [
-        ([1500] * 20, False),
-        ([1500, 1510, 1700], False),
-        ([700, *[1500] * 200], False),
-        ([500, 1000, 2000], True),
-        ([500, 1000, 2000, 4000] * 10, True),
-    ],
-)
-def test_a_sequence_has_several_sizes(counts: list[int], are_graded: bool) -> None:
-    assert _are_graded(counts) == are_graded
 
 
 def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ def tcp_scheduler() -> Iterator[str]:
         yield address
 
 
+@pytest.mark.all
 def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
     tcp_scheduler: str, study: Study, finished_store: Path, store_path: Path
 ) -> None:
@@ -44,14 +45,7 @@ def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
     assert len(workers) == 2
 
 
-def test_no_scheduler_there() -> None:
-    with (
-        pytest.raises(ClusterError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"),
-        remote_client("tcp://127.0.0.1:9"),
-    ):
-        pass
-
-
+@pytest.mark.process
 def test_a_scheduler_without_workers() -> None:
     scheduler = dask(*SCHEDULER)
     try:
@@ -82,6 +76,7 @@ def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
 
 
+@pytest.mark.all
 def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: Path) -> None:
     """0.0.0.0 leads to loopback, and is not known to: what listens here nobody else reaches."""
     write_study(tmp_path)
@@ -95,6 +90,7 @@ def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: P
     assert "1, with 1 threads" in trusted.stdout
 
 
+@pytest.mark.all
 def test_a_worker_that_others_could_reach_counts_too() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -118,6 +114,7 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
             stop(process)
 
 
+@pytest.mark.process
 def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
     write_study(tmp_path)
     done = cli("submit", tmp_path / "study.toml", "--scheduler", "host")
@@ -169,6 +166,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.all
 @pytest.mark.parametrize(
     ("script", "store", "least"),
     [(RUN, "of-run.zarr", 4), (COMMAND, "of-command.zarr", 4), (RUN, "memory://of-threads", 2)],

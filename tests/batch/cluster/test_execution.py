@@ -122,7 +122,8 @@ def test_failures_of_the_store_end_all(cluster: Cluster) -> None:
     assert caught.value.row == 3
 
 
-def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path) -> None:
+@pytest.mark.process
+def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, threads: Client) -> None:
     family = [{"name": f"ball{i}", "source": "sphere", "radius": 0.5 + 0.001 * i} for i in range(200)]
     study = Study.from_table(small_table(family=family, norm={"orders": [-3.0], "pairs": "reference"}))
     scheduler = dask(*SCHEDULER)
@@ -151,5 +152,5 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path) -> N
     status = Status.of(store_path)
     assert status.run is not None
     assert (status.run.state, status.failed) == ("failed", {})
-    again = run(study, store_path, workers=1)
+    again = run(study, store_path, threads)
     assert (len(again.reused) >= 3, again.failed) == (True, {})

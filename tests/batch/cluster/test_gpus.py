@@ -93,6 +93,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are locked on Linux only")
 def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free() -> None:
     devices = [f"GPU-{os.getpid()}-{number}" for number in range(2)]

@@ -19,6 +19,8 @@ from tests.support.processes import tcp_cluster
 from tests.support.repository import ROOT
 from tests.support.studies import small_table, variable
 
+pytestmark = pytest.mark.all
+
 PRETEND = ["--preload", str(ROOT / "tests" / "support" / "pretend_gpu.py")]
 
 

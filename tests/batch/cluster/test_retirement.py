@@ -25,6 +25,8 @@ from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop
 from tests.support.studies import small_table, variable
 
+pytestmark = pytest.mark.all
+
 _POLL_SECONDS = 0.02
 
 

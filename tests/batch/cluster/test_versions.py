@@ -87,6 +87,7 @@ def wait_for(file: str) -> str | None:
     return os.environ.get("PYTHONPATH")
 
 
+@pytest.mark.all
 def test_workers_that_join_later_take_no_task_and_harm_none(
     cluster: str, other: Path, lacking: Path, tmp_path: Path
 ) -> None:
@@ -148,6 +149,7 @@ def test_a_client_that_differs_is_refused_and_leaves_the_cluster_as_it_is(cluste
         assert list(before) == ["sobolev-batch-versions"]
 
 
+@pytest.mark.process
 @pytest.mark.filterwarnings("ignore::distributed.versions.VersionMismatchWarning")
 def test_a_scheduler_with_another_dask(tmp_path: Path) -> None:
     folder = installed(tmp_path / "old", "dask", "1.0")

@@ -28,6 +28,7 @@ def study_on(backend: str) -> Study:
     return Study.from_table(small_table(transform={"backend": backend}))
 
 
+@pytest.mark.process
 def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
     boastful_cluster: str, store_path: Path
 ) -> None:
@@ -59,6 +60,7 @@ def test_workers_declare_their_memory(client: Client) -> None:
         assert 0.5 < member.allowed_bytes / workers[member.address]["memory_limit"] < 0.85
 
 
+@pytest.mark.all
 def test_workers_that_join_later_are_equipped_too() -> None:
     with local_client(1) as client:
         prepare_workers(client)

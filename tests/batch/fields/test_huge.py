@@ -16,6 +16,8 @@ from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.spectral.quadrature.rules import gauss_rule
 from tests.support.studies import variable
 
+pytestmark = pytest.mark.all
+
 CORTEX = Study.from_toml(Path(__file__).parents[3] / "workflows" / "cortex.toml")
 PER_EDGE = 32
 SCALE = 0.009
@@ -83,7 +85,6 @@ def processes(client: Client) -> set[int]:
     return set(client.run(os.getpid).values())
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_twenty_million_triangles_on_two_workers_of_four_gigabytes(tmp_path: Path, store_path: Path) -> None:
     base = original()
@@ -119,7 +120,6 @@ def test_twenty_million_triangles_on_two_workers_of_four_gigabytes(tmp_path: Pat
     (tmp_path / "huge.ply").unlink()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_lattice_of_512_intervals_on_a_worker_of_three_gigabytes(store_path: Path) -> None:
     lattice = Lattice(20.0, 512)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.all
+
 # The mesh is cut from a square so that making it costs little beside what is measured.
 TASK = """
 import resource, sys
@@ -47,7 +49,6 @@ print(record.facts.triangles, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 """
 
 
-@pytest.mark.slow
 def test_five_million_triangles_stay_below_two_gigabytes(store_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", TASK, str(store_path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
@@ -28,6 +29,7 @@ def storage() -> Iterator[FailingStorage]:
         yield storage
 
 
+@pytest.mark.all
 def test_object_storage_that_takes_no_more_fields(storage: FailingStorage, tmp_path: Path) -> None:
     location = Location.of(f"s3://{BUCKET}/results.zarr")
 
@@ -53,7 +55,9 @@ def _limit_files(size_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, size_bytes))
 
 
-def test_a_disk_without_room_for_more_fields(study: Study, store_path: Path, finished_store: Path) -> None:
+def test_a_disk_without_room_for_more_fields(
+    study: Study, store_path: Path, finished_store: Path, threads: Client
+) -> None:
     with local_client(1) as client:
 
         def fill(progress: Progress) -> None:
@@ -67,6 +71,6 @@ def test_a_disk_without_room_for_more_fields(study: Study, store_path: Path, fin
     there = sum(record is not None for record in records)
     assert 2 <= there < 5
     assert not list(store_path.rglob("*.partial"))
-    again = run(study, store_path, workers=1)
+    again = run(study, store_path, threads)
     assert (len(again.reused), len(again.computed), again.failed) == (there, 5 - there, {})
     assert_same(open_store(store_path), open_store(finished_store))

@@ -160,6 +160,7 @@ def test_a_study_on_storage_that_fails_now_and_then(
     assert all(failures[kind] for kind in KINDS if kind != "kept"), failures
 
 
+@pytest.mark.all
 def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
     storage: FailingStorage, location: Location, tmp_path: Path
 ) -> None:
@@ -200,6 +201,7 @@ except Exception as error:
 """
 
 
+@pytest.mark.process
 def test_a_field_that_finds_no_room_leaves_nothing(store_path: Path) -> None:
     plan = make_plan(Study.from_table(small_table()))
     store = prepare_store(store_path, plan)

@@ -68,6 +68,7 @@ def stored(server: Server, s3_client: Client) -> str:
     return url
 
 
+@pytest.mark.all
 def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, stored: str, finished_store: Path) -> None:
     tree = open_store(stored)
     assert_same(tree, open_store(finished_store))
@@ -108,6 +109,7 @@ def test_requests_grow_by_eight_for_a_mesh(server: Server, s3_client: Client, ur
     assert counts[0] < 240
 
 
+@pytest.mark.all
 def test_an_interrupted_run_goes_on_from_what_is_stored(
     server: Server, s3_client: Client, url: str, stored: str
 ) -> None:
@@ -124,15 +126,7 @@ def test_an_interrupted_run_goes_on_from_what_is_stored(
     assert_same(open_store(url), open_store(stored))
 
 
-def test_meshes_added_to_a_study_join_its_store(s3_client: Client, url: str) -> None:
-    table = small_table(lattice={"xi_max": 3.0, "M": 40})
-    run(Study.from_table(table), url, s3_client)
-    more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
-    assert run(Study.from_table({**table, "family": more}), url, s3_client).computed == ("late/sphere",)
-    assert variable(open_store(url), "convergence", "distance").sizes["mesh"] == 6
-    assert np.isfinite(variable(open_store(url), "norms", "norm").values).all()
-
-
+@pytest.mark.all
 def test_comparisons_are_those_of_a_folder(server: Server, s3_client: Client, url: str, tmp_path: Path) -> None:
     table = small_table(
         reference={"source": "icosphere", "levels": [4]}, witness={"orders": [-2.0]}, proximity={"points": 100}
@@ -183,6 +177,7 @@ def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Pat
     assert 0.003 < float(done.stdout) < 0.006
 
 
+@pytest.mark.all
 def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     assert f"{url}, 0 of 3 already stored" in call("plan", "study.toml", "--store", url, folder=tmp_path).stdout
@@ -201,6 +196,7 @@ def test_the_command_line(server: Server, tmp_path: Path, url: str) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"study.toml", *drawn}
 
 
+@pytest.mark.all
 def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     done = command("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
@@ -266,6 +262,7 @@ def deaf() -> Iterator[str]:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}"
 
 
+@pytest.mark.all
 def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path: Path, deaf: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     there, nowhere = f"s3://{BUCKET}/nothing.zarr", "s3://no-such-bucket/results.zarr"
@@ -294,6 +291,7 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
     assert server.keys("nothing.zarr") == []
 
 
+@pytest.mark.process
 def test_a_missing_driver_is_named(tmp_path: Path) -> None:
     script = "import sys; sys.modules['s3fs'] = None; sys.argv[1:] = ['status', 's3://b/x.zarr']\n"
     script += "from sobolev_batch.cli import main; main()"
@@ -303,6 +301,7 @@ def test_a_missing_driver_is_named(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.all
 def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     read = '{"Effect": "Allow", "Action": ["s3:Get*", "s3:List*", "s3:Head*"], "Resource": "*"}'
@@ -347,6 +346,7 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
         assert server.keys("") == before
 
 
+@pytest.mark.all
 def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     def kill(progress: Progress) -> None:
         if progress.stage == "fields" and progress.done == 1:
@@ -430,6 +430,7 @@ def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str)
     assert location.names() == set()
 
 
+@pytest.mark.all
 def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> None:
     location = Location.of(url)
     together = Barrier(6)
@@ -448,6 +449,7 @@ def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> 
             location.discard(LOCK_KEY)
 
 
+@pytest.mark.all
 @pytest.mark.parametrize("damage", ["cut", "flipped", "gone"])
 def test_damage_is_found_and_repaired(server: Server, s3_client: Client, url: str, damage: str, stored: str) -> None:
     study, there = Study.from_table(small_table()), server.client()

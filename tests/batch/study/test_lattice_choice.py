@@ -74,6 +74,7 @@ def test_a_mesh_that_reaches_further_says_what_to_do(client: Client, store_path:
     assert "that reach less far. Is this one in the same unit of length?" in summary.failed["far/far"]
 
 
+@pytest.mark.all
 def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:
     run(asking(), store_path, client)
     first = stored_choice(store_path)

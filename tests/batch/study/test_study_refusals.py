@@ -449,7 +449,7 @@ _keys = st.sampled_from(_KEYS) | st.text(max_size=5)
 _values = st.recursive(
     _scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(_keys, inner, max_size=5), max_leaves=12
 )
-_fuzz = settings(derandomize=True, deadline=None, max_examples=300, suppress_health_check=[HealthCheck.too_slow])
+_fuzz = settings(derandomize=True, deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 
 
 def _ends_well(table: dict[str, Any]) -> None:

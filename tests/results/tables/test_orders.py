@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.analysis.reduce import StoredFields
@@ -73,9 +74,9 @@ def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytes
         sb.table(stores[0], -3.7)
 
 
-def test_a_damaged_field_is_named(tmp_path: Path) -> None:
+def test_a_damaged_field_is_named(tmp_path: Path, threads: Client) -> None:
     store = tmp_path / "s.zarr"
-    sb.run(sb.Study.from_table(small_table()), store, workers=1)
+    sb.run(sb.Study.from_table(small_table()), store, threads)
     chunk = next(path for path in (store / "fourier" / "fourier" / "c").rglob("*") if path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-1] + b"x")
     with pytest.raises(sb.DamageError, match=r"field .*ico"):

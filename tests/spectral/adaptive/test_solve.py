@@ -21,10 +21,6 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
-from sobolev_batch.spectral.adaptive import solve as solve_module
-from sobolev_batch.spectral.adaptive.problem import Problem, Solution
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate
 from tests.support.shapes import CENTRED_BOX as BOX
 
 
@@ -91,27 +87,6 @@ def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
     assert not found["within"].item()
     relative = found["error"].item() / found["distance"].item()
     assert rtol < relative < 1.5 * caught.value.reachable
-
-
-def test_a_best_effort_aims_lower_where_that_comes_nearer(monkeypatch: pytest.MonkeyPatch) -> None:
-    errors = {1e-1: 0.08, 1e-2: 0.009, 1e-3: 0.2, 1e-4: 0.3}
-
-    def octaves(problem: Problem, seed: int) -> Solution:
-        rtol = problem.accuracy.rtol
-        estimate = NormEstimate(np.ones(1), np.array([errors[rtol]]), *np.zeros((3, 1)))
-        shortfall = None if errors[rtol] <= rtol else problem.out_of_reach(estimate, "here")
-        return Solution(estimate, Lattice(1.0, 16), shortfall=shortfall)
-
-    def lattices(problem: Problem, step: object) -> Solution:
-        raise problem.out_of_reach(NormEstimate(np.ones(1), np.ones(1), *np.zeros((3, 1))), "there")
-
-    monkeypatch.setattr(solve_module, "solve_in_octaves", octaves)
-    monkeypatch.setattr(solve_module, "_solve_on_lattices", lattices)
-    for rtol in (1e-2, 1e-3, 1e-4):
-        accuracy = Accuracy(rtol, best_effort=True)
-        found = solve_module.solve(Problem.of((icosphere(0), icosphere(1)), (-0.6,), accuracy, "the distance", 1))
-        assert found.estimate.errors[0] == 0.009
-        assert (found.shortfall is None) == (rtol == 1e-2)
 
 
 def test_a_best_effort_that_succeeds_is_the_same() -> None:

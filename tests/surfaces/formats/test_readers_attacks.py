@@ -74,7 +74,7 @@ def disk_bytes(folder: Path) -> int:
     return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if not path.is_symlink())
 
 
-@pytest.mark.slow
+@pytest.mark.all
 def test_attacks_are_refused_in_bounded_time_and_memory(tmp_path: Path) -> None:
     found = subprocess.run(
         [sys.executable, "-c", f"from {__name__} import main; from pathlib import Path; main(Path({str(tmp_path)!r}))"],

@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from sobolev_batch import MeshError, read_mesh
 from tests.support.mesh_files import (
@@ -608,30 +606,6 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
         else:
             accepted.append(length)
     assert not accepted, f"of {len(whole)} bytes"
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", BOXES)
-@settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_random_damage_raises_nothing_but_mesh_errors(tmp_path: Path, name: str, data: st.DataObject) -> None:
-    ending, content = BOXES[name]
-    path = tmp_path / f"scan{ending}"
-    changed = bytearray(content)
-    for _ in range(data.draw(st.integers(1, 4))):
-        # Digits into digits would make counts of many gigabytes, which are another test's matter.
-        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(
-            st.integers(0, 255).filter(lambda x: not 48 <= x < 58)
-        )
-    path.write_bytes(bytes(changed))
-    try:
-        mesh = read_mesh(path)
-    except MeshError as error:
-        assert str(error).startswith(f"{path}: ")  # noqa: PT017
-    else:
-        assert np.isfinite(mesh.vertices).all()
-        assert mesh.triangles.min() >= 0
-        assert mesh.triangles.max() < len(mesh.vertices)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,56 @@
+"""The examples in docstrings run as they stand; those of results and commands beside a small store."""
+
+from __future__ import annotations
+
+import doctest
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from tests.support.gallery import run_icospheres
+from tests.support.repository import PACKAGE
+
+FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+FILES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>>" in file.read_text(encoding="utf-8")]
+NAMES = [".".join([PACKAGE.name, *file.relative_to(PACKAGE).with_suffix("").parts]) for file in FILES]
+BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}." for layer in ("results", "cli"))
+# They run studies on clusters of their own.
+WITH_CLUSTERS = {f"{PACKAGE.name}.batch.{name}" for name in ("run", "verify")}
+
+
+def run(name: str) -> None:
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    for test in doctest.DocTestFinder(exclude_empty=True).find(import_module(name)):
+        runner.run(test)
+    assert runner.tries > 0
+    assert runner.failures == 0
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.process] if name in WITH_CLUSTERS else [])
+        for name in NAMES
+        if not name.startswith(BESIDE_A_STORE)
+    ],
+)
+def test_examples_run(name: str) -> None:
+    if name.endswith(".proximity"):
+        pytest.importorskip("vtkmodules", reason="VTK comes with the extra 'vtk'")
+    run(name)
+
+
+@pytest.fixture(scope="module")
+def folder(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with storage/icosphere.zarr and the study workflows/icosphere.toml."""
+    folder = tmp_path_factory.mktemp("examples")
+    run_icospheres(folder, client)
+    return folder
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(BESIDE_A_STORE)])
+def test_examples_beside_a_store_run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    run(name)
