@@ -10,7 +10,7 @@ from types import FrameType
 
 def main() -> None:
     """Run the command line and end the process with its exit status."""
-    # Matrix products of commands are small, and threads of OpenBLAS that spin for the next one took a fifth of the time.
+    # Matrix products of commands are small: threads of OpenBLAS that spin for the next one took a fifth of the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # The import takes a second, in which a library may catch the exception of an interrupt.
     before = {number: signal.signal(number, _leave) for number in (signal.SIGINT, signal.SIGTERM)}

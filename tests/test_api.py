@@ -26,6 +26,7 @@ def test_an_old_name_works_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> No
         assert sb.Grid is sb.Lattice  # type: ignore[attr-defined]
 
 
+@pytest.mark.process
 def test_the_package_alone_imports_no_libraries() -> None:
     code = "import sys, sobolev_batch; assert not {'numpy', 'xarray', 'dask', 'zarr'} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

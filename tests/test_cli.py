@@ -27,6 +27,8 @@ from sobolev_batch.results.tables.formatting import Digits
 from tests.support.commands import COMMAND, STUDY, call, command
 from tests.support.drawing import obstacle
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -150,6 +152,7 @@ def test_plot_draws_every_picture(folder: Path) -> None:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.all
 def test_plot_for_a_paper(folder: Path) -> None:
     place = ("plot", "storage/cli.zarr", "--output", "paper")
     chosen = ("--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
@@ -558,6 +561,7 @@ def test_debug_shows_the_traceback(folder: Path) -> None:
     assert done.returncode == 1
 
 
+@pytest.mark.all
 def test_a_terminal_gets_a_bar(folder: Path) -> None:
     master, slave = pty.openpty()
     process = subprocess.Popen(
@@ -614,6 +618,7 @@ def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(balls: Path) -> None:
     assert fitted.area == pytest.approx(4 * 3.14159265 * 31.0**2, rel=0.01)
 
 
+@pytest.mark.all
 def test_the_options_of_fit_reach_it(balls: Path) -> None:
     ball = icosphere(2)
     upper = ball.vertices[ball.triangles][:, :, 2].mean(axis=1) > 0.1
@@ -639,6 +644,7 @@ def test_the_options_of_fit_reach_it(balls: Path) -> None:
     assert min(np.abs(one - other).max() for one, other in combinations(found, 2)) > 4e-3
 
 
+@pytest.mark.all
 def test_fit_keeps_the_unit_if_asked(balls: Path) -> None:
     arguments = ("start.ply", "target.ply", "-o", "f.ply", "--steps", "1")
     scaled, own = (call("fit", *arguments, *more, folder=balls).stdout for more in ((), ("--no-scaling",)))
@@ -660,6 +666,7 @@ def test_fit_says_that_a_file_has_too_few_digits(balls: Path) -> None:
         assert ("have too few digits: vertices are off by up to 0.2" in done.stdout) != is_enough
 
 
+@pytest.mark.all
 def test_fit_leaves_an_old_file_until_the_new_one_is_whole(balls: Path) -> None:
     before = (balls / "start.ply").read_bytes()
     arguments = ["fit", "start.ply", "target.ply", "-o", "start.ply", "--refine-to", "20000", "--steps", "1"]
@@ -684,7 +691,7 @@ def test_fit_refines_to_a_number_of_triangles(balls: Path) -> None:
     assert fitted.bounds.mean(axis=0) == pytest.approx([100.0, 0, 0], abs=0.1)
 
 
-@pytest.mark.parametrize("request_to_end", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("request_to_end", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.all)])
 def test_an_interrupted_fit_writes_the_best_so_far(balls: Path, request_to_end: signal.Signals) -> None:
     # So fine that a step takes longer than this process to hear of one.
     ball = icosphere(5)

@@ -35,6 +35,8 @@ from sobolev_batch.surfaces.sources import files
 from sobolev_batch.visible import VisibleRecord, visible, visible_lines
 from tests.support.commands import COMMAND
 
+pytestmark = pytest.mark.process
+
 # The title of a terminal, a bell, a line of its own, a turn of the direction of text, and a byte that is no UTF-8.
 HOSTILE = "evil\x1b]0;owned\x07\nerror: \x9b31m\u202e\u2028\udcff"
 SHOWN = r"evil\x1b]0;owned\x07\nerror: \x9b31m\u202e\u2028\udcff"
@@ -140,6 +142,7 @@ def test_a_run_shows_names_and_reasons(folder: Path) -> None:
     assert f"WARNING sobolev_batch.batch.study.plan: files/gone: {folder}/{SHOWN_LABEL}/gone.obj: " in errors
 
 
+@pytest.mark.all
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -174,7 +177,9 @@ def test_studies_with_hostile_titles_and_names_are_refused(folder: Path, key: st
     assert "it holds the invisible character U+001B" in errors
 
 
-@pytest.mark.parametrize("style", FORMATS)
+@pytest.mark.parametrize(
+    "style", [pytest.param(style, marks=[] if style in ("csv", "json") else pytest.mark.all) for style in FORMATS]
+)
 def test_tables_of_hostile_labels(folder: Path, foreign: str, style: Format) -> None:
     _, output, _ = printed("table", foreign, "--format", style, folder=folder)
     tree = sb.open_store(folder / foreign)
@@ -196,6 +201,7 @@ def test_tables_of_hostile_labels(folder: Path, foreign: str, style: Format) -> 
             assert r"evil\x1b]0;" in text
 
 
+@pytest.mark.all
 def test_status_and_verify_name_hostile_labels(folder: Path, foreign: str) -> None:
     shutil.copytree(folder / foreign, folder / "damaged.zarr")
     chunks = folder / "damaged.zarr" / "fourier" / "fourier" / "c"
@@ -209,6 +215,7 @@ def test_status_and_verify_name_hostile_labels(folder: Path, foreign: str) -> No
     assert f"files/{SHOWN_LABEL}2: " in output
 
 
+@pytest.mark.all
 def test_pages_of_hostile_labels(folder: Path, foreign: str) -> None:
     status, _, _ = printed("report", foreign, folder=folder)
     assert status == 0
@@ -221,6 +228,7 @@ def test_pages_of_hostile_labels(folder: Path, foreign: str) -> None:
     assert tomllib.loads(html.unescape(text)) == tomllib.loads(TOML.replace("*/*.obj", "foreign/*.obj"))
 
 
+@pytest.mark.all
 def test_pictures_of_hostile_labels(folder: Path, foreign: str) -> None:
     status, output, _ = printed("plot", foreign, "--format", "svg", "--output", "pictures", folder=folder)
     assert status == 0
@@ -324,6 +332,7 @@ def test_messages_of_workers_reach_the_terminal_as_escapes(folder: Path) -> None
     assert harmful(errors) == []
 
 
+@pytest.mark.all
 def test_first_studies_of_hostile_folders(tmp_path: Path) -> None:
     name = HOSTILE.replace("\udcff", "")
     (tmp_path / name).mkdir()

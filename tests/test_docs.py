@@ -54,6 +54,8 @@ def test_every_public_name_has_an_example() -> None:
     assert not without
 
 
+@pytest.mark.process
+@pytest.mark.all
 def test_every_public_name_is_there_with_its_text(site: Path) -> None:
     page = (site / "sobolev_batch.html").read_text(encoding="utf-8")
     # From one name to the next, methods and attributes included.
@@ -71,6 +73,7 @@ def test_every_public_name_is_there_with_its_text(site: Path) -> None:
     assert "field.sobolev.norm(-2)" in sections["SobolevAccessor"]
 
 
+@pytest.mark.all
 def test_every_page_is_there_and_asks_nobody(site: Path) -> None:
     pages = {path.name: path.read_text(encoding="utf-8") for path in site.glob("*.html")}
     for source in (ROOT / "docs").glob("*.md"):

@@ -38,7 +38,6 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     )
     assert set(found["pair"]) == {levels[0], levels[3]}
     assert found["along_axis"].loc[0.0].real == pytest.approx(sb.icosphere(3).area, rel=1e-6)
-    assert (found["diagonal"]["error"] < 1e-4).all()
     assert found["by_wavelength"].sum() == pytest.approx(1, rel=1e-10)
     assert found["by_wavelength"].index.is_monotonic_increasing
     # An inscribed mesh lacks area and lies inside: at its vertices, next to the sphere, the sphere has more.

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import sobolev_batch as sb
 from tests.support.repository import ROOT, blocks
 
@@ -21,6 +23,8 @@ def test_the_study_file_is_valid(tmp_path: Path) -> None:
     assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(5.0, 64)
 
 
+@pytest.mark.process
+@pytest.mark.all
 def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
     (example,) = blocks("README.md", "python")
     small = (ROOT / "workflows" / "icosphere.toml").read_text().replace("M = 128", "M = 32")

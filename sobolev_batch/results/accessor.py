@@ -11,7 +11,6 @@ from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.decomposition import proportion
 from sobolev_batch.spectral.metrics.inputs import OperandLike, pair_of
-from sobolev_batch.spectral.metrics.interpolation import full_lattice, interpolate
 from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.metrics.witness import witness
@@ -105,44 +104,6 @@ class SobolevAccessor:
         See `sobolev_batch.witness`.
         """
         return witness(self._field, other, order, points, eps=eps, memory=memory)
-
-    def at(self, frequencies: ArrayLike, *, reach: float | None = None) -> xr.DataArray:
-        """Return the field at any frequencies ξ within the cube of its lattice, by band-limited interpolation.
-
-        The whole field is read.
-
-        Args:
-            frequencies: Frequencies ξ, real (n, 3), in cycles per unit length, |ξ_i| <= ξ_max.
-            reach: Half width of a cube |x_i| <= reach that contains the surface, in units of length. Computed and
-                stored fields know their surface's bounding box; other fields need this.
-
-        Returns:
-            complex128 (frequency,), with the coordinates xi_x, xi_y, xi_z, `error` (a bound on the error of
-            interpolation) and `amplification` (a bound on the factor of the field's own error). If the box fills a
-            third of the period, `error` is 2e-10 of the area, and 1e-7 beside the faces of the cube.
-
-        Raises:
-            LatticeError: A frequency lies beyond the cube.
-            InputError: Frequencies are not finite or not (n, 3), or reach is needed and missing.
-
-        >>> import sobolev_batch as sb
-        >>> field = sb.fourier_transform(sb.Sphere(), sb.Lattice(xi_max=3.0, M=24))
-        >>> complex(field.sobolev.at([[0.0, 0.0, 0.0]]).item()).real  # the area, 4π
-        12.566...
-        """
-        return interpolate(self._field, frequencies, reach=reach)
-
-    def full(self) -> xr.DataArray:
-        """Return the field on the whole lattice, (M+1, M+1, M+1); at -ξ it is the conjugate of its value at ξ.
-
-        The result is lazy if the field is a Dask array. Other dimensions stay.
-
-        >>> import sobolev_batch as sb
-        >>> field = sb.fourier_transform(sb.Sphere(), sb.Lattice(xi_max=3.0, M=24))
-        >>> field.shape, field.sobolev.full().shape
-        ((25, 25, 13), (25, 25, 25))
-        """
-        return full_lattice(self._field)
 
     def _each_with(
         self, other: OperandLike, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]

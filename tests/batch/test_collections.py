@@ -217,6 +217,7 @@ def test_a_study_against_itself_has_not_changed(store: Path) -> None:
     assert set(frame["verdict"]) == {"undecided"}
 
 
+@pytest.mark.all
 def test_a_study_against_another_finds_what_became_farther(tmp_path: Path, client: Client) -> None:
     radii = {f"o{i}": 1 + i / 100 for i in range(7)}
     new, old = tmp_path / "new.zarr", tmp_path / "old.zarr"

@@ -140,6 +140,7 @@ def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
+@pytest.mark.process
 @pytest.mark.all
 def test_a_job_that_is_refused(slurm: Path) -> None:
     write_study(slurm)
@@ -150,6 +151,7 @@ def test_a_job_that_is_refused(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
+@pytest.mark.process
 @pytest.mark.all
 def test_settings_that_cannot_serve(tmp_path: Path) -> None:
     completed = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")

@@ -80,6 +80,7 @@ def test_cases_depend_on_the_seed_and_the_place_alone() -> None:
     assert digests[0] == digests[1] != digests[2]
 
 
+@pytest.mark.all
 @pytest.mark.parametrize(
     ("a", "b"),
     [(BOX, SMALL), (SMALL, Sphere(0.7)), (icosphere(0), Sphere(0.8, (0.1, 0.0, 0.0)))],
@@ -103,6 +104,7 @@ def test_the_kernel_is_the_matern_function_and_its_integral_that_of_the_kernel(p
     assert np.allclose(radial_integral(r, power), rest, rtol=1e-9, atol=0)
 
 
+@pytest.mark.all
 def test_real_space_agrees_with_the_radial_integral_of_spheres() -> None:
     # Icospheres come nearer to spheres by a factor of 4 a level; extrapolation leads to them.
     first, second = Sphere(), Sphere(0.5, (0.2, 0.1, 0.0))
@@ -150,6 +152,7 @@ def test_real_space_agrees_with_heat_traces_within_what_both_claim(
         assert other.uncertainty < accuracy * truth.value
 
 
+@pytest.mark.all
 def test_sums_of_points_agree_with_heat_traces_where_the_kernel_is_infinite() -> None:
     orders = (-1.0, -1.5)
     box, other = Rectangles.box((0, 0, 0), (1, 0.6, 0.4)), Rectangles.box((0.2, 0.1, 0.7), (0.8, 0.5, 0.9))

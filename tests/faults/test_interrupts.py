@@ -217,6 +217,7 @@ def test_work_that_keeps_what_it_has_is_asked_again_and_not_killed(number: int) 
     assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
 
 
+@pytest.mark.all
 def test_a_status_that_is_followed_ends_without_a_traceback(store_path: Path, tmp_path: Path) -> None:
     with started("run", write_toml(tmp_path), "--store", store_path, "--workers", "1") as process:
         read_until(process, "[1/5]")

@@ -18,7 +18,7 @@ from tests.support.studies import small_table
 
 pytestmark = pytest.mark.process
 
-KILLS = 60
+KILLS = 20
 
 
 def outcome(script: str, store: Path) -> Any:
@@ -128,6 +128,7 @@ print(json.dumps(deaths))
 """
 
 
+@pytest.mark.all
 def test_a_layout_that_was_interrupted_is_begun_anew(store_path: Path) -> None:
     assert outcome(KILLED_LAYOUTS, store_path) > 5
     store = prepare_store(store_path, make_plan(Study.from_table(small_table())))

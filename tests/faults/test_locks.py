@@ -25,7 +25,7 @@ from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.errors import LockError
-from tests.support.commands import call, command, write_toml
+from tests.support.commands import call, write_toml
 
 # Stops in the middle of a study until it is told to go on; beats often. Told that its store was released, it
 # goes on when its heartbeat has ended.
@@ -67,8 +67,7 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
     study = write_toml(tmp_path)
     first = driving(study, store_path)
     try:
-        for arguments in (["run", study, "--store", store_path], ["verify", store_path]):
-            second = command(*arguments)
+        for second in (call("run", study, "--store", store_path), call("verify", store_path)):
             assert second.returncode == 2
             assert f"another run has this store to itself: process {first.pid} on " in second.stderr
             assert f"sobolev-batch release {store_path}" in second.stderr

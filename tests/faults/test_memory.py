@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.support.commands import call, write_toml
 
 
+@pytest.mark.process
 def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_path: Path) -> None:
     study = write_toml(tmp_path)
     study.write_text(study.read_text().replace("M = 16", "M = 1024"))

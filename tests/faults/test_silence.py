@@ -114,6 +114,7 @@ def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path,
     assert_same_fields(store_path, finished_store)
 
 
+@pytest.mark.all
 def test_a_cluster_without_workers_is_told() -> None:
     def told(address: str, needs_gpu: bool) -> str:
         with Client(address) as client, Watch(client, needs_gpu, 60).kept() as kept:

@@ -18,6 +18,7 @@ BUMP = 1 + 0.5 * np.exp(-200 * (1 - np.asarray(BALL.vertices)[:, 2:]))
 TARGET = sb.Mesh(np.asarray(BALL.vertices) * BUMP, BALL.triangles)
 
 
+@pytest.mark.all
 def test_edges_are_split_where_the_surface_is_not_met() -> None:
     start = sb.icosphere(3)
     refined = sb.refine(start, TARGET, -2.0, triangles=1400, steps=10).mesh
@@ -27,6 +28,7 @@ def test_edges_are_split_where_the_surface_is_not_met() -> None:
     assert at_bump.mean() > 0.5
 
 
+@pytest.mark.all
 def test_the_mesh_is_nearer_than_a_fitted_ball_of_as_many_triangles() -> None:
     start = sb.icosphere(1)
     refined = sb.refine(start, TARGET, -2.0, triangles=320, steps=40)

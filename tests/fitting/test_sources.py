@@ -55,6 +55,7 @@ def test_a_member_is_the_fit_in_the_unit_ball_of_its_target() -> None:
     np.testing.assert_allclose((found.vertices - [100, 0, 0]) / 30, expected.vertices, rtol=0, atol=1e-9)
 
 
+@pytest.mark.process
 def test_every_process_makes_the_same_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     member = members({**FIT, "target": SPHERE})[0]
     program = "import pickle, sys; print(pickle.load(sys.stdin.buffer).load().digest)"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.mutants.guards import guards_of
 from tests.mutants.trial import mirrors_of, try_one
 
@@ -50,6 +52,8 @@ def test_guards_are_conditions_that_raise_and_calls_that_check() -> None:
         compile(text, "roots.py", "exec")
 
 
+@pytest.mark.process
+@pytest.mark.all
 def test_a_guard_without_a_test_survives(tmp_path: Path) -> None:
     module, test = tmp_path / "package" / "layer" / "roots.py", tmp_path / "tests" / "layer" / "test_roots.py"
     for path, content in ((module, SOURCE), (test, TEST.encode())):

@@ -102,6 +102,7 @@ line.main()
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("on_terminal", [True, False])
 def test_a_terminal_has_one_line_and_a_file_one_for_each_change(on_terminal: bool, path: Path) -> None:
     arguments = [sys.executable, "-c", FOLLOWING, "status", str(path), "--follow"]

@@ -51,6 +51,7 @@ def _status_bytes(key: str) -> int:
     return 1024 * int(line.split()[1])
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")
 def test_no_step_holds_whole_arrays_of_temporaries() -> None:
     root = Path(__file__).parents[2]

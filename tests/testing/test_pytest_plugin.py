@@ -12,6 +12,8 @@ import pytest
 import sobolev_batch as sb
 from tests.support.repository import ROOT
 
+pytestmark = pytest.mark.process
+
 pytest_plugins = ["pytester"]
 
 MODULE = "sobolev_batch.testing.pytest_plugin"
@@ -41,8 +43,8 @@ def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     ("settings", "options", "folder"),
     [
         ("", [], ".pytest_cache/d/sobolev-witness"),
-        ("", ["--sobolev-witness-folder=chosen/here"], "chosen/here"),
-        ("[pytest]\nsobolev_witness_folder = of_settings", [], "of_settings"),
+        pytest.param("", ["--sobolev-witness-folder=chosen/here"], "chosen/here", marks=pytest.mark.all),
+        pytest.param("[pytest]\nsobolev_witness_folder = of_settings", [], "of_settings", marks=pytest.mark.all),
     ],
 )
 def test_files_lie_beside_the_failure(

@@ -166,8 +166,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         client = Client(address, timeout=seconds)
     except (OSError, ValueError) as error:
         raise ClusterError(
-            f"no Dask scheduler answers at {address!r} within {seconds:g} s ({error}); "
-            "start one with: dask scheduler"
+            f"no Dask scheduler answers at {address!r} within {seconds:g} s ({error}); start one with: dask scheduler"
         ) from error
     with client:
         workers = client.scheduler_info(n_workers=-1)["workers"]

@@ -247,6 +247,7 @@ def forbid_the_first(patched: pytest.MonkeyPatch) -> None:
         patched.setattr(kind, "projected_bytes", lambda self, i: 1e15 if i == 0 else 1.0)
 
 
+@pytest.mark.all
 def test_another_member_becomes_the_reference(store_path: Path, client: Client) -> None:
     """Whose own record, of a failure even, speaks for nothing any more."""
 
@@ -505,6 +506,7 @@ def test_no_note_speaks_for_values_that_are_being_replaced(files: Path, tmp_path
     }
 
 
+@pytest.mark.all
 def test_values_without_a_note_are_those_of_nobody(files: Path, tmp_path: Path, client: Client) -> None:
     """As an end between both leaves them; and then the mesh becomes smaller."""
     place = tmp_path / "s.zarr"

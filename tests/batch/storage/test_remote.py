@@ -109,6 +109,7 @@ def test_a_part_of_a_large_key_that_breaks_off_is_read_again(
     assert 6 <= len(made) <= 10
 
 
+@pytest.mark.all
 def test_what_is_cut_short_each_time_is_no_answer(storage: FailingStorage, location: Location) -> None:
     location.write({"a": DOCUMENT})
     storage.rule = Rule(1.0, ("truncated",))
@@ -128,7 +129,10 @@ def test_keys_that_a_server_does_not_remove_are_told_of(storage: FailingStorage,
     assert location.read("a/b") is None
 
 
-@pytest.mark.parametrize(("kind", "reason"), [("error", "InternalError"), ("reset before", "Could not connect")])
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [("error", "InternalError"), pytest.param("reset before", "Could not connect", marks=pytest.mark.all)],
+)
 def test_a_store_that_fails_for_good_is_given_up(
     storage: FailingStorage, location: Location, kind: Kind, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,6 +150,7 @@ def test_a_store_that_fails_for_good_is_given_up(
     assert location.read("a") == b"1"
 
 
+@pytest.mark.all
 def test_a_study_on_storage_that_fails_now_and_then(
     storage: FailingStorage, s3_client: Client, location: Location, finished_store: Path
 ) -> None:

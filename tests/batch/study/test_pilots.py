@@ -76,6 +76,7 @@ def test_only_wrong_meshes_are_refused_with_a_reason(folder: Path) -> None:
         sb.plan(study(folder), folder / "s.zarr")
 
 
+@pytest.mark.all
 def test_a_best_effort_serves_the_meshes_that_can_be_served(client: Client, folder: Path) -> None:
     near = sb.icosphere(2)
     rough = np.random.default_rng(0).normal(size=near.vertices.shape)

@@ -14,6 +14,7 @@ from sobolev_batch.results.figures.pictures import Output, parse_size
 from sobolev_batch.results.figures.plots import write_plots
 
 
+@pytest.mark.all
 def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path) -> None:
     settings = dict(mpl.rcParams)
     written = [

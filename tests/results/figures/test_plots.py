@@ -66,6 +66,7 @@ def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_pa
         write_plots(tree, tmp_path / "file")
 
 
+@pytest.mark.process
 def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTree) -> None:
     first, second = Figure().subplots(1, 2)
     assert sb.plot_convergence(tree, ax=first) is first

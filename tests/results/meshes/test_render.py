@@ -23,6 +23,8 @@ from sobolev_batch.results.meshes.views import MeshView, make_views
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
 
+pytestmark = pytest.mark.process
+
 Spheres = tuple[str, Path]
 drawing = pytest.mark.skipif(obstacle() is not None, reason=str(obstacle()))
 
@@ -111,6 +113,7 @@ def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spher
     assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
 
 
+@pytest.mark.all
 @drawing
 def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
@@ -132,6 +135,7 @@ def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Pa
     assert len(list(tmp_path.glob("witness-*"))) == 1
 
 
+@pytest.mark.all
 def test_plot_does_without_what_cannot_be_drawn(
     spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -236,6 +236,7 @@ class _Outline(HTMLParser):
         self.elements.append((tag, dict(attrs)))
 
 
+@pytest.mark.process
 def test_page_can_be_found_through_without_eyes(page: Path) -> None:
     outline = _Outline()
     outline.feed(page.read_text(encoding="utf-8"))
@@ -305,6 +306,7 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         assert omission in page.omissions
 
 
+@pytest.mark.all
 def test_a_page_without_rendered_pictures_says_why(
     store: str, folder: Path, page: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -343,6 +345,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
         assert "proximity" in reader.texts("#study-settings dt")
 
 
+@pytest.mark.all
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(Status.of(store), not_compared={"files/good": "no witness: <i>changed</i>"})
     monkeypatch.setattr(Status, "of", lambda _: status)
@@ -361,6 +364,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
         make_report(store)
 
 
+@pytest.mark.all
 def test_a_page_shows_one_state_of_a_store(
     finished_store: Path, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -171,6 +171,7 @@ def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Pa
     assert "1000000.2 " in text
 
 
+@pytest.mark.all
 def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
     done = call("table", str(store), "--over-time", "--truth", "true", "--order", "-4", folder=tmp_path)
     assert "over time" in done.stdout

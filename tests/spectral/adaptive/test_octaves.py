@@ -65,6 +65,7 @@ def test_a_seed_is_a_whole_number(seed: Any) -> None:
         distance(icosphere(1), icosphere(2), -1.0, rtol=0.05, seed=seed)
 
 
+@pytest.mark.all
 def test_the_unit_of_length_may_be_tiny_beside_the_surfaces() -> None:
     scale, ball, smaller = 1e9, icosphere(1), icosphere(1).moved(0.9, (0.0, 0.0, 0.0))
     pair = (ball.moved(scale, (0.0, 0.0, 0.0)), smaller.moved(scale, (0.0, 0.0, 0.0)))
@@ -82,6 +83,7 @@ def test_very_negative_orders_beside_low_ones_have_no_tail() -> None:
     assert found["distance"].values[2] == pytest.approx(exact["distance"].item(), rel=1e-3)
 
 
+@pytest.mark.all
 def test_many_orders_are_served_by_the_same_octaves() -> None:
     pair = icosphere(1), icosphere(2)
     together = distance(*pair, [-1.0, -2.0, -6.0], rtol=0.02)

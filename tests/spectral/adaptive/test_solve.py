@@ -247,6 +247,7 @@ def transform_of_ring(turn: float, frequencies: np.ndarray) -> np.ndarray:
     return np.asarray(HEIGHT * width * np.sinc(HEIGHT * frequencies[:, 2]) * (along * phase).sum(axis=1))
 
 
+@pytest.mark.all
 def test_a_turned_ring_differs_although_no_small_lattice_shows_it() -> None:
     found = distance(ring(0.0), ring(0.5), -2.0, rtol=0.3)
     # The integral over frequencies at which the sides can be told apart, by draws with even logarithms of |xi|.

@@ -104,6 +104,7 @@ def test_batches_and_blocks_agree(block: Block) -> None:
     assert_agree(found, expected, mesh)
 
 
+@pytest.mark.all
 def test_lattices_of_octaves_agree() -> None:
     # Turned and shifted, with a period far below the size of the mesh.
     mesh, lattice = icosphere(4), OctaveLattice.random(8.0, 32.0, 32, np.random.default_rng(0))
@@ -115,7 +116,7 @@ def test_lattices_of_octaves_agree() -> None:
     assert_agree(found, expected, mesh)
 
 
-@pytest.mark.parametrize("eps", [1e-5, 1e-9])
+@pytest.mark.parametrize("eps", [1e-5, pytest.param(1e-9, marks=pytest.mark.all)])
 def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog: pytest.LogCaptureFixture) -> None:
     mesh, settings, lattice = icosphere(5), TransformSettings(eps), Lattice(5.0, 64)
     expected = transform_block(mesh, lattice, lattice.half, settings)
@@ -266,6 +267,7 @@ def test_the_cpu_and_errors_survive_pickling() -> None:
     assert Device().backend().__reduce__() == (gpu_backend, ())
 
 
+@pytest.mark.process
 def test_importing_the_package_loads_nothing_of_a_gpu() -> None:
     # zarr imports CuPy where it is installed; nothing of this package does.
     code = "import sys, sobolev_batch; print('cufinufft' in sys.modules)"

@@ -79,7 +79,7 @@ def test_points_in_one_spot_are_looked_at_a_few_at_a_time(monkeypatch: pytest.Mo
     spot = RNG.normal(0.3, 1e-4, (200, 3))
     cloud = PointCloud.uniform(np.concatenate([RNG.uniform(-40.0, 40.0, (5000, 3)), spot]), 1.0)
     at_once, _ = PointPairs.of([cloud], START).beyond([-2.0])
-    monkeypatch.setattr(point_spectrum, "cKDTree", CountingTree)
+    monkeypatch.setattr(point_spectrum, "_tree", CountingTree)
     monkeypatch.setattr(point_spectrum, "_HELD_PAIRS", 1000)
     square, _ = PointPairs.of([cloud], START).beyond([-2.0])
     assert max(held) <= 1000

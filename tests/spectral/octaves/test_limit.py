@@ -119,6 +119,7 @@ def test_triangles_coincide_whichever_side_is_their_front() -> None:
         assert limit.value == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.all
 def test_thousands_of_triangles_in_a_plane_are_all_looked_up() -> None:
     def sheet(is_other_diagonal: bool) -> Mesh:
         count = 40

@@ -139,6 +139,8 @@ def test_states_the_smallest_memory() -> None:
         transform_block(mesh, lattice, lattice.half, TransformSettings(), Execution(allowed_bytes=least - 1.1e5))
 
 
+@pytest.mark.process
+@pytest.mark.all
 @pytest.mark.parametrize(("intervals", "memory"), [(128, None), (128, 6e7), (256, 3e8)])
 def test_takes_no_more_memory_than_it_says(intervals: int, memory: float | None) -> None:
     taken, said, result = map(int, memory_of_a_transform(intervals, memory).split())

@@ -213,6 +213,7 @@ def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, name: str,
         getattr(box(), f"to_{name}")()
 
 
+@pytest.mark.process
 def test_no_library_is_imported_to_tell_its_meshes() -> None:
     code = (
         "import sys, sobolev_batch as sb; sb.as_mesh(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]));"

@@ -632,6 +632,7 @@ def test_files_of_other_formats_are_refused_with_a_remedy(tmp_path: Path, name: 
     assert "{" not in str(caught.value)
 
 
+@pytest.mark.process
 def test_a_remedy_by_pyvista_makes_a_readable_file(tmp_path: Path) -> None:
     pyvista = pytest.importorskip("pyvista")
     parts = [pyvista.Box().triangulate(), pyvista.Box((2, 3, 2, 3, 2, 3))]

@@ -94,7 +94,7 @@ _TOKENS += [
 _fuzz = settings(
     derandomize=True,
     deadline=None,  # a mean over examples; each is timed by itself
-    max_examples=60,
+    max_examples=30,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
@@ -173,6 +173,8 @@ def main(folder: Path) -> None:
         sys.stdout.write(json.dumps([used.ru_utime - start, used.ru_maxrss]) + "\n")
 
 
+@pytest.mark.all
+@pytest.mark.process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is limited and measured as Linux does it")
 def test_damaged_files_take_little_more_time_and_memory_than_whole_ones(tmp_path: Path) -> None:
     root = Path(__file__).parents[3]
