@@ -24,12 +24,12 @@ $(MESHES): workflows/remeshers/make_meshes.py $(READY)
 # Whole files, longest first: see tests/conftest.py. Three for two cores, since many tests wait for processes to start.
 PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 # Compiled modules are kept, or each of the processes that tests start would compile the package anew.
-test test-all durations: export PYTHONDONTWRITEBYTECODE =
+test test-fast test-all durations: export PYTHONDONTWRITEBYTECODE =
 
 test: $(READY)  ## the tests: what must pass before a change is trusted, eight minutes
 	$(PYTEST) -n 3 -m "not all"
 
-test-fast: $(READY)  ## those that start no process and take no longer than two seconds, one minute
+test-fast: $(READY)  ## those that start no process and take less than a second, one minute
 	$(PYTEST) -n 2 -m "not (all or process or slow)"
 
 test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; an hour

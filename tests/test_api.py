@@ -33,6 +33,7 @@ def test_the_package_alone_imports_no_libraries() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_integers_of_numpy_are_whole_numbers() -> None:
     few: Any = np.int64(3)
     small: Any = np.int8(100)

@@ -28,6 +28,7 @@ def run(name: str) -> None:
     assert runner.failures == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -70,6 +70,7 @@ def offences(source: str, name: str = "") -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_no_source_can_run_what_it_reads() -> None:
     paths = sorted(PACKAGE.rglob("*.py"))
     assert len(paths) > 50

@@ -76,6 +76,7 @@ def test_a_plan_shows_its_lines() -> None:
         assert line[15:] in page.text
 
 
+@pytest.mark.slow
 def test_a_league_shows_both_tables(tmp_path: Path) -> None:
     families = [
         {"name": name, "source": "icosphere", "levels": levels}

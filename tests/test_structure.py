@@ -60,6 +60,7 @@ def arrows() -> list[tuple[Path, Path]]:
     return found
 
 
+@pytest.mark.slow
 def test_layers_know_only_those_below(arrows: list[tuple[Path, Path]]) -> None:
     backwards = [(a, b) for a, b in arrows if LAYERS.index(a[0]) < LAYERS.index(b[0])]
     assert not backwards
@@ -84,6 +85,7 @@ def test_every_folder_can_be_taken_in_at_a_glance() -> None:
         assert len(names) <= MOST_NAMES_OF_A_FOLDER, folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", ["surfaces", "spectral", "fitting"])
 def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
     files = list((PACKAGE / layer).rglob("*.py"))

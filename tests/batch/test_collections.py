@@ -124,6 +124,7 @@ def test_what_is_wrong_with_a_question_is_said_as_it_is(store: Path) -> None:
         sb.league({"a": store / "a", "b": store / "nowhere"})
 
 
+@pytest.mark.slow
 def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
     table = collection([*spheres(a=1.0), GONE, *spheres(b=1.1)]).table

@@ -138,6 +138,7 @@ def test_two_ways_to_spheres_agree_at_every_order(a: Sphere, b: Sphere) -> None:
         assert truth.uncertainty < 1e-4 * value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [(0.1, 0.07, 0.03), (0.001, 0.002, 0.001)], ids=["moved", "near"])
 @pytest.mark.parametrize(("orders", "accuracy"), [((-0.6,), 2e-3), ((-1.0, -1.5, -3.0), 6e-4)])
 def test_real_space_agrees_with_heat_traces_within_what_both_claim(
@@ -171,6 +172,7 @@ def test_heat_traces_do_not_depend_on_how_a_part_is_cut() -> None:
     assert np.all(slacks < 1e-10)
 
 
+@pytest.mark.slow
 def test_triangles_that_both_meshes_have_are_left_out() -> None:
     vertices = BOX.vertices.copy()
     vertices[0] += 0.1

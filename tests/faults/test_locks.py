@@ -94,6 +94,7 @@ def test_a_run_whose_store_was_released_ends(store_path: Path, tmp_path: Path) -
     assert "nothing more is written by a run that no longer has the store" in said
 
 
+@pytest.mark.slow
 def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
     study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch, threads: Client
 ) -> None:
@@ -115,6 +116,7 @@ def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
     assert Lock.read(Location.of(store_path)) == other
 
 
+@pytest.mark.slow
 def test_the_lock_of_another_machine_is_released_by_hand(
     study: Study, store_path: Path, caplog: pytest.LogCaptureFixture, threads: Client
 ) -> None:
@@ -198,6 +200,7 @@ def test_a_lock_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
         acquire(location, Lock.of_this_process())
 
 
+@pytest.mark.slow
 def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(
     study: Study, store_path: Path, threads: Client
 ) -> None:

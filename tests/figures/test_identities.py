@@ -47,6 +47,7 @@ def fields(points: tuple[list[WeightedPoints], list[WeightedPoints]]) -> tuple[x
     return field(points[0]), field(points[1])
 
 
+@pytest.mark.slow
 def test_bands_add_up(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
     squared = sb.distance(*fields, ORDERS)["distance"] ** 2
     bands = sb.spectrum(*fields, ORDERS)["squared"]

@@ -42,6 +42,7 @@ def test_figure_1b_trapezoidal_rule_for_the_sphere(intervals: int) -> None:
         assert error == pytest.approx(expected, rel=1e-3, abs=5e-15)
 
 
+@pytest.mark.slow
 def test_figure_3b_icospheres_converge_with_second_order() -> None:
     lattice = Lattice(5.0, 128)
     sphere = fourier_transform(Sphere(), lattice)

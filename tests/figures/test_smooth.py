@@ -21,6 +21,7 @@ def figures(shape: str) -> list[float]:
     return [float(entry) for entry in line.strip("|").split("|")[1:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "surface", "mesh"),
     [

@@ -48,6 +48,7 @@ def normals(mesh: sb.Mesh) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
+@pytest.mark.slow
 def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.Fit) -> None:
     orders = [-1.5, -2.0, -4.0]
     before, after = (sb.distance(mesh, TARGET, orders, rtol=3e-2)["distance"].values for mesh in (START, fitted.mesh))
@@ -88,6 +89,7 @@ def test_a_ball_becomes_something_else() -> None:
     assert fitted.after.chamfer < fitted.before.chamfer / 5
 
 
+@pytest.mark.slow
 def test_moving_both_moves_the_result() -> None:
     by = np.array([30.0, -5.0, 7.0])
     start, target = (sb.Mesh(mesh.vertices + by, mesh.triangles) for mesh in (START, TARGET))
@@ -95,6 +97,7 @@ def test_moving_both_moves_the_result() -> None:
     assert np.abs(other.mesh.vertices - by - one.mesh.vertices).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_boundaries_stay_if_asked() -> None:
     cap = np.asarray(START.vertices)[START.triangles][:, :, 2].mean(axis=1) > 0.1
     half = sb.Mesh(START.vertices, START.triangles[cap])
@@ -110,6 +113,7 @@ def test_boundaries_stay_if_asked() -> None:
         assert np.abs(mesh.vertices - half.vertices).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_triangles_without_common_vertices_stay_together() -> None:
     soup = sb.Mesh(
         np.asarray(START.vertices)[START.triangles].reshape(-1, 3), np.arange(3 * len(START.triangles)).reshape(-1, 3)
@@ -121,6 +125,7 @@ def test_triangles_without_common_vertices_stay_together() -> None:
     assert len(np.unique(fitted.vertices, axis=0)) == len(np.unique(START.vertices, axis=0))
 
 
+@pytest.mark.slow
 def test_an_interrupt_keeps_the_best_so_far() -> None:
     seen: list[sb.FitProgress] = []
 

@@ -60,6 +60,7 @@ MESHES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_it_is_the_derivative_of_plain_sums(name: str) -> None:
     mesh, orders = MESHES[name], [-0.75, -2.0, -6.0]
@@ -99,6 +100,7 @@ def test_flat_vertices_give_a_flat_derivative() -> None:
     np.testing.assert_array_equal(flat.reshape(-1, 3), gradient)
 
 
+@pytest.mark.slow
 def test_two_meshes_that_move_together_keep_their_distance() -> None:
     a, b, lattice = wrinkled(2), moved(wrinkled(3), 0.3, 0, 0.1), sb.Lattice(3.0, 40)
     of_a, of_b = (sb.gradient(*pair, -3.0, lattice=lattice, eps=1e-11) for pair in ((a, b), (b, a)))
@@ -138,6 +140,7 @@ def pair_and_gradient(name: str) -> tuple[sb.Mesh, sb.Mesh | sb.Sphere, xr.Datas
     return mesh, target, sb.gradient(mesh, target, ORDERS, lattice=sb.Lattice(8.0, 72), eps=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("highest", "intervals", "eps"), [(2.0, 20, 1e-4), (3.0, 24, 1e-9), (5.0, 60, 1e-2)])
 @pytest.mark.parametrize("name", [pytest.param("ball in ball", marks=pytest.mark.all), "moved", "box"])
 def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, intervals: int, eps: float) -> None:

@@ -39,6 +39,7 @@ def test_the_mesh_is_nearer_than_a_fitted_ball_of_as_many_triangles() -> None:
     assert refined.steps > 40
 
 
+@pytest.mark.slow
 def test_the_target_can_be_a_field_alone() -> None:
     field = sb.fourier_transform(TARGET, sb.Lattice(4.0, 48))
     refined = sb.refine(sb.icosphere(1), field, -4.0, triangles=160, steps=20)
@@ -46,6 +47,7 @@ def test_the_target_can_be_a_field_alone() -> None:
     assert refined.after.distance < refined.before.distance / 5
 
 
+@pytest.mark.slow
 def test_progress_counts_all_rounds() -> None:
     seen: list[sb.FitProgress] = []
     found = sb.refine(sb.icosphere(0), sb.Ellipsoid((1.3, 1, 1)), -4.0, triangles=70, steps=5, notify=seen.append)
@@ -53,6 +55,7 @@ def test_progress_counts_all_rounds() -> None:
     assert {progress.steps for progress in seen} == {15}
 
 
+@pytest.mark.slow
 def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(progress: sb.FitProgress) -> None:
         if progress.step == 7:
@@ -73,6 +76,7 @@ def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(found.mesh.triangles) == 20
 
 
+@pytest.mark.slow
 def test_vertices_at_one_place_become_one_and_boundaries_stay() -> None:
     sheet = sb.icosphere(1)
     upper = np.asarray(sheet.triangles)[np.asarray(sheet.vertices)[sheet.triangles][..., 2].mean(axis=1) > -0.3]
@@ -102,6 +106,7 @@ def test_goals_that_cannot_be_reached_are_refused(goal: Any, message: str) -> No
         sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=goal)
 
 
+@pytest.mark.slow
 def test_a_member_is_the_refinement_in_the_unit_ball_of_its_target() -> None:
     table: dict[str, Any] = {
         "source": "refine",

@@ -47,6 +47,7 @@ def test_a_study_fits_to_its_reference_and_reuses_what_it_has(client: Client, tm
     assert sb.run(other, store=tmp_path / "store.zarr", client=client).computed == ("fitted/1", "fitted/2")
 
 
+@pytest.mark.slow
 def test_a_member_is_the_fit_in_the_unit_ball_of_its_target() -> None:
     _, member = members({**FIT, "target": SPHERE})
     start, found = loaded(members(STARTS)[1]), loaded(member)

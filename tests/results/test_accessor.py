@@ -73,6 +73,7 @@ def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
         assert norms["norm"].values[i] == pytest.approx(sb.norm(one, ORDERS)["norm"].values, rel=1e-13)
 
 
+@pytest.mark.slow
 def test_a_stack_is_not_held_at_once() -> None:
     field = sb.fourier_transform(sb.Sphere(0.5), sb.Lattice(4.0, 48))
     count = 40

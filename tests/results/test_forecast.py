@@ -94,6 +94,7 @@ def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
     assert fitted.member.expected_size().seconds > 1 > fast.member.expected_size().seconds
 
 
+@pytest.mark.slow
 def test_points_of_clouds_count(tmp_path: Path) -> None:
     seconds = []
     for count in (1_000, 100_000):

@@ -55,6 +55,7 @@ def running(store: Store, *finished: float, begun: float = 0.0, state: str = "ru
     return Status.of(store.path)
 
 
+@pytest.mark.slow
 def test_the_time_left_follows_from_the_last_ones(store: Store) -> None:
     status = running(store, 0, 10, 40, 70)
     # Times in records are whole seconds, and that of the end may be the next one.
@@ -63,6 +64,7 @@ def test_the_time_left_follows_from_the_last_ones(store: Store) -> None:
     assert status.progress == "4 of 5 done, 1 failed, 2 a minute, about 30 s left at this rate"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_told_is_not(store: Store) -> None:
     for status in (running(store, 0, 10), running(store, 0, 0, 0), running(store, 0, 10, 40, begun=20)):
         assert status.progress.endswith(" of 5 done, 1 failed, time left not known yet")
@@ -70,6 +72,7 @@ def test_what_cannot_be_told_is_not(store: Store) -> None:
     assert running(store, state="submitted").progress == "0 of 5 done, 0 failed, no worker has taken it up yet"
 
 
+@pytest.mark.slow
 def test_a_moment_between_two_objects_is_not_the_end(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     ended = replace(Status.of(store.path), run_store="object")
     goes_on = replace(running(store), run_store="object")

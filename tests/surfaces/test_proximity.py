@@ -25,6 +25,7 @@ def test_parallel_squares() -> None:
     assert found.chamfer_error < 1e-12
 
 
+@pytest.mark.slow
 def test_a_square_within_a_larger_one() -> None:
     found = proximity(square(2.0), square(4.0), points=200_000)
     # The corner of the larger is the farthest point; from the smaller one all distances are zero.
@@ -37,6 +38,7 @@ def test_a_square_within_a_larger_one() -> None:
     assert proximity(square(4.0), square(2.0), points=200_000).hausdorff == found.hausdorff
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_the_drawing() -> None:
     a, b = square(2.0), square(4.0)
     exact = proximity(a, b, points=400_000).chamfer

@@ -25,6 +25,7 @@ def test_an_undecided_comparison_fails() -> None:
         sb.assert_same_surface(sb.Sphere(0.9), sb.Sphere(), rtol=truth, scaling=False)
 
 
+@pytest.mark.slow
 def test_the_files_show_the_place_of_a_lost_patch(tmp_path: Path) -> None:
     whole = sb.Mesh(1000 + 20 * sb.icosphere(4).vertices, sb.icosphere(4).triangles)
     heights = whole.vertices[whole.triangles].mean(axis=1)[:, 2]
@@ -48,6 +49,7 @@ def test_the_files_show_the_place_of_a_lost_patch(tmp_path: Path) -> None:
         assert "comparison part" in " ".join(data.comments)
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written_leaves_the_failure_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(AssertionError, match=r"^different surfaces: .*; no witness: .*file"):

@@ -11,6 +11,7 @@ from tests.support.gallery import run_blocks
 from tests.support.repository import blocks
 
 
+@pytest.mark.slow
 def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     assert len(blocks("docs/testing.md", "python")) == 5

@@ -67,6 +67,7 @@ def test_quadrilaterals_cut_along_the_other_diagonal() -> None:
     assert sb.same_surface((BOX_VERTICES, others), (BOX_VERTICES, halves[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -93,6 +94,7 @@ def test_another_surface(change: Callable[[sb.Mesh], sb.Mesh], mesh: sb.Mesh) ->
     assert verdict.distance - verdict.error > verdict.rtol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_neither_the_unit_nor_the_place_of_both_matters(scale: float, mesh: sb.Mesh) -> None:
     place = scale * np.array([1e3, -2e3, 0.0])
@@ -103,6 +105,7 @@ def test_neither_the_unit_nor_the_place_of_both_matters(scale: float, mesh: sb.M
     assert sb.same_surface((other.vertices, other.triangles[1:]), own, rtol=1e-4).outcome == "different"
 
 
+@pytest.mark.slow
 def test_flat_and_open_meshes_of_several_parts() -> None:
     square = sb.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     assert sb.same_surface(split(split(square)), square)
@@ -114,6 +117,7 @@ def test_flat_and_open_meshes_of_several_parts() -> None:
     assert sb.same_surface(square, beside).outcome == "different"
 
 
+@pytest.mark.slow
 def test_files_and_closed_forms(tmp_path: Path) -> None:
     sb.write_mesh(sb.icosphere(4), tmp_path / "sphere.ply")
     verdict = sb.same_surface(tmp_path / "sphere.ply", sb.Sphere(), rtol=0.01)
@@ -133,6 +137,7 @@ def test_between_same_and_different_it_is_undecided() -> None:
     assert str(verdict).startswith("undecided: relative distance 0.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("move", "rtol"), [(5e-4, 1e-5), (1e-4, 1e-7), (1e-6, 1e-12)])
 def test_what_is_printed_holds_the_truth(move: float, rtol: float) -> None:
     own = sb.icosphere(2)

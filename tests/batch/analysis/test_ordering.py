@@ -36,6 +36,7 @@ def names(folder: Path) -> list[str]:
     return list(sb.table(store_of(folder), -3)["name"])
 
 
+@pytest.mark.slow
 def test_files_go_from_few_triangles_to_many_and_have_rates(folder: Path) -> None:
     run(folder)
     frame = sb.table(store_of(folder), -3)
@@ -45,6 +46,7 @@ def test_files_go_from_few_triangles_to_many_and_have_rates(folder: Path) -> Non
     assert frame["rate"].round().tolist()[1:] == [2, 2]
 
 
+@pytest.mark.slow
 def test_a_key_orders_by_names_naturally_and_then_there_are_no_rates(folder: Path) -> None:
     run(folder, order_by="names")
     frame = sb.table(store_of(folder), -3)
@@ -54,6 +56,7 @@ def test_a_key_orders_by_names_naturally_and_then_there_are_no_rates(folder: Pat
     assert names(folder) == ["b", "a10", "a9"], "the key alone makes the tables anew"
 
 
+@pytest.mark.slow
 def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
     ball = sb.icosphere(1)
     draw = np.random.default_rng(1)
@@ -69,6 +72,7 @@ def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
     assert sb.table(store_of(tmp_path), -3)["rate"].notna().any()
 
 
+@pytest.mark.slow
 def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:
     for name in ("x10", "x9"):
         sb.write_mesh(sb.icosphere(0), tmp_path / f"{name}.ply")
@@ -76,12 +80,14 @@ def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:
     assert names(tmp_path) == ["x9", "x10"]
 
 
+@pytest.mark.slow
 def test_a_mesh_that_failed_comes_last(folder: Path) -> None:
     (folder / "a0.ply").write_text("no mesh")
     run(folder)
     assert names(folder) == ["b", "a10", "a9", "a0"]
 
 
+@pytest.mark.slow
 def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folder: Path) -> None:
     run(folder)
     path, away = folder / "a10.ply", folder / "a10.away"
@@ -98,6 +104,7 @@ def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folde
     assert names(folder) == ["b", "a10", "a9"]
 
 
+@pytest.mark.slow
 def test_the_rate_of_a_mesh_bridges_a_removed_one(folder: Path) -> None:
     run(folder)
     (folder / "a10.ply").unlink()
@@ -106,6 +113,7 @@ def test_the_rate_of_a_mesh_bridges_a_removed_one(folder: Path) -> None:
     assert round(rates["a9"]) == 2
 
 
+@pytest.mark.slow
 def test_renamed_meshes_keep_their_fields(folder: Path) -> None:
     run(folder)
     before = sb.table(store_of(folder), -3).set_index("name")["distance"]
@@ -122,6 +130,7 @@ def test_renamed_meshes_keep_their_fields(folder: Path) -> None:
     assert sb.verify(store_of(folder)).is_sound
 
 
+@pytest.mark.slow
 def test_names_that_files_swap_are_not_mixed_up(folder: Path) -> None:
     run(folder)
     before = sb.table(store_of(folder), -3).set_index("name")["distance"]

@@ -59,6 +59,7 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1, 2, 500])
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 11, 200])
 def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int) -> None:

@@ -64,6 +64,7 @@ def _die_once(mark: Path) -> int:
     return os.getpid()
 
 
+@pytest.mark.all
 def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
     # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
     with dask_settings.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1) as client:

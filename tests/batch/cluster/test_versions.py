@@ -180,6 +180,7 @@ def test_an_extra_that_the_study_needs(client: Client, tmp_path: Path, monkeypat
         require_same_versions(client, ["sobolev-batch-remesher"])
 
 
+@pytest.mark.slow
 def test_a_study_knows_what_its_sources_need() -> None:
     sphere = {"source": "icosphere", "levels": [3]}
     remeshed = {"source": "remesh", "mesh": sphere, "triangles": [100]}

@@ -28,6 +28,7 @@ def study_on(backend: str) -> Study:
     return Study.from_table(small_table(transform={"backend": backend}))
 
 
+@pytest.mark.all
 @pytest.mark.process
 def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
     boastful_cluster: str, store_path: Path
@@ -71,6 +72,7 @@ def test_workers_that_join_later_are_equipped_too() -> None:
         assert all(worker["resources"][MEMORY] > 0 for worker in workers)
 
 
+@pytest.mark.all
 def test_the_memory_of_local_workers_can_be_given() -> None:
     with local_client(1, "3GB") as client:
         (member,) = prepare_workers(client).members
@@ -95,6 +97,7 @@ def _die_once(marker: Path) -> str:
     return "alive"
 
 
+@pytest.mark.all
 def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tmp_path: Path) -> None:
     with local_client(1, "1GB") as client:
         prepare_workers(client)
@@ -102,6 +105,7 @@ def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tm
         assert task.result(timeout=PATIENCE_SECONDS) == "alive"
 
 
+@pytest.mark.all
 def test_workers_are_described_as_they_are_after_their_setup() -> None:
     """A second client registers nothing and waits for nothing of its own accord."""
     with local_client(1) as client, Client(client.scheduler.address, set_as_default=False) as second:

@@ -68,7 +68,7 @@ def computed(client: Client, job: Job, batches: int, blocks: tuple[Block, ...]) 
     return record
 
 
-@pytest.mark.parametrize("batches", [2, 3, 7])
+@pytest.mark.parametrize("batches", [3, *(pytest.param(count, marks=pytest.mark.all) for count in (2, 7))])
 def test_octaves_of_batches_add_up_to_those_of_the_whole(client: Client, store_path: Path, batches: int) -> None:
     lattice = {"xi_max": 3.0, "M": 16, "octaves": 2}
     plan = make_plan(Study.from_table(small_table(lattice=lattice, norm={"orders": [-1.5, -2.0]})))

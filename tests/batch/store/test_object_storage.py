@@ -365,6 +365,7 @@ def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.
             forget_drivers()
 
 
+@pytest.mark.all
 def test_workers_that_do_not_reach_the_store_are_found_at_once(server: Server, url: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]

@@ -260,6 +260,7 @@ def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:
         sb.init_study(tmp_path, tmp_path / "nowhere" / "study.toml")
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_study_that_runs_and_keeps_it(tmp_path: Path) -> None:
     write(tmp_path / "original.ply", 2)
     for level in (0, 1):

@@ -52,6 +52,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         sys.modules.pop(name, None)
 
 
+@pytest.mark.slow
 def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
     exec("".join(blocks("python")[:2]), {})
     first, second = capsys.readouterr().out.splitlines()
@@ -59,6 +60,7 @@ def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert float(second.split()[0]) > 1.6**2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("packages")
 def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path) -> None:
     (study_text,) = (text for text in blocks("toml") if text.startswith("[study]"))
@@ -80,6 +82,7 @@ def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path) -> None:
         assert 0.01 < distances.sel(mesh="ball/wavy-ball").item() < 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("packages")
 def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path) -> None:
     def write_archive(**scales: float) -> None:

@@ -46,6 +46,7 @@ def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Pat
     assert pilots.extent.reach == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice(folder: Path) -> None:
     ball = sb.icosphere(1)
     sb.write_mesh(sb.Mesh(1.5 * ball.vertices, ball.triangles), folder / "large.off")

@@ -59,6 +59,7 @@ def egg_table(**changes: Any) -> dict[str, Any]:
     return torus_table(reference={"source": "ellipsoid", **EGG}, family=[family], **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("table", "levels"), [(torus_table(), 4), (egg_table(), 5)], ids=["torus", "ellipsoid"])
 def test_refinements_converge_with_second_order(
     threads: Client, store_path: Path, table: dict[str, Any], levels: int
@@ -82,6 +83,7 @@ def test_refinements_converge_with_second_order(
     assert rows["backend"].item() == "finufft"
 
 
+@pytest.mark.slow
 def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path: Path) -> None:
     study = Study.from_table(torus_table())
     run(study, store_path, threads)
@@ -95,6 +97,7 @@ def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path
     assert area == pytest.approx(unit.area, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_only_what_changed_is_computed_again(threads: Client, store_path: Path) -> None:
     def go(**changes: Any) -> tuple[str, ...]:
         return run(Study.from_table(torus_table(scaling={"mode": "none"}, **changes)), store_path, threads).computed
@@ -107,6 +110,7 @@ def test_only_what_changed_is_computed_again(threads: Client, store_path: Path) 
     assert go(family=[{**family[0], "axes": [0.8, 1.0, 0.5]}], reference={**here, "r": 0.41}) == ("f/ellipsoid",)
 
 
+@pytest.mark.slow
 def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]
@@ -119,6 +123,7 @@ def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     assert found["distance"].values[0] / found["distance"].values[1] == pytest.approx(4.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_path: Path) -> None:
     family = [{"name": "grid", "source": "torus-grid", **RING, "levels": [1]}]
     study = Study.from_table(torus_table(family=family))
@@ -157,6 +162,7 @@ def own(surface: ParametrisedSurface, **changes: Any) -> Study:
     return study
 
 
+@pytest.mark.slow
 def test_a_reference_of_one_s_own(threads: Client, store_path: Path) -> None:
     family = [{"name": "turned", "source": "torus", "R": 1.0, "r": 0.4}]
     surface = turned_torus(Torus(1.0, 0.4))
@@ -168,6 +174,7 @@ def test_a_reference_of_one_s_own(threads: Client, store_path: Path) -> None:
     assert norms.sel(mesh="reference").values == pytest.approx(norms.sel(mesh="turned/torus").values, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,6 +199,7 @@ def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
     assert make_plan(Study.from_table(egg_table())).similarity.scale == 0.5
 
 
+@pytest.mark.slow
 def test_error_targets_of_smooth_references_are_met_by_settings() -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]

@@ -190,6 +190,7 @@ OVERSIZED: dict[str, tuple[str, Any, str, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("path", "value", "asked", "allowed"), OVERSIZED.values(), ids=OVERSIZED.keys())
 def test_sizes_beyond_the_bounds_are_refused_with_both_numbers(path: str, value: Any, asked: str, allowed: str) -> None:
     table = changed(path, value)
@@ -204,6 +205,7 @@ def test_sizes_beyond_the_bounds_are_refused_with_both_numbers(path: str, value:
     assert peak_bytes < 48 << 20
 
 
+@pytest.mark.slow
 def test_all_values_together_are_bounded() -> None:
     families = [{"name": f"f{i}", "source": "files", "paths": ["a"] * 10_000} for i in range(101)]
     assert "the study has more than 1000000 values" in refusal(small_table(family=families))
@@ -215,6 +217,7 @@ def test_of_many_offenders_the_first_are_listed() -> None:
     assert message.endswith("; and 90 more")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [21, 1000, 200_000])
 def test_deep_tables_are_refused(depth: int) -> None:
     deep: Any = 1
@@ -462,12 +465,14 @@ def _ends_well(table: dict[str, Any]) -> None:
         assert study.families
 
 
+@pytest.mark.slow
 @_fuzz
 @given(table=st.dictionaries(_keys, _values, max_size=6))
 def test_any_tables_end_in_a_study_or_a_study_error(table: dict[str, Any]) -> None:
     _ends_well(table)
 
 
+@pytest.mark.slow
 @_fuzz
 @given(data=st.data())
 def test_damaged_studies_end_in_a_study_or_a_study_error(data: st.DataObject) -> None:
@@ -536,6 +541,7 @@ def test_names_without_a_flaw_are_seen_as_they_are(text: str) -> None:
         assert reason.isprintable()
 
 
+@pytest.mark.slow
 @_fuzz
 @given(value=_values)
 def test_values_are_shown_on_one_line(value: Any) -> None:

@@ -21,6 +21,7 @@ def texts(legend: Legend | None) -> list[str]:
     return [text.get_text() for text in legend.get_texts()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 8, 30])
 @pytest.mark.parametrize("width", [3.3, 6.4])
 def test_every_family_is_named_and_no_data_are_hidden(count: int, width: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import xarray as xr
 from scipy.spatial.distance import cdist
 
@@ -29,6 +30,7 @@ def store_of(points: np.ndarray) -> xr.DataTree:
     return xr.DataTree.from_dict({"/meshes": meshes, "/distances": pairs, "/convergence": convergence})
 
 
+@pytest.mark.slow
 def test_names_on_a_map_hide_nothing() -> None:
     tree = store_of(np.random.default_rng(5).normal(size=(60, 2)))
     for size in ((6.4, 4.4), (3.3, 2.4)):

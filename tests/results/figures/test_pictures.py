@@ -34,6 +34,7 @@ def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path
     assert dict(mpl.rcParams) == settings
 
 
+@pytest.mark.slow
 def test_the_size_is_that_of_a_panel(tree: xr.DataTree, tmp_path: Path) -> None:
     output = Output(("png",), parse_size("3x2in"))
     (path, *_) = write_plots(tree, tmp_path, output=output).paths

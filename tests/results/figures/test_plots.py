@@ -44,6 +44,7 @@ def pairs(tree: xr.DataTree) -> xr.DataTree:
     return tree
 
 
+@pytest.mark.slow
 def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> None:
     axes = sb.plot_matrix(pairs, -10.0)
     assert axes.get_title().startswith("Sobolev distance of order -10")
@@ -58,6 +59,7 @@ def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> N
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
+@pytest.mark.slow
 def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:
     for path in write_plots(tree, tmp_path / "new" / "folder").paths:
         assert path.read_bytes().startswith(b"\x89PNG")

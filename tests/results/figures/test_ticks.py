@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from sobolev_batch.results.figures.ticks import set_log_ticks, tick_labels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inches", [(6.4, 3.6), (3.3, 2.4)])
 @pytest.mark.parametrize(
     ("low", "high"),

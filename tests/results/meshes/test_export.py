@@ -46,6 +46,7 @@ def evaluated(place: str, label: str, points: np.ndarray) -> np.ndarray:
     return np.asarray(sb.witness(fields.sel(mesh=label), fields.sel(mesh="reference"), ORDERS, scaled).values)
 
 
+@pytest.mark.slow
 def test_ply_holds_the_mesh_of_the_file_and_its_witness(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     for label in LABELS:
@@ -63,6 +64,7 @@ def test_ply_holds_the_mesh_of_the_file_and_its_witness(spheres: Spheres, tmp_pa
         assert (sb.read_mesh(path).vertices == own.vertices).all()
 
 
+@pytest.mark.slow
 def test_the_header_tells_what_the_numbers_are(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     path = sb.write_witness(place, LABELS[0], tmp_path / "a.ply", [-2.5], folder)
@@ -81,6 +83,7 @@ def test_the_header_tells_what_the_numbers_are(spheres: Spheres, tmp_path: Path)
     assert float(unit[1]) == pytest.approx(RADIUS)
 
 
+@pytest.mark.slow
 def test_signs_of_spheres_within_around_and_beside(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     inner, beside, outer = (
@@ -97,6 +100,7 @@ def test_signs_of_spheres_within_around_and_beside(spheres: Spheres, tmp_path: P
     assert np.abs(beside["witness_minus_2_5"][np.abs(along - 0.15) < 0.02]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_its_integral_against_the_difference_is_the_squared_distance(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     tree = sb.open_store(place)
@@ -115,6 +119,7 @@ def vertex_areas(mesh: sb.Mesh) -> Any:
     return np.bincount(mesh.triangles.ravel(), np.repeat(mesh.areas / 3, 3), len(mesh.vertices))
 
 
+@pytest.mark.slow
 def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
     pyvista = pytest.importorskip("pyvista", reason="pyvista, of the extra vtk, is not installed")
     place, folder = spheres
@@ -130,6 +135,7 @@ def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_stored_values_are_taken(spheres: Spheres) -> None:
     place, folder = spheres
     exporter = Exporter.of(place, folder=folder)
@@ -152,6 +158,7 @@ def test_stored_values_are_taken(spheres: Spheres) -> None:
     assert other.values == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
     table = {
         "study": {"name": "stored"},
@@ -185,6 +192,7 @@ def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
     assert np.isfinite(PlyData.read(path)["vertex"]["witness_minus_3"]).all()
 
 
+@pytest.mark.slow
 def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
     place, folder = spheres
     exporter = Exporter.of(place, folder=folder)
@@ -195,6 +203,7 @@ def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> No
     assert np.isfinite(values[:, :-2]).all()
 
 
+@pytest.mark.slow
 def test_the_command_writes_all_meshes_into_one_folder(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     done = call(place, "--output", tmp_path / "out", "--folder", folder)
@@ -210,6 +219,7 @@ def test_the_command_writes_all_meshes_into_one_folder(spheres: Spheres, tmp_pat
     assert "witness_minus_4" not in read_ply(tmp_path / "0002-files-beside.ply")["vertex"].data.dtype.names
 
 
+@pytest.mark.slow
 def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     copy = shutil.copytree(folder, tmp_path / "copy")
@@ -232,6 +242,7 @@ def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres:
     )
 
 
+@pytest.mark.slow
 def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place, folder = spheres
     refused: list[tuple[str, str, list[float] | None, str]] = [
@@ -258,6 +269,7 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
     assert os.listdir(tmp_path) == ["taken"]
 
 
+@pytest.mark.slow
 def test_without_a_reference_there_is_nothing_to_compare_with(
     spheres: Spheres, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ def viewed(vertices: np.ndarray, triangles: np.ndarray, values: np.ndarray) -> n
     return best_viewpoint(seen_of_worst(vertices, triangles, values[None], limits)).direction
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_worst_place_is_in_front(sign: int) -> None:
     rng = np.random.default_rng(8)

@@ -284,6 +284,7 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
         make_views(tree, folder, ["nobody"])
 
 
+@pytest.mark.slow
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: dict[str, list[Any]] = {name: [] for name in _CHARTS}
     monkeypatch.setattr(build, "study_pictures", lambda *_: nothing)
@@ -355,6 +356,7 @@ def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatc
     assert "no witness: &lt;i&gt;changed&lt;/i&gt;" in text
 
 
+@pytest.mark.slow
 def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def damaged(*_: object, **__: object) -> None:
         raise ValueError("Stored and computed checksum do not match.")

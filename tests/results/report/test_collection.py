@@ -93,6 +93,7 @@ def test_method_and_distance_are_seen_at_every_width(reader: Browser, page: Path
     assert reader.relative_columns() == {"table-league": True, "table-objects": True}
 
 
+@pytest.mark.slow
 def test_a_collection_without_league_says_why(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise InputError("no object has all of the methods <a>")

@@ -31,6 +31,7 @@ def stores() -> tuple[str, str]:
     return places[0], places[1]
 
 
+@pytest.mark.slow
 def test_any_order_is_that_of_a_study_that_asks_for_it(stores: tuple[str, str]) -> None:
     few, every = (sb.table(store, ORDERS) for store in stores)
     pd.testing.assert_frame_equal(few.drop(columns="seconds"), every.drop(columns="seconds"), rtol=1e-12)
@@ -42,6 +43,7 @@ def test_any_order_is_that_of_a_study_that_asks_for_it(stores: tuple[str, str]) 
     assert few[(few["order"] == -3.7) & (few["status"] == "complete")]["resolved"].all()
 
 
+@pytest.mark.slow
 def test_any_order_is_that_of_the_two_surfaces(stores: tuple[str, str]) -> None:
     row = sb.table(stores[0], -3.7).set_index("mesh").loc["ico/2"]
     scale = sb.Similarity.to_unit_ball(sb.Sphere()).scale
@@ -50,6 +52,7 @@ def test_any_order_is_that_of_the_two_surfaces(stores: tuple[str, str]) -> None:
     assert abs(row["distance"] - direct["distance"].item()) < row["error"] + direct["error"].item()
 
 
+@pytest.mark.slow
 def test_matrices_of_any_order(stores: tuple[str, str]) -> None:
     for values in ("distance", "error"):
         few, every = (sb.matrix(store, -3.7, values) for store in stores)
@@ -59,6 +62,7 @@ def test_matrices_of_any_order(stores: tuple[str, str]) -> None:
     assert "\nNot of the study, but computed now from its stored fields: order -3.7." in texts[0]
 
 
+@pytest.mark.slow
 def test_text_says_what_such_orders_rest_on(stores: tuple[str, str]) -> None:
     text = format_table(sb.open_store(stores[0]), "text", [-3.7])
     assert "computed now from its stored fields: order -3.7." in text
@@ -66,6 +70,7 @@ def test_text_says_what_such_orders_rest_on(stores: tuple[str, str]) -> None:
     assert "lost/nowhere is failed: " in text
 
 
+@pytest.mark.slow
 def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(StoredFields, "results")
     assert set(sb.table(stores[0])["order"]) == {-10.0, -3.0}
@@ -74,6 +79,7 @@ def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytes
         sb.table(stores[0], -3.7)
 
 
+@pytest.mark.slow
 def test_a_damaged_field_is_named(tmp_path: Path, threads: Client) -> None:
     store = tmp_path / "s.zarr"
     sb.run(sb.Study.from_table(small_table()), store, threads)
@@ -84,6 +90,7 @@ def test_a_damaged_field_is_named(tmp_path: Path, threads: Client) -> None:
     assert len(sb.table(store, -3.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [-0.5, 1.0, [], "all"])
 def test_other_orders_are_refused(stores: tuple[str, str], order: float) -> None:
     for ask in (sb.table, sb.matrix, sb.evolution):

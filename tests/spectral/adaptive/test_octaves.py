@@ -28,6 +28,7 @@ def exact_distances(name: str) -> dict[float, float]:
     return dict(zip(ORDERS, a.distance(b, ORDERS).tolist(), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize(("order", "rtol"), [(-0.7, 1e-1), (-1.0, 3e-2), (-2.0, 1e-2), (-3.0, 1e-3)])
 def test_flat_and_periodic_faces_against_their_heat_trace(name: str, order: float, rtol: float) -> None:
@@ -47,6 +48,7 @@ def test_spheres_against_their_closed_form(order: float) -> None:
     assert abs(norm(a, order, rtol=1e-2)["norm"].item() / norm(a, order)["norm"].item() - 1) < 1e-2
 
 
+@pytest.mark.slow
 def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> None:
     pair = icosphere(1), icosphere(2)
     first, again, other = (distance(*pair, -1.0, rtol=0.05, seed=seed) for seed in (1, 1, 2))
@@ -76,6 +78,7 @@ def test_the_unit_of_length_may_be_tiny_beside_the_surfaces() -> None:
     assert found["distance"].item() == pytest.approx(np.sqrt(squares), rel=0.05)
 
 
+@pytest.mark.slow
 def test_very_negative_orders_beside_low_ones_have_no_tail() -> None:
     found = distance(icosphere(1), icosphere(2), [-0.6, -4.0, -100.0], rtol=5e-2)
     assert found["within"].all()
@@ -93,6 +96,7 @@ def test_many_orders_are_served_by_the_same_octaves() -> None:
         assert abs(alone["distance"] - at_order["distance"]) <= alone["error"] + at_order["error"]
 
 
+@pytest.mark.slow
 def test_real_distances_at_a_common_scale() -> None:
     # A mesh that is a thousand times larger has, at frequencies a thousand times lower, the same distance but for
     # the length in the weight: octaves must follow the size of the surfaces, not the unit.

@@ -33,6 +33,7 @@ def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: 
     assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= rtol * dataset["distance"].item()
 
 
+@pytest.mark.slow
 def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
     dataset = distance(icosphere(6), Sphere(), -10.0, rtol=1e-5)
     relative = dataset["distance"].item() / norm(Sphere(), -10.0)["norm"].item()
@@ -66,6 +67,7 @@ def test_low_accuracy_is_computed_in_single_precision() -> None:
     assert distance(icosphere(1), Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
 
 
+@pytest.mark.slow
 def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
     pair = icosphere(0), icosphere(1)
     with pytest.raises(
@@ -79,6 +81,7 @@ def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
     assert distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
 
 
+@pytest.mark.slow
 def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
     a, b, rtol = icosphere(3), Sphere(), 1e-12
     with pytest.raises(AccuracyError, match="a best effort") as caught:
@@ -89,6 +92,7 @@ def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
     assert rtol < relative < 1.5 * caught.value.reachable
 
 
+@pytest.mark.slow
 def test_a_best_effort_that_succeeds_is_the_same() -> None:
     a, b = icosphere(1), Sphere()
     strict, best = (distance(a, b, -3.0, rtol=1e-2, best_effort=best) for best in (False, True))
@@ -99,6 +103,7 @@ def test_a_best_effort_that_succeeds_is_the_same() -> None:
         distance(a, b, -3.0, lattice=Lattice(2.0, 16), best_effort=True)
 
 
+@pytest.mark.slow
 def test_a_looser_accuracy_is_never_harder() -> None:
     # Cuboids repeat their faces, so that their tails are hard.
     plate = Mesh(BOX.vertices * [1.0, 1.0, 0.05], BOX.triangles)
@@ -126,6 +131,7 @@ def test_equal_surfaces_have_the_distance_zero() -> None:
         assert dataset["within"].all()
 
 
+@pytest.mark.slow
 def test_what_surfaces_share_cancels() -> None:
     ball = icosphere(2)
     less = Mesh(ball.vertices, ball.triangles[5:])
@@ -161,6 +167,7 @@ def test_refuses_what_has_no_meaning() -> None:
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [1e4, 1e8])
 def test_surfaces_far_apart_are_no_endless_search(offset: float) -> None:
     far = Mesh(BOX.vertices + offset, BOX.triangles)
@@ -175,6 +182,7 @@ def test_memory_as_text() -> None:
     assert as_text.identical(as_number)
 
 
+@pytest.mark.slow
 def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
     a, b = icosphere(2), icosphere(3)
     centred = distance(a, b, -3.0, rtol=1e-3)
@@ -187,6 +195,7 @@ def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
     assert abs(apart["distance"].item() - exact) <= apart["error"].item()
 
 
+@pytest.mark.slow
 def test_octaves_measure_what_a_small_lattice_does_not_reach() -> None:
     # Up to some 8 cycles, the distance of near meshes is still growing.
     dataset = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
@@ -212,6 +221,7 @@ def test_very_negative_orders(order: float) -> None:
         distance(Sphere(), Sphere(0.9), [order, -1e6], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_many_orders_at_once_are_met_together() -> None:
     orders = [-0.6, -2.0, -20.0]
     exact = distance(Sphere(), Sphere(1.01), orders)["distance"]

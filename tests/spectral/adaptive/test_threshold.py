@@ -16,6 +16,7 @@ def bounded(surface: Surface, reference: Surface, order: float, threshold: float
     return relative_distance(surface, reference, order, threshold, Accuracy(threshold), 2, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "method", "gap"), [(-4.0, "lattice", 0.01), (-2.5, "lattice", 0.01), (-1.2, "octaves", 0.05)]
 )
@@ -30,6 +31,7 @@ def test_spheres_against_their_closed_form(order: float, method: str, gap: float
     assert side < 1 or found.method == method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [-4.0, -2.0])
 @pytest.mark.parametrize("threshold", [3e-3, 0.1])
 def test_surfaces_that_repeat_beyond_the_lattice(order: float, threshold: float) -> None:

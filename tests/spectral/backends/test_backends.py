@@ -66,6 +66,7 @@ def rules_in_use(mesh: Mesh, settings: TransformSettings) -> set[str]:
 MESHES: list[Callable[[], Mesh]] = [*(lambda level=level: icosphere(level) for level in range(5)), uneven]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MESHES)
 @pytest.mark.parametrize("quadrature", ["auto", "gauss8", 7])
 def test_the_fake_agrees_with_the_processor(make: Callable[[], Mesh], quadrature: str | int) -> None:
@@ -116,6 +117,7 @@ def test_lattices_of_octaves_agree() -> None:
     assert_agree(found, expected, mesh)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eps", [1e-5, pytest.param(1e-9, marks=pytest.mark.all)])
 def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog: pytest.LogCaptureFixture) -> None:
     mesh, settings, lattice = icosphere(5), TransformSettings(eps), Lattice(5.0, 64)
@@ -129,6 +131,7 @@ def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog:
     assert device.used == 0
 
 
+@pytest.mark.slow
 def test_what_is_foreseen_of_a_device_is_what_it_takes() -> None:
     mesh, settings = icosphere(6), TransformSettings(1e-9)
     device = Device()
@@ -148,6 +151,7 @@ def test_every_option_of_a_plan_is_given() -> None:
     assert (options["isign"], options["modeord"], options["dtype"], options["eps"]) == (-1, 0, "complex128", 1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["plan", "setpts", "execute"])
 @pytest.mark.parametrize("times", [1, 2])
 def test_out_of_memory_is_tried_again_in_smaller_parts(
@@ -180,6 +184,7 @@ def test_a_device_too_small_for_anything_is_not_tried(caplog: pytest.LogCaptureF
     assert len(caplog.records) == 1
 
 
+@pytest.mark.slow
 def test_arrays_that_run_out_of_memory_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, device = icosphere(4), Device(capacity=2e6)
     monkeypatch.setattr(Gpu, "free_bytes", 1e9)  # as with a limit on CuPy's pool, which CUDA does not know
@@ -199,6 +204,7 @@ def test_any_other_failure_falls_back_at_once(where: str, caplog: pytest.LogCapt
     assert device.used == 0
 
 
+@pytest.mark.slow
 def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
     mesh, lattice = icosphere(4), Lattice(5.0, 64)
     device = Device(capacity=2.5e8, failures=[("plan", "error")])
@@ -217,6 +223,7 @@ def test_memory_bounds_the_processor_that_steps_in() -> None:
         on(Device().backend(), mesh, allowed_bytes=1e6)
 
 
+@pytest.mark.slow
 def test_two_threads_take_turns() -> None:
     mesh, backend = icosphere(3), Device().backend()
     with ThreadPoolExecutor(4) as pool:

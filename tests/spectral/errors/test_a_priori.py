@@ -35,6 +35,7 @@ MESHES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [-2.0, -5.0, -10.0])
 @pytest.mark.parametrize("name", MESHES)
 def test_chosen_fields_keep_their_goal_and_are_not_wasteful(name: str, order: float) -> None:
@@ -66,6 +67,7 @@ def test_probed_fields_keep_their_goal(name: str) -> None:
     assert (field.quality.probe.norms(SobolevWeights(LATTICE, orders)) <= target.norms).all()
 
 
+@pytest.mark.slow
 def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
     mesh, lattice, orders = icosphere(5), Lattice(2.5, 24), (-4.0, -10.0)
     exact = fourier_transform(mesh, lattice, 1e-13)

@@ -30,6 +30,7 @@ FINE = Lattice(16.0, 128)
 COARSE = (Lattice(2.0, 12), Lattice(3.0, 20), Lattice(4.0, 24), Lattice(4.0, 36), Lattice(6.0, 54))
 
 
+@pytest.mark.slow
 def test_reported_errors_cover_the_true_ones_and_stay_near_them() -> None:
     ratios = []
     for name, (a, b) in PAIRS.items():

@@ -59,6 +59,7 @@ def test_levels_end_at_the_sum_of_squared_weights() -> None:
     assert PointSpectrum.from_table(spectrum.to_table()).levels.tolist() == spectrum.levels.tolist()  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_some_points_stand_for_all_where_pairs_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
     many = PointCloud.uniform(RNG.uniform(-0.5, 0.5, (3000, 3)), 1.0)
     exact, _ = PointPairs.of([many], START).beyond([-2.0])

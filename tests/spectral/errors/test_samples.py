@@ -30,6 +30,7 @@ LATTICE = Lattice(3.0, 24)
 ORDERS = (-2.0, -5.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", [icosphere(3), Sphere(0.9), Ellipsoid((0.9, 0.7, 0.5))])
 def test_norms_are_estimated_from_a_few_frequencies(surface: Surface) -> None:
     samples = [Sample.of(surface, draw(LATTICE, ORDERS, 2, 32, seed)) for seed in range(20)]
@@ -38,6 +39,7 @@ def test_norms_are_estimated_from_a_few_frequencies(surface: Surface) -> None:
     assert np.sqrt(squares) == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eps", [1e-3, 1e-6])
 @pytest.mark.parametrize("surface", [icosphere(3), Torus(0.9, 0.3)])
 def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: Surface, eps: float) -> None:

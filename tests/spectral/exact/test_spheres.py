@@ -35,6 +35,7 @@ def radial_integral(first: Sphere, second: Sphere, order: float) -> float:
         return float(mpmath.quad(integrand, [k * mpmath.mpf(0.5) for k in range(60)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -71,6 +72,7 @@ def test_block_and_pointwise_transform_agree() -> None:
     assert np.allclose(sphere_block(sphere, lattice, lattice.half), sphere_transform(sphere, grid), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_distance_of_two_spheres_is_that_of_fine_meshes_of_them() -> None:
     lattice = Lattice(5.0, 64)
     fine = icosphere(6)
@@ -101,6 +103,7 @@ def test_says_when_its_functions_overflow() -> None:
         sphere_inner_product(Sphere(), Sphere(), -1000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("radius", "order"), [(1e-4, -10), (1e-3, -5), (1e-2, -2)])
 def test_small_spheres_apart_keep_their_digits(radius: float, order: int) -> None:
     # Sixty digits leave nothing to cancellation.

@@ -44,6 +44,7 @@ SHARING = PointCloud(np.concatenate([RANDOM.points[:20], OTHER.points]), np.full
 ON_SPHERE = PointCloud.uniform(icosphere(1).vertices, Sphere().area)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pair",
     [
@@ -78,6 +79,7 @@ def squared_norms(surface: PointCloud | Sphere, orders: list[float]) -> Reals:
     return np.array([surface.area * sphere_potential(surface, pole, -order).item() for order in orders])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{"rtol": 3e-2}, {"lattice": LATTICE}], ids=["octaves", "lattice"])
 @pytest.mark.parametrize(
     "pair",

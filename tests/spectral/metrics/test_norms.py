@@ -48,6 +48,7 @@ def test_inner_product_polarises() -> None:
     assert squares - 2 * product == pytest.approx(distance(a, b, -2.5)["distance"].item() ** 2, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_distance_against_the_matern_kernel_in_real_space() -> None:
     # ||m||² = ∬ K(|x-y|) dm dm with K the Matérn kernel: no Fourier transform on that side.
     order = -6.0
@@ -118,6 +119,7 @@ def test_single_precision_fields_are_summed_in_double() -> None:
     assert single == pytest.approx(norm(field, -2)["norm"].item(), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_inner_products_to_an_accuracy_agree_with_the_closed_form() -> None:
     orders = [-1.0, -2.0]
     for a, b in ((Sphere(), Sphere(0.9, (0.1, 0.0, 0.0))), (Sphere(), Sphere(0.2, (0.0, 2.0, 0.0)))):

@@ -109,6 +109,7 @@ def test_evaluation_is_the_adjoint_of_the_transform() -> None:
     assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [Mesh(0.7 * icosphere(1).vertices, icosphere(1).triangles), BOX])
 def test_its_integral_against_the_difference_is_the_squared_distance(other: Mesh) -> None:
     lattice, mesh = Lattice(4.0, 32), icosphere(2)

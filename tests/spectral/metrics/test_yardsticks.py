@@ -19,24 +19,28 @@ def moved(length: float) -> Mesh:
     return Mesh(BALL.vertices + length * np.array([0.36, 0.48, 0.8]), BALL.triangles)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.002, 0.3])
 def test_a_move_is_found_again(length: float) -> None:
     found = yardsticks(moved(length), BALL, ORDERS, lattice=LATTICE)
     np.testing.assert_allclose(found["moved"], length, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_noise_is_found_again() -> None:
     found = yardsticks(with_noise(BALL, 0.01, 4), BALL, ORDERS, lattice=LATTICE, seed=4)
     np.testing.assert_allclose(found["noise"], 0.01, rtol=0.03)
     assert (abs(found["noise"] - 0.01) <= found["noise_error"] + 1e-4).all()
 
 
+@pytest.mark.slow
 def test_decimation_is_found_again() -> None:
     found = yardsticks(decimated(BALL, 300), BALL, -2.0, lattice=LATTICE)
     assert found["decimated"].dims == ()
     assert found["decimated"].item() == pytest.approx(300, rel=0.05)
 
 
+@pytest.mark.slow
 def test_yardsticks_come_with_the_distance() -> None:
     a, b = moved(0.1), BALL
     found, alone = yardsticks(a, b, ORDERS, rtol=0.05), distance(a, b, ORDERS, rtol=0.05)
@@ -46,6 +50,7 @@ def test_yardsticks_come_with_the_distance() -> None:
     np.testing.assert_allclose(found["moved"], 0.1, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_shared_triangles_change_nothing() -> None:
     """The reference is whole though most of it cancels."""
     part = Mesh(BALL.vertices, BALL.triangles[:-40])

@@ -49,6 +49,7 @@ def beyond_energies(energies: Reals, limit: float, deviation: float = 0.0) -> tu
     return mean.item() / tail, uncertain.item() / tail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", np.geomspace(0.01, 0.3, 25))
 def test_swings_about_the_limit_are_allowed_for(gap: float) -> None:
     # Parallel surfaces: the energy swings about its limit, and is averaged over octaves.

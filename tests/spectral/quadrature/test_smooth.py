@@ -71,6 +71,7 @@ def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
     return np.asarray(fourier_transform(surface, LATTICE, eps, threads=1).values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivatives", [False, True])
 def test_the_sphere_as_a_parametrised_surface_is_the_closed_form(derivatives: bool) -> None:
     exact = fourier_transform(Sphere(), LATTICE)
@@ -153,6 +154,7 @@ def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
     assert exact_values(moved, points) == pytest.approx(expected, abs=1e-12 * moved.area)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
 def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
     settings = TransformSettings(1e-13)
@@ -174,6 +176,7 @@ def test_single_precision() -> None:
 # The nodes.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", [*SMOOTH, angular_ball(False)], ids=lambda surface: type(surface).__name__)
 @pytest.mark.parametrize("highest", [0.5, 7.0, 20.0])
 def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float) -> None:
@@ -257,6 +260,7 @@ def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (reported < 30 * truth).all()
 
 
+@pytest.mark.slow
 def test_what_doubling_the_nodes_changes_is_reported() -> None:
     side = Interval(-0.9, 1.0)
     surface = ParametrisedSurface(roof, side, side, roof_derivatives)
@@ -284,6 +288,7 @@ def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
     assert len(found.probe.shells) == 32 + 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-2, 1e-5])
 def test_a_norm_to_an_accuracy(rtol: float) -> None:
     exact = norm(Sphere(0.8), [-3.0, -6.0])["norm"].values
@@ -293,6 +298,7 @@ def test_a_norm_to_an_accuracy(rtol: float) -> None:
     assert (found["error"].values <= rtol * exact).all()
 
 
+@pytest.mark.slow
 def test_a_distance_to_an_accuracy() -> None:
     near, far = Sphere(0.8, (0.2, 0.0, 0.0)), Ellipsoid((1.0, 1.0, 1.0))
     exact = distance(near, Sphere(), [-3.0, -6.0])["distance"].values
@@ -348,6 +354,7 @@ def test_little_memory_makes_parts_and_not_other_numbers() -> None:
     assert 0 < np.abs(whole.values - parts.values).max() < 1e-8 * surface.area
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_reported_errors_hold_true_ones(seed: int) -> None:
     rng = np.random.default_rng([11, seed])
@@ -365,6 +372,7 @@ def test_reported_errors_hold_true_ones(seed: int) -> None:
         assert (error <= found["error"].values + truth["error"].values).all()
 
 
+@pytest.mark.slow
 def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
     fewer, more = (resolution_of(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9).counts[0] for thickness in (0.04, 0.01))
     assert 2 * fewer < more < 8 * fewer

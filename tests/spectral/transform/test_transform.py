@@ -60,6 +60,7 @@ def cortex(rng: np.random.Generator) -> Mesh:
     return scaled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy, cortex])
 @pytest.mark.parametrize("eps", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
 def test_agrees_with_the_exact_transform_to_a_small_multiple_of_eps(make, eps: float) -> None:  # type: ignore[no-untyped-def]
@@ -80,6 +81,7 @@ def test_single_precision_reaches_its_own_accuracy() -> None:
     assert np.abs(single.values - double.values).max() < 1e-5 * mesh.area
 
 
+@pytest.mark.slow
 def test_every_block_of_the_lattice_equals_the_same_part_of_the_whole() -> None:
     lattice, mesh = Lattice(4.0, 20), icosphere(2)
     settings = TransformSettings(1e-12)
@@ -104,6 +106,7 @@ def test_batches_change_nothing_but_rounding() -> None:
     assert np.abs(one - many).max() < 1e-11 * mesh.area
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [2.5e7, 1.2e7, 9.9e6])
 @pytest.mark.parametrize("dtype", ["complex128", "complex64"])
 def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: float, dtype: ComplexDtype) -> None:
@@ -129,6 +132,7 @@ def test_enough_memory_changes_nothing() -> None:
     assert np.array_equal(whole.values, same.values)
 
 
+@pytest.mark.slow
 def test_states_the_smallest_memory() -> None:
     lattice, mesh = Lattice(5.0, 32), icosphere(2)
     with pytest.raises(InputError, match=r"^1 MB .* 33 x 33 x 17 samples: give at least [\d.]+ MB") as caught:
@@ -215,6 +219,7 @@ def test_translation_rotation_order_and_subdivision() -> None:
     assert np.abs(fourier_transform(split, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
 
 
+@pytest.mark.slow
 def test_the_papers_quadrature_stays_available() -> None:
     lattice, mesh = Lattice(5.0, 32), icosphere(4)
     paper = fourier_transform(mesh, lattice, 1e-12, quadrature="gauss8")

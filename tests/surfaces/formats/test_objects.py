@@ -186,6 +186,7 @@ def target() -> xr.DataArray:
     return sb.fourier_transform(sb.Sphere(1.2), LATTICE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", USES)
 def test_every_function_takes_paths_and_meshes_of_other_libraries(
     tmp_path: Path, name: str, target: xr.DataArray
@@ -222,6 +223,7 @@ def test_no_library_is_imported_to_tell_its_meshes() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_the_page_names_every_format_and_its_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     formats = {mesh_format(Path(f"scan{ending}")) for ending, _ in BOXES.values()}

@@ -97,6 +97,7 @@ def test_attacks_are_refused_in_bounded_time_and_memory(tmp_path: Path) -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in ATTACKS if not name.endswith(", sparse")])
 def test_no_size_is_claimed_that_the_file_cannot_hold(tmp_path: Path, name: str) -> None:
     path = ATTACKS[name](tmp_path)
@@ -162,6 +163,7 @@ def test_buffers_count_together(tmp_path: Path) -> None:
         read_mesh(tmp_path / "scan.gltf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "reason"),
     [

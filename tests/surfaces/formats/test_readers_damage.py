@@ -589,6 +589,7 @@ CUTTABLE: dict[str, tuple[str, bytes, int]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", CUTTABLE)
 def test_a_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:

@@ -191,6 +191,7 @@ def test_damaged_files_take_little_more_time_and_memory_than_whole_ones(tmp_path
     assert peak < _MOST_GROWTH * whole_peak
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _KINDS)
 @_fuzz
 @given(data=st.data())
@@ -199,6 +200,7 @@ def test_damaged_files_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, name: str, 
     _ends_well(tmp_path / f"scan{ending}", _damaged(content, data.draw(st.randoms(use_true_random=False))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", _STARTS)
 @_fuzz
 @given(data=st.data())
@@ -208,6 +210,7 @@ def test_any_bytes_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, ending: str, da
     _ends_well(tmp_path / f"scan{ending}", start + body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", _STARTS)
 @_fuzz
 @given(data=st.data())

@@ -234,6 +234,7 @@ def test_areas_and_lengths_of_solids() -> None:
     assert tetrahedron().centroid_radii[2] == pytest.approx(np.sqrt(2 / 3), rel=1e-15)
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes())
 def test_areas_agree_with_the_formula_of_heron(mesh: Mesh) -> None:
@@ -374,6 +375,7 @@ def test_the_digest_changes_with_every_array(vertices: Any, triangles: Any) -> N
     assert Mesh(vertices, triangles).digest != tetrahedron().digest
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes(), st.randoms(use_true_random=False))
 def test_the_order_of_vertices_and_triangles_does_not_matter(mesh: Mesh, random: Any) -> None:
@@ -389,6 +391,7 @@ def test_the_order_of_vertices_and_triangles_does_not_matter(mesh: Mesh, random:
     assert np.array_equal(shuffled.bounds, mesh.bounds)
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes(), st.permutations([0, 1, 2]))
 def test_the_order_of_corners_does_not_matter(mesh: Mesh, order: list[int]) -> None:
@@ -401,6 +404,7 @@ def test_the_order_of_corners_does_not_matter(mesh: Mesh, order: list[int]) -> N
     )
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes(), st.tuples(*[st.floats(-100, 100)] * 3), st.integers(0, 2**32 - 1))
 def test_rigid_motions_keep_areas_and_lengths(mesh: Mesh, shift: tuple[float, ...], seed: int) -> None:
@@ -411,6 +415,7 @@ def test_rigid_motions_keep_areas_and_lengths(mesh: Mesh, shift: tuple[float, ..
     assert moved.centroid_radii == pytest.approx(mesh.centroid_radii, rel=1e-12, abs=1e-12)
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes(), st.tuples(st.floats(0.05, 1), st.floats(0.05, 1), st.floats(0.05, 1)))
 def test_splitting_a_triangle_keeps_the_area(mesh: Mesh, weights: tuple[float, float, float]) -> None:

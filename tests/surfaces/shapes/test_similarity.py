@@ -95,6 +95,7 @@ def test_a_mesh_of_a_sphere_goes_where_the_sphere_goes() -> None:
     assert similarity.origin == pytest.approx((1.0, -2.0, 3.0), rel=1e-14)
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes())
 def test_every_mesh_touches_the_unit_sphere_from_inside(mesh: Mesh) -> None:
@@ -108,6 +109,7 @@ def test_every_mesh_touches_the_unit_sphere_from_inside(mesh: Mesh) -> None:
     assert [type(x) for x in similarity.origin] == [float] * 3
 
 
+@pytest.mark.slow
 @seeded
 @given(meshes(), st.floats(0.01, 100), shifts)
 def test_copies_in_other_places_and_sizes_end_up_alike(

@@ -115,6 +115,7 @@ def test_positions_must_be_three_arrays(position: Any, found: str) -> None:
         ParametrisedSurface(position, Interval(0.0, 1.0), Interval(0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_positions_must_be_finite() -> None:
     side = Interval(0.0, 1.0)
     with pytest.raises(InputError, match="position is not finite everywhere"):
@@ -128,6 +129,7 @@ def test_a_surface_without_area_is_refused() -> None:
         ParametrisedSurface(lambda u, v: (u, u, u), Interval(0.0, 1.0), Interval(0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_an_area_that_does_not_settle_is_refused() -> None:
     with pytest.raises(InputError, match="not smooth, or oscillates too fast"):
         ParametrisedSurface(lambda u, v: (u, v, np.sin(1 / (u + 1e-5))), Interval(0.0, 1.0), Interval(0.0, 1.0))

@@ -115,6 +115,7 @@ def test_a_frame_loses_nothing() -> None:
         sb.Study.from_table(small_table(family=[{"name": "f", "source": "files", "meshes": twice}]))
 
 
+@pytest.mark.slow
 def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
     for level in (0, 1):
         sb.write_mesh(sb.icosphere(level), tmp_path / f"{level}.ply")
