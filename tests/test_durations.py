@@ -5,8 +5,8 @@ from __future__ import annotations
 from tests.support.durations import recorded_seconds
 from tests.support.repository import ROOT
 
-# Eight minutes in three processes, of which two compute at a time.
-MOST_SECONDS, MOST_SECONDS_OF_A_FILE = 1300.0, 75.0
+# Of three processes for two cores, in some twelve minutes of a slow machine.
+MOST_SECONDS, MOST_SECONDS_OF_A_FILE = 2100.0, 135.0
 
 
 def test_the_suite_is_within_its_budget() -> None:
