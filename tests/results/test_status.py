@@ -22,9 +22,13 @@ from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
 
 
+# One instant for all moments of a test: records have whole seconds, and two readings of the clock may differ by one.
+HOUR_AGO = int(time.time()) - 3600
+
+
 def moment(seconds: float) -> str:
-    """Return a time of so many seconds from an hour ago, as records have it."""
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time.time() - 3600 + seconds))
+    """Return a time of this many seconds after an hour ago, as records have it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(HOUR_AGO + seconds))
 
 
 @pytest.fixture
@@ -58,7 +62,6 @@ def running(store: Store, *finished: float, begun: float = 0.0, state: str = "ru
 @pytest.mark.slow
 def test_the_time_left_follows_from_the_last_ones(store: Store) -> None:
     status = running(store, 0, 10, 40, 70)
-    # Times in records are whole seconds, and that of the end may be the next one.
     assert status.rate == pytest.approx(1 / 30, rel=0.05)
     assert status.seconds_left == pytest.approx(30, rel=0.05)
     assert status.progress == "4 of 5 done, 1 failed, 2 a minute, about 30 s left at this rate"
