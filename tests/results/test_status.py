@@ -21,7 +21,6 @@ from sobolev_batch.cli import cli
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
 
-
 # One instant for all moments of a test: records have whole seconds, and two readings of the clock may differ by one.
 HOUR_AGO = int(time.time()) - 3600
 
