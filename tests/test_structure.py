@@ -26,7 +26,7 @@ LAYERS = (
     "testing",
     "cli",
 )
-MOST_NAMES_OF_A_FOLDER = 12
+MOST_NAMES_OF_A_FOLDER = 20
 
 Path = tuple[str, ...]
 
