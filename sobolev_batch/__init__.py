@@ -34,7 +34,6 @@ The public names by subject:
 - Errors: all derive from `SobolevBatchError`.
 """
 
-import warnings
 from importlib import import_module
 from typing import Any
 
@@ -45,16 +44,9 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # xarray learns of the accessors `field.sobolev` and `tree.sobolev` with the first function that returns fields.
 _RETURN_FIELDS = ("fourier_transform", "open_store")
-# New names by the old ones, which go on working for one release.
-_RENAMED = {"ClaimError": "LockError"}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _RENAMED:
-        new = _RENAMED[name]
-        message = f"sobolev_batch.{name} is now called {new}; the old name will be removed in the next release"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        name = new
     if name in _RETURN_FIELDS:
         import_module(f"{__name__}.results.accessor")
     if name == "open_store":

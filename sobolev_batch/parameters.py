@@ -1,20 +1,14 @@
-"""Parameters of the public interface: whole numbers, sizes of memory, and names that were spelt differently before."""
+"""Parameters of the public interface: whole numbers, sizes of memory, fractions."""
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
-from functools import wraps
 from numbers import Integral
-from typing import ParamSpec, TypeGuard, TypeVar
+from typing import TypeGuard
 
 from pydantic import ByteSize, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import InputError
-
-P = ParamSpec("P")
-Result = TypeVar("Result")
 
 _BYTE_SIZE = TypeAdapter(ByteSize)
 
@@ -82,39 +76,3 @@ def format_bytes(count: float) -> str:
     '4.0GB'
     """
     return ByteSize(count).human_readable(decimal=True)
-
-
-def renamed_parameters(**names: str) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
-    """Let a function take parameters under their old names for one more release, with a DeprecationWarning.
-
-    Args:
-        **names: New name of each parameter, by its old one.
-
-    >>> @renamed_parameters(orders="order")
-    ... def double(order):
-    ...     return 2 * order
-    >>> double(order=3)
-    6
-    """
-
-    def decorate(function: Callable[P, Result]) -> Callable[P, Result]:
-        @wraps(function)
-        def call(*arguments: P.args, **options: P.kwargs) -> Result:
-            for old in names.keys() & options.keys():
-                new = names[old]
-                if new in options:
-                    raise TypeError(
-                        f"{function.__name__}() got both {new!r} and its old name {old!r}; give {new!r} alone"
-                    )
-                warnings.warn(
-                    f"the parameter {old!r} of {function.__name__}() is now called {new!r}; "
-                    f"{old!r} will be refused from the next release on",
-                    DeprecationWarning,
-                    stacklevel=2,
-                )
-                options[new] = options.pop(old)
-            return function(*arguments, **options)
-
-        return call
-
-    return decorate

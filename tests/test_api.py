@@ -1,4 +1,4 @@
-"""The public names of the package: one list, imported when first used, old names for one more release."""
+"""The public names of the package: one list, imported when first used."""
 
 from __future__ import annotations
 
@@ -18,12 +18,6 @@ def test_names_are_sorted_and_unknown_ones_refused() -> None:
     assert dir(sb) == sb.__all__
     with pytest.raises(AttributeError, match="nothing"):
         sb.nothing  # type: ignore[attr-defined]  # noqa: B018
-
-
-def test_an_old_name_works_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(vars(sb)["_RENAMED"], "Grid", "Lattice")
-    with pytest.warns(DeprecationWarning, match="Grid is now called Lattice"):
-        assert sb.Grid is sb.Lattice  # type: ignore[attr-defined]
 
 
 @pytest.mark.process

@@ -251,18 +251,6 @@ def test_plan_says_what_an_accuracy_leads_to(folder: Path) -> None:
     assert len(re.findall(r"^chosen: ", done.stdout, re.M)) == 3
 
 
-def test_the_old_name_of_memory_works_for_now(pair: Path) -> None:
-    options = ("compare", "1.off", "3.off", "--order", "-8", "--rtol", "1e-2")
-    done = call(*options, "--memory", "1GB", folder=pair)
-    old = call(*options, "--memory-gb", "1", folder=pair)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert old.stdout == done.stdout
-    assert old.stderr == "--memory-gb is now called --memory and takes sizes such as 4GB; --memory-gb will be removed\n"
-    both = call(*options, "--memory", "1GB", "--memory-gb", "1", folder=pair)
-    assert both.returncode == 2
-    assert "give --memory alone" in both.stderr
-
-
 def test_compare_two_files(pair: Path) -> None:
     done = call("compare", "1.off", "3.off", "--order", "-4", "--order", "-2", "--M", "64", folder=pair)
     assert done.returncode == 0, done.stderr
@@ -458,11 +446,11 @@ def test_wrong_input_gives_one_line_and_status_2(folder: Path, arguments: tuple[
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("compare", "one.off", "two.off", "--rtol", "0.1", "--memory-gb", "1000000"),
-        ("run", "study.toml", "--store", "huge.zarr", "--worker-memory", "1000TB"),
+        ("compare", "one.off", "two.off", "--rtol", "0.1", "--memory", "1000TB"),
+        ("run", "study.toml", "--store", "huge.zarr", "--memory", "1000TB"),
     ],
 )
-def test_the_old_names_of_memory_believe_no_more_either(folder: Path, arguments: tuple[str, ...]) -> None:
+def test_more_memory_than_there_is_is_refused(folder: Path, arguments: tuple[str, ...]) -> None:
     for name, x in (("one.off", 1), ("two.off", 2)):
         (folder / name).write_text(f"OFF\n3 1 0\n0 0 0\n{x} 0 0\n0 1 0\n3 0 1 2\n")
     done = call(*arguments, folder=folder)

@@ -127,19 +127,6 @@ def test_every_command_is_listed_with_its_functions() -> None:
         assert set(re.findall(r"`sb\.(\w+)`", functions)) <= set(sb.__all__)
 
 
-def test_every_deprecated_parameter_is_listed() -> None:
-    sources = "\n".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
-    renamed = {
-        pair
-        for names in re.findall(r"@renamed_parameters\((.*?)\)", sources, re.DOTALL)
-        for pair in re.findall(r'(\w+)="(\w+)"', names)
-    }
-    assert renamed
-    text = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
-    for old, new in sorted(renamed):
-        assert f"| `{old}` | `{new}` |" in text, (old, new)
-
-
 def test_the_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -137,8 +137,8 @@ def test_every_command_with_a_memory_is_known() -> None:
         if isinstance(command, click.Command)
     }
     assert {name: found for name, found in options.items() if found} == {
-        "compare": ["--memory", "--memory-gb"],
-        "run": ["--memory", "--worker-memory"],
+        "compare": ["--memory"],
+        "run": ["--memory"],
     }
 
 

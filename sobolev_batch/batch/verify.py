@@ -23,7 +23,6 @@ from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.html import reasons, table_html
-from sobolev_batch.parameters import renamed_parameters
 
 _log = logging.getLogger(__name__)
 
@@ -97,7 +96,6 @@ class Verification:
         return not self.fields and not self.comparisons and not self.tables
 
 
-@renamed_parameters(place="store")
 def verify(store: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
     """Read everything that a store holds, and withdraw what is damaged so that a run computes it again.
 

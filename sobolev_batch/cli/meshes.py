@@ -10,7 +10,7 @@ import click
 
 from sobolev_batch.cli.below import below_option, judge_files
 from sobolev_batch.cli.group import cli
-from sobolev_batch.cli.options import best_effort_option, memory_of, memory_option, orders_option
+from sobolev_batch.cli.options import best_effort_option, memory_option, orders_option
 from sobolev_batch.cli.output import echo, echo_lines
 from sobolev_batch.cli.points import point_options, read_pair, require_mesh, two_meshes
 from sobolev_batch.visible import visible
@@ -28,7 +28,6 @@ _DEFAULT_RTOL = 1e-2
 @orders_option("Print the distance of this order, which may be any below -1/2.", "-2")
 @click.option("--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest to be had]")
 @memory_option("Let a transform for --rtol take so much memory. [default: 2GB]")
-@click.option("--memory-gb", type=float, hidden=True)
 @best_effort_option
 @click.option(
     "--xi-max",
@@ -67,7 +66,6 @@ def compare_command(
     orders: tuple[float, ...],
     rtol: float | None,
     memory: int | None,
-    memory_gb: float | None,
     best_effort: bool,
     xi_max: float | None,
     intervals: int | None,
@@ -85,7 +83,6 @@ def compare_command(
     of the squared distance that a change of area explains. With --below, print one line on whether both are the same
     surface. The exit status is then 0 if they are, 1 if they are not, and 4 if that cannot be told.
     """
-    from sobolev_batch.parameters import byte_count
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.norms import distance
     from sobolev_batch.spectral.metrics.yardsticks import yardsticks
@@ -99,7 +96,6 @@ def compare_command(
         context.exit(judge_files(context, a, b, below))
     if rtol is not None and (xi_max is not None or intervals is not None):
         raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
-    memory = memory_of(memory, "--memory-gb", None if memory_gb is None else byte_count(1e9 * memory_gb))
     lattice = None
     if xi_max is not None or intervals is not None:
         lattice = Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER, LEAST_GIVE_UP_AFTER
-from sobolev_batch.cli.output import echo
 from sobolev_batch.results.tables.defaults import FORMATS
 
 if TYPE_CHECKING:
@@ -126,19 +125,9 @@ def output_option(text: str, default: str) -> Callable[[Command], Command]:
     return click.option("--output", type=click.Path(path_type=Path), default=default, show_default=True, help=text)
 
 
-def memory_option(text: str, *, old: str = "") -> Callable[[Command], Command]:
-    """Return the option --memory, or a hidden one that is its old name."""
-    return click.option(old or "--memory", type=_memory_size, metavar="SIZE", help=text, hidden=bool(old))
-
-
-def memory_of(memory: int | None, old: str, old_memory: int | None) -> int | None:
-    """Return the memory that --memory gives, or the name that it had before, which works for one more release."""
-    if old_memory is None:
-        return memory
-    if memory is not None:
-        raise click.UsageError(f"{old} is the old name of --memory; give --memory alone")
-    echo(f"{old} is now called --memory and takes sizes such as 4GB; {old} will be removed", err=True)
-    return old_memory
+def memory_option(text: str) -> Callable[[Command], Command]:
+    """Return the option --memory of a command."""
+    return click.option("--memory", type=_memory_size, metavar="SIZE", help=text)
 
 
 def fraction_of_norm(text: str) -> float:

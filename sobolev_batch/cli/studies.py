@@ -15,7 +15,6 @@ from sobolev_batch.cli.options import (
     best_effort_option,
     give_up_option,
     location,
-    memory_of,
     memory_option,
     store_option,
     study_argument,
@@ -64,7 +63,6 @@ def init_command(folder: Path, output: Path) -> None:
     "--workers", type=click.IntRange(min=1), help="Start so many processes on this machine. [default: one per core]"
 )
 @memory_option("Give each process so much memory, such as 4GB. [default: equal parts]")
-@memory_option("", old="--worker-memory")
 @best_effort_option
 @click.option(
     "--reuse",
@@ -83,7 +81,6 @@ def run_command(
     trust_network: bool,
     workers: int | None,
     memory: int | None,
-    worker_memory: int | None,
     best_effort: bool,
     reuse: tuple[Location, ...],
     give_up_after: float,
@@ -102,7 +99,6 @@ def run_command(
     from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
 
-    memory = memory_of(memory, "--worker-memory", worker_memory)
     if scheduler and (workers or memory):
         raise click.UsageError(
             "--workers and --memory are for a cluster on this machine; the workers of a scheduler have their own"

@@ -15,7 +15,6 @@ from sobolev_batch.batch.store.hierarchy import DIGEST, DIGESTS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.errors import DamageError, InputError, StoreError
-from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.metrics.datasets import describe
 
 # A store as functions for its readers take it.
@@ -25,7 +24,6 @@ AnyStore = str | Path | Location | xr.DataTree
 _SOURCE, _STATE = "source", "state"
 
 
-@renamed_parameters(place="store")
 def open_store(store: str | Path | Location) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 

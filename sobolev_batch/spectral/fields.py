@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
@@ -51,7 +50,6 @@ class Field:
     backend: str
 
 
-@renamed_parameters(orders="order")
 def fourier_transform(
     surface: SurfaceLike,
     lattice: Lattice,

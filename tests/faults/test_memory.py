@@ -14,7 +14,7 @@ from tests.support.commands import call, write_toml
 def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_path: Path) -> None:
     study = write_toml(tmp_path)
     study.write_text(study.read_text().replace("M = 16", "M = 1024"))
-    arguments = "--store", tmp_path / "large.zarr", "--workers", "1", "--worker-memory", "700MB"
+    arguments = "--store", tmp_path / "large.zarr", "--workers", "1", "--memory", "700MB"
     done = call("run", study, *arguments)
     assert done.returncode == 1
     expected = r"it takes about 7[89]\d\.\dMB in one task, and no worker has more than 295\.0MB"

@@ -47,8 +47,3 @@ def test_a_tree_from_nowhere_has_no_status(tree: xr.DataTree) -> None:
         sb.InputError, match=r"does not say where it was opened; open it with sobolev_batch\.open_store"
     ):
         sb.status(tree)
-
-
-def test_the_old_name_of_a_parameter_works_for_now(finished_store: Path) -> None:
-    with pytest.warns(DeprecationWarning, match="'place' of open_store"):
-        assert "norms" in sb.open_store(place=finished_store)  # type: ignore[call-arg]

@@ -24,12 +24,3 @@ def test_one_order_or_several_are_probed() -> None:
     mesh, lattice = icosphere(1), Lattice(1.0, 8)
     one, several = (fourier_transform(mesh, lattice, order=order, threads=1) for order in (-2.0, [-2.0]))
     assert one.attrs == several.attrs
-
-
-def test_the_old_name_of_order_still_works() -> None:
-    mesh, lattice = icosphere(1), Lattice(1.0, 8)
-    with pytest.warns(DeprecationWarning, match="'orders' of fourier_transform.. is now called 'order'"):
-        old = fourier_transform(mesh, lattice, orders=[-2.0], threads=1)  # type: ignore[call-arg]
-    new = fourier_transform(mesh, lattice, order=[-2.0], threads=1)
-    assert np.array_equal(old, new)
-    assert old.attrs == new.attrs

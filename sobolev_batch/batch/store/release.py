@@ -12,10 +12,8 @@ from sobolev_batch.batch.storage.timestamps import age_seconds
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import LockError, StoreError
-from sobolev_batch.parameters import renamed_parameters
 
 
-@renamed_parameters(place="store")
 def release(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     """Remove the lock of a run that cannot do so itself, because it or its machine was killed.
 

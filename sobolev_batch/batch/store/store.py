@@ -103,7 +103,7 @@ class Store(Hierarchy):
         if version != SCHEMA_VERSION:
             raise StoreError(
                 f"{self.path}: its schema has version {version}, this program reads {SCHEMA_VERSION}; "
-                "name another store for this program, or read this one with the version that has written it"
+                "run the study again into another store, or read this one with the version that has written it"
             )
         return attributes
 

@@ -102,19 +102,11 @@ class _LatticeSection(Section):
 class _AccuracySection(Section):
     rtol: Number
     memory: Annotated[float | None, BeforeValidator(_memory)] = None
-    memory_gb: Number | None = None
     best_effort: bool = False
 
-    @model_validator(mode="after")
-    def _one_memory(self) -> Self:
-        if self.memory is not None and self.memory_gb is not None:
-            raise ValueError("memory_gb is the old name of memory; give memory alone")
-        return self
-
     def settings(self) -> Accuracy:
-        memory = self.memory if self.memory_gb is None else 1e9 * self.memory_gb
         accuracy = Accuracy(self.rtol, best_effort=self.best_effort)
-        return accuracy if memory is None else replace(accuracy, allowed_bytes=memory)
+        return accuracy if self.memory is None else replace(accuracy, allowed_bytes=self.memory)
 
 
 class _NormSection(Section):

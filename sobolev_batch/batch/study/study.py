@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -257,13 +256,6 @@ class Study:
         if document is None or reference is None or refused:
             raise StudyError(joined(refused))
         _require_distinct(families)
-        if document.accuracy is not None and document.accuracy.memory_gb is not None:
-            warnings.warn(
-                "the key memory_gb of [accuracy] is now called memory, as in memory = "
-                f'"{document.accuracy.memory_gb:g}GB"; memory_gb will be refused from the next release on',
-                DeprecationWarning,
-                stacklevel=3,
-            )
         if isinstance(reference, Source):
             families = tuple(replace(family, source=family.source.with_reference(reference)) for family in families)
         with _in_section("lattice"):

@@ -26,7 +26,6 @@ M = 64
 octaves = 4
 rtol = 1e-2
 memory = "4GB"
-memory_gb = 4.0
 best_effort = true
 orders = [-4.0]
 pairs = "all"

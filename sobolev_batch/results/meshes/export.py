@@ -10,7 +10,6 @@ from typing import Self
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.parameters import renamed_parameters
 from sobolev_batch.results.meshes.files import SUFFIXES, VertexField
 from sobolev_batch.results.meshes.rebuild import MeshRebuilder, matching_labels
 from sobolev_batch.results.meshes.witness import witness_at_vertices
@@ -97,7 +96,6 @@ class Exporter:
         )
 
 
-@renamed_parameters(label="mesh", orders="order", place="store")
 def write_witness(
     store: AnyStore,
     mesh: str,

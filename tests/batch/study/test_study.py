@@ -202,10 +202,3 @@ def test_memory_is_a_size(memory: str | float) -> None:
     study = asking(rtol=0.1, memory=memory)
     assert study.accuracy is not None
     assert study.accuracy.allowed_bytes == 4e9
-
-
-def test_the_old_name_of_memory_goes_on_working() -> None:
-    with pytest.warns(DeprecationWarning, match=r'is now called memory, as in memory = "4GB"') as caught:
-        old = asking(rtol=0.1, memory_gb=4)
-    assert caught[0].filename == __file__
-    assert old.accuracy == asking(rtol=0.1, memory="4GB").accuracy
