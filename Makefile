@@ -29,7 +29,7 @@ test test-fast test-all durations: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)  ## the tests: what must pass before a change is trusted, twelve minutes
 	$(PYTEST) -n 3 -m "not all"
 
-test-fast: $(READY)  ## those that start no process and take less than a second, one to two minutes
+test-fast: $(READY)  ## those that start no process and take less than a second, a minute
 	$(PYTEST) -n 2 -m "not (all or process or slow)"
 
 test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; an hour

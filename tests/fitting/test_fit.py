@@ -59,12 +59,14 @@ def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.Fit) -> None:
     assert fitted.after.error < 0.05 * fitted.after.distance
 
 
+@pytest.mark.slow
 def test_it_keeps_the_triangles_and_turns_none_over(fitted: sb.Fit) -> None:
     np.testing.assert_array_equal(fitted.mesh.triangles, START.triangles)
     assert (np.sum(normals(fitted.mesh) * normals(START), axis=1) > 0).all()
     assert fitted.after.smallest_angle > 0.3 * fitted.before.smallest_angle
 
 
+@pytest.mark.slow
 def test_it_reports_distances_of_points_too(fitted: sb.Fit) -> None:
     near = sb.proximity(fitted.mesh, TARGET)
     # Points are drawn on meshes that were moved to a common centre.
@@ -141,6 +143,7 @@ def test_an_interrupt_keeps_the_best_so_far() -> None:
     assert [progress.relative for progress in seen] == sorted((one.relative for one in seen), reverse=True)
 
 
+@pytest.mark.slow
 def test_nothing_is_fitted_below_the_error_of_a_field() -> None:
     field = sb.fourier_transform(TARGET, sb.Lattice(4.0, 36), 3e-2, order=[-4.0])
     fitted = sb.fit(START, field, -4.0)
@@ -148,12 +151,14 @@ def test_nothing_is_fitted_below_the_error_of_a_field() -> None:
     assert fitted.after.distance > fitted.after.error
 
 
+@pytest.mark.slow
 def test_a_mesh_at_its_target_stays() -> None:
     fitted = sb.fit(START, START, -2.0)
     assert (fitted.before.distance, fitted.after.distance, fitted.steps) == (0, 0, 0)
     np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
     def away(run: Any, stages: Any) -> np.ndarray:
         return np.asarray(run.problem.mesh.vertices) * 1.1

@@ -14,10 +14,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-import boto3
 import fsspec
 import pytest
-from botocore.config import Config
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
@@ -53,6 +51,10 @@ class Server:
 
     def client(self, service: str = "s3") -> Any:
         """Return a client of the server that shares nothing with the code under test."""
+        # Imported late: it takes a second.
+        import boto3
+        from botocore.config import Config
+
         return boto3.client(
             service,
             endpoint_url=self.url,

@@ -64,6 +64,7 @@ def test_wrong_meshes_fail_by_their_own_names_and_the_others_have_their_accuracy
         assert abs(table["distance"][f"f/{name}"] - value) <= 1.01 * table["error"][f"f/{name}"] + 1e-3 * value
 
 
+@pytest.mark.slow
 def test_a_plan_tells_what_is_doubtful(folder: Path) -> None:
     plan = sb.plan(study(folder), folder / "s.zarr")
     assert set(plan.doubtful) == {"f/broken", "f/inches"}

@@ -497,6 +497,7 @@ def test_damaged_studies_end_in_a_study_or_a_study_error(data: st.DataObject) ->
     _ends_well(table)
 
 
+@pytest.mark.slow
 @_fuzz
 @given(
     xi_max=st.floats(),
@@ -516,6 +517,7 @@ def test_numbers_at_the_ends_of_their_range_end_in_a_plan_or_an_error(
         orderly(str(error))
 
 
+@pytest.mark.slow
 @_fuzz
 @given(content=st.binary(max_size=200) | st.text(max_size=200).map(lambda text: text.encode("utf-8", "surrogatepass")))
 def test_any_file_ends_in_a_study_or_a_study_error(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:

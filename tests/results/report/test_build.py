@@ -260,6 +260,7 @@ def test_the_study_can_be_run_again(page: Path, folder: Path, reader: Browser) -
     assert tomllib.loads(reader.tell("document.getElementById('study').textContent")) == table(folder)
 
 
+@pytest.mark.slow
 def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> None:
     tree = open_store(store)
     made = make_views(tree, folder, ["files/good", "reference", "files/<b>bad<"])

@@ -27,6 +27,7 @@ from tests.support.shapes import CENTRED_BOX as BOX
 LATTICE = Lattice(4.0, 32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [-0.6, -2.0, -10.0])
 def test_norm_is_the_trapezoidal_rule_over_the_whole_cube(order: float) -> None:
     field = fourier_transform(BOX, LATTICE)

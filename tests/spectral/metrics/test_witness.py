@@ -79,6 +79,7 @@ def test_is_the_direct_sum_over_the_whole_lattice(seed: int) -> None:
         assert evaluated.sel(order=order).values == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     a, b = random_pair(3)
     points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))

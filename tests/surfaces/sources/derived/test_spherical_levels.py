@@ -96,6 +96,7 @@ def test_the_fingerprint_of_a_level_is_that_of_both_meshes_and_the_level() -> No
     assert json.dumps(dict(levels(3, 3, [1])[0].fingerprint())) == found[0]
 
 
+@pytest.mark.slow
 def test_the_levels_of_a_cortex() -> None:
     pytest.importorskip("nilearn", reason="the cortical surface needs the extra `studies`")
 
