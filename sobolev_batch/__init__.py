@@ -21,7 +21,7 @@ The public names by subject:
   tensors.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
 - Surfaces: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`, `icosphere`,
-  `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two `Interval`, `PointCloud`, `read_points`; a
+  `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two `Interval`; a
   `Similarity` scales and moves them.
 - Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
 - Test suites: `assert_same_surface`, or `same_surface` for its `Verdict`.

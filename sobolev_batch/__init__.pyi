@@ -69,12 +69,10 @@ from .spectral.metrics.yardsticks import yardsticks as yardsticks
 from .surfaces.formats.objects import as_mesh as as_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh
 from .surfaces.formats.writers import write_mesh as write_mesh
-from .surfaces.point_files import read_points as read_points
 from .surfaces.proximity import Proximity as Proximity
 from .surfaces.proximity import proximity as proximity
 from .surfaces.shapes.icosphere import icosphere as icosphere
 from .surfaces.shapes.mesh import Mesh as Mesh
-from .surfaces.shapes.point_cloud import PointCloud as PointCloud
 from .surfaces.shapes.similarity import Similarity as Similarity
 from .surfaces.shapes.sphere import Sphere as Sphere
 from .surfaces.smooth.ellipsoid import Ellipsoid as Ellipsoid

@@ -10,12 +10,11 @@ from click.core import ParameterSource
 from sobolev_batch.cli.group import EXIT_DIFFERENT, EXIT_UNDECIDED
 from sobolev_batch.cli.options import fraction_of_norm
 from sobolev_batch.cli.output import echo
-from sobolev_batch.cli.points import read_pair
 from sobolev_batch.testing.defaults import DEFAULT_ORDER
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
-_KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling", "weight", "area"}
+_KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling"}
 
 below_option = click.option(
     "--below",
@@ -49,7 +48,6 @@ def judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
         raise click.UsageError("--below takes one --order")
     (order,) = orders
     settings = {"scaling": not context.params["no_scaling"], "memory": context.params["memory"]}
-    first, second = read_pair(a, b, context.params["weight"], context.params["area"])
-    verdict = same_surface(first, second, rtol=below, order=order, **settings)
+    verdict = same_surface(a, b, rtol=below, order=order, **settings)
     echo(f"{a.name}: {verdict}")
     return _STATUSES[verdict.outcome]

@@ -12,7 +12,6 @@ from sobolev_batch.cli.below import below_option, judge_files
 from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.options import best_effort_option, memory_option, orders_option
 from sobolev_batch.cli.output import echo, echo_lines
-from sobolev_batch.cli.points import point_options, read_pair, require_mesh, two_meshes
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
@@ -56,7 +55,6 @@ _DEFAULT_RTOL = 1e-2
     "PATH-a.ply and PATH-b.ply.",
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
-@point_options
 @below_option
 @click.pass_context
 def compare_command(
@@ -73,11 +71,9 @@ def compare_command(
     with_proximity: bool,
     witness_path: Path | None,
     no_scaling: bool,
-    weight: str | None,
-    area: float | None,
     below: float | None,
 ) -> None:
-    """Print how much two files of meshes or points differ.
+    """Print how much two meshes differ.
 
     B is the reference. The difference is given in per cent of its norm, with a bound on the error, and with the share
     of the squared distance that a change of area explains. With --below, print one line on whether both are the same
@@ -86,8 +82,8 @@ def compare_command(
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.norms import distance
     from sobolev_batch.spectral.metrics.yardsticks import yardsticks
+    from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
-    from sobolev_batch.surfaces.shapes.mesh import Mesh
     from sobolev_batch.surfaces.shapes.placement import placement_doubt
     from sobolev_batch.surfaces.shapes.similarity import Similarity
     from sobolev_batch.testing.witness import require_place, write_difference
@@ -101,9 +97,8 @@ def compare_command(
         lattice = Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
     elif rtol is None:
         rtol, best_effort = _DEFAULT_RTOL, True
-    first, second = read_pair(a, b, weight, area)
+    first, second = read_mesh(a), read_mesh(b)
     if witness_path is not None:
-        require_mesh("--witness", (first, second))
         require_place(witness_path)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)
@@ -111,15 +106,11 @@ def compare_command(
     if doubt is not None:
         echo(f"note: {a.name}: {doubt}", err=True)
     # Refused before a long computation where its library is not installed.
-    nearness = proximity(*two_meshes("--proximity", pair)) if with_proximity else None
+    nearness = proximity(*pair) if with_proximity else None
     orders = orders or (-2.0,)
     accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
-    if with_yardsticks:
-        results = yardsticks(*two_meshes("--yardsticks", pair), orders, **accuracy)
-    else:
-        results = distance(*pair, orders, **accuracy)
-    parts = "triangles" if isinstance(first, Mesh) else "points"
-    _print_answers(a.name, b.name, results, first.area / second.area - 1, parts, rtol)
+    results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
+    _print_answers(a.name, b.name, results, first.area / second.area - 1, rtol)
     echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
     if nearness is not None:
         echo(
@@ -131,14 +122,12 @@ def compare_command(
         echo(difference.sentence(a.name))
 
 
-def _print_answers(
-    name: str, reference: str, results: xr.Dataset, area_change: float, parts: str, rtol: float | None
-) -> None:
+def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> None:
     """Print a sentence for each order, what is as far away if that was measured, and then the numbers."""
     from sobolev_batch.results.tables.sentences import answer, likeness
 
     by_order = [results.sel(order=order) for order in results["order"].values]
-    for sentence in dict.fromkeys(answer(name, reference, result, area_change, parts) for result in by_order):
+    for sentence in dict.fromkeys(answer(name, reference, result, area_change) for result in by_order):
         echo(sentence)
     # Of equal meshes there is no more to tell.
     unequal = [result for result in by_order if result["distance"] > 0]

@@ -16,7 +16,7 @@ from sobolev_batch.fitting.optimisation.descent import End
 from sobolev_batch.fitting.optimisation.problem import FitProblem
 from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run, stages_of
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, quality_of, refuse_points
+from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, quality_of
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -115,7 +115,6 @@ def require_comparable(mesh: Mesh, target: Operand) -> None:
     Raises:
         InputError: See `fit`.
     """
-    refuse_points(target)
     if isinstance(target, xr.DataArray):
         quality = quality_of(target)
         extent = None if quality is None else quality.extent

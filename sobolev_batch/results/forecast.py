@@ -95,9 +95,9 @@ class Forecast:
 def _row_seconds(plan: Plan, row: Row) -> float:
     """Return the predicted time of a row's tasks, on the machine that constants were measured on."""
     expected = row.member.expected_size()
-    size = SurfaceSize(expected.triangles, plan.reference_area, points=expected.points)
+    size = SurfaceSize(expected.triangles, plan.reference_area)
     # An accuracy takes coarser settings where it can; what they save is little beside octaves.
-    transform = field_seconds(expected.triangles, plan.reference_area, plan.lattice, plan.transform, expected.points)
+    transform = field_seconds(expected.triangles, plan.reference_area, plan.lattice, plan.transform)
     octaves = () if plan.tail is None else plan.tail.octaves
     sampling = sum(size.sampling_seconds(octave) for octave in octaves)
     return _ROW_SECONDS + _TRIANGLE_SECONDS * expected.triangles + expected.seconds + transform + sampling

@@ -151,7 +151,7 @@ def compute_field(
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
         probe = probe_block(surface, lattice, settings, orders, block, values, draws)
-    return Field(values, Quality.of_surface(surface, probe, lattice), settings, transformed.points, transformed.backend)
+    return Field(values, Quality.from_surface(surface, probe), settings, transformed.points, transformed.backend)
 
 
 def field_for(

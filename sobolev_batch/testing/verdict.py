@@ -35,9 +35,9 @@ class Verdict:
         rtol: Largest distance of surfaces that count as the same.
         order: Order s of the norm.
         area_change: Area of the surface over that of the reference, less one.
-        method: What the distance follows from: "identical" (meshes have the same triangles, or clouds the same points),
-            "lattice" (the areas bound what lies beyond it), or "octaves" (random frequencies, and the distances of
-            points, measure what lies beyond a lattice).
+        method: What the distance follows from: "identical" (meshes have the same triangles),
+            "lattice" (the areas bound what lies beyond it), or "octaves" (random frequencies measure what lies
+            beyond a lattice).
 
     >>> import sobolev_batch as sb
     >>> verdict = sb.same_surface(sb.icosphere(3), sb.Sphere())
@@ -109,11 +109,11 @@ def same_surface(
     triangles face does not matter either. The distance is only computed as exactly as the answer needs.
 
     Args:
-        a: Surface: a `Mesh`, a surface in closed form such as a `Sphere`, a `PointCloud`, the path of a mesh file, or a
-            tuple of vertices (n, 3) and triangles (m, 3).
+        a: Surface: a `Mesh`, a surface in closed form such as a `Sphere`, the path of a mesh file, or a tuple of
+            vertices (n, 3) and triangles (m, 3).
         b: Reference, likewise.
         rtol: Largest distance of surfaces that count as the same, over the norm of the reference.
-        order: Order s < -1/2 of the norm, for point clouds < -3/2. Orders from -3 on take seconds for an rtol of 1e-3,
+        order: Order s < -1/2 of the norm. Orders from -3 on take seconds for an rtol of 1e-3,
             and most time near -1/2.
         scaling: Compare both in the unit of length in which the bounding sphere of the reference has the radius 1.
             Otherwise they are compared in their own, on which norms depend.
@@ -126,7 +126,7 @@ def same_surface(
     Raises:
         InputError: An argument is no surface, or out of range; or there is less memory.
         MeshError: A file or arrays hold no valid mesh.
-        OrderError: The order is not below -1/2, or for point clouds -3/2.
+        OrderError: The order is not below -1/2.
 
     >>> import sobolev_batch as sb
     >>> fine, coarse = sb.icosphere(4), sb.icosphere(3)
@@ -137,7 +137,7 @@ def same_surface(
     """
     accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, available(memory))
     checked_order = single_order(order)
-    surface, reference = (as_surface(one, (checked_order,)) for one in (a, b))
+    surface, reference = (as_surface(one) for one in (a, b))
     area_change = surface.area / reference.area - 1
     similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
     pair = similarity.apply(surface), similarity.apply(reference)

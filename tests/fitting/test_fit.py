@@ -242,8 +242,7 @@ def far_field() -> xr.DataArray:
         ({"mesh": sb.Sphere()}, "expected a Mesh, the path of a mesh file, a pair"),
         (
             {"target": 7},
-            "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), a PointCloud or a Fourier "
-            "field; found int",
+            "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a Fourier field; found int",
         ),
         ({"target": sb.Sphere(1.0, (9, 0, 0))}, "do not overlap: move one of them to the other first"),
         ({"target": sb.Sphere(1000.0)}, "are both in the same unit of length?"),

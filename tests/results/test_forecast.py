@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,20 +91,6 @@ def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
     (fast,) = (row for row in plan.rows if row.label == "ico/1")
     (fitted,) = (row for row in slow.rows if row.label == "fitted/1")
     assert fitted.member.expected_size().seconds > 1 > fast.member.expected_size().seconds
-
-
-@pytest.mark.slow
-def test_points_of_clouds_count(tmp_path: Path) -> None:
-    seconds = []
-    for count in (1_000, 100_000):
-        points = np.random.default_rng(1).normal(size=(count, 3))
-        np.savetxt(tmp_path / "scan.xyz", points / np.linalg.norm(points, axis=1, keepdims=True))
-        family = {"name": "scan", "source": "points", "paths": [str(tmp_path / "scan.xyz")], "area": 4 * np.pi}
-        found = make_plan(sb.Study.from_table(small_table(family=[family])))
-        missing = {row.label: row for row in found.rows}.pop("scan/scan")
-        assert count / 3 < missing.member.expected_size().points < 3 * count
-        seconds.append(Forecast.of(found, {}, Workers.of_this_machine(1), None, planning_seconds=0.0).processor_seconds)
-    assert seconds[1] > seconds[0] + 0.01
 
 
 def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:

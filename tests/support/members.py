@@ -10,7 +10,7 @@ from sobolev_batch.surfaces.sources.registry import Member, parse_source
 
 BALL: dict[str, Any] = {"source": "icosphere", "levels": [3]}
 
-# A table of each source; box.off and scan.csv must lie in the folder of the study.
+# A table of each source; box.off must lie in the folder of the study.
 KINDS: dict[str, dict[str, Any]] = {
     "icosphere": {"source": "icosphere", "levels": [1, 0]},
     "sphere": {"source": "sphere", "radius": 2.0, "center": [1, 2, 3]},
@@ -19,7 +19,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "torus": {"source": "torus", "R": 2, "r": 0.5, "center": [1, 2, 3]},
     "torus-grid": {"source": "torus-grid", "R": 2, "r": 0.5, "levels": [1, 0]},
     "files": {"source": "files", "paths": ["box.off"]},
-    "points": {"source": "points", "paths": ["scan.csv"], "weight": "area"},
     "decimate": {"source": "decimate", "mesh": BALL, "triangles": [80]},
     "remesh": {"source": "remesh", "mesh": BALL, "triangles": [80]},
     "fit": {

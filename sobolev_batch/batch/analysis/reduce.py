@@ -28,14 +28,12 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum, stacked_levels
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
-from sobolev_batch.surfaces.shapes.point_cloud import require_finite_norm
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 5
@@ -166,16 +164,12 @@ class StoredFields:
         areas, errors = np.full(len(self.records), np.nan), np.full((len(orders), len(self.records)), np.nan)
         weights = SobolevWeights(self.lattice, orders, None if self.tail is None else self.tail.cutoff)
         extents, qualities = [], {}
-        points: dict[int, PointSpectrum] = {}
         for i, record in complete.items():
             quality = Quality.from_json(record.quality)
             areas[i], errors[:, i] = quality.area, quality.error_norms(weights)
             extents.append(quality.extent)
             if quality.tail is not None:
                 qualities[i] = quality.tail
-            if quality.points is not None:
-                require_finite_norm(orders)
-                points[i] = quality.points
         reference = self.reference if self.reference in complete else None
         tails = None
         if self.tail is not None:
@@ -192,7 +186,6 @@ class StoredFields:
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums={i: record.checksums for i, record in complete.items()},
             tails=tails,
-            point_levels=stacked_levels(points, len(self.records)),
         )
 
 

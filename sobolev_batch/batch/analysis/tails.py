@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.quality import TailQuality
 from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.sums import OctaveSums, squared_moduli
@@ -69,8 +68,7 @@ class TailReducer:
     def of_norm(self, row: int, values: NDArray[np.complexfloating], inner: Reals) -> Tail:
         """Return the tail of a squared norm; ``inner`` are the energies of the two octaves below (2,)."""
         quality = self.qualities[row]
-        limit = EnergyLimit(*quality.own_limit).with_points(quality.own_points)
-        return self._tail(self.weights.sums(squared_moduli(values)), limit, inner)
+        return self._tail(self.weights.sums(squared_moduli(values)), EnergyLimit(*quality.own_limit), inner)
 
     def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating], inner: Reals) -> Tail:
         """Return the tail of a squared distance; see `of_norm`."""
@@ -113,12 +111,9 @@ class TailReducer:
         for one, against in ((row, other), (other, row)):
             known = self.qualities[one].difference_limit
             if against == self.reference and known is not None:
-                return EnergyLimit(*known).with_points(self.qualities[one].difference_points)
+                return EnergyLimit(*known)
         if not last_energy:
             # Equal meshes have equal values.
             return EnergyLimit(0.0)
         highest = self.qualities[row].own_limit[0] + self.qualities[other].own_limit[0]
-        points = PointSpectrum.between(self.qualities[row].own_points, self.qualities[other].own_points)
-        if points is not None:
-            return EnergyLimit(highest).with_points(points)
         return EnergyLimit.between(_LEAST_LIMIT * last_energy, highest)

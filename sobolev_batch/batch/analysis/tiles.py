@@ -66,7 +66,6 @@ class Reducer:
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
     tails: TailReducer | None = None
-    point_levels: Reals | None = None
     tile_bytes: int = 384 << 20
 
     @property
@@ -133,17 +132,14 @@ class Reducer:
         if self.tails is not None:
             sums = [sums_of_shells(one, self.weights) for one in (own, to_reference, products, of_reference[None])]
             return self._with_tails(self.tails, rows, sums)
-        of_points = None if self.point_levels is None else self.point_levels[:, list(rows)]
-        norms = self._estimate(sums_of_shells(own, self.weights), *of_rows, of_points)
+        norms = self._estimate(sums_of_shells(own, self.weights), *of_rows)
         if self.reference is None:
             return norms, *self._unknown(norms)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas = (of_rows[0] + self.areas[self.reference]) * apart
         errors = (of_rows[1] + self.errors[:, [self.reference]]) * apart
-        of_pairs = self._levels_of_pairs(rows, [self.reference])
-        of_pairs = None if of_pairs is None else of_pairs[..., 0] * apart
-        distances = self._estimate(sums_of_shells(to_reference, self.weights), areas, errors, of_pairs)
+        distances = self._estimate(sums_of_shells(to_reference, self.weights), areas, errors)
         return norms, distances, Proportion.of_shells(to_reference, products, of_reference, self.weights)
 
     def _with_tails(
@@ -211,19 +207,10 @@ class Reducer:
             tail = self.tails.of_pairs(rows, others, sums.outer, shared)
             images = aliased(sums, self.weights, self.widths) * unequal
             return tail.estimate(sums.totals, images, errors)
-        levels = self._levels_of_pairs(rows, others)
-        return self._estimate(sums, areas, errors, None if levels is None else levels * unequal)
+        return self._estimate(sums, areas, errors)
 
-    def _levels_of_pairs(self, rows: Sequence[int], others: Sequence[int]) -> Reals | None:
-        """Return the most that points of clouds add to differences, (octaves + 1, rows, others); None for none."""
-        if self.point_levels is None:
-            return None
-        roots = np.sqrt(self.point_levels)
-        return np.asarray((roots[:, list(rows), None] + roots[:, None, list(others)]) ** 2)
-
-    def _estimate(self, sums: Sums, areas: Reals, errors: Reals, point_levels: Reals | None) -> NormEstimate:
-        support = Support(areas, self.widths, point_levels=point_levels)
-        return estimate_norms(sums, self.weights, support, errors)
+    def _estimate(self, sums: Sums, areas: Reals, errors: Reals) -> NormEstimate:
+        return estimate_norms(sums, self.weights, Support(areas, self.widths), errors)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

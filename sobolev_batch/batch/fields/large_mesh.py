@@ -99,7 +99,7 @@ def split_mesh(job: Job, count: int) -> SplitMesh:
         require_inside(mesh, lattice)
         transform = job.transform_settings(mesh)
         draws = draws_for([mesh], lattice, job.settings.orders, transform.lowest_degree(mesh, lattice))
-        facts, quality = facts_of(mesh, 0), Quality.of_surface(mesh, Probe(), job.settings.lattice)
+        facts, quality = facts_of(mesh, 0), Quality.from_surface(mesh, Probe())
         octave_target = None if job.settings.tail is None else job.octave_target(mesh)
         token, batches = uuid4().hex, set()
         for number, batch in mesh.batches(math.ceil(len(mesh.triangles) / count)):

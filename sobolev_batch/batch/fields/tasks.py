@@ -24,7 +24,6 @@ from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.probe import Probe, join
 from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.errors.samples import draws_for, probe_block
@@ -36,7 +35,6 @@ from sobolev_batch.spectral.octaves.values import OctaveValues, Settings, octave
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among, require_finite_norm
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -115,8 +113,6 @@ class Job:
 
     def _loaded(self, row: Row) -> Surface:
         surface = self.settings.similarity.apply(row.member.load())
-        if isinstance(surface, PointCloud):
-            require_finite_norm(self.settings.orders)
         if row.fingerprint and row.member.fingerprint_digest() != row.fingerprint:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
@@ -162,13 +158,6 @@ class StoredBlocks:
     quality: Quality | None = None
     checksums: tuple[int, ...] = ()
     backends: tuple[str, ...] = ()
-
-    def with_points(self, own: PointSpectrum | None, difference: PointSpectrum | None) -> StoredBlocks:
-        """Return the outcome with what points of clouds add beyond the octaves."""
-        if self.quality is None or self.quality.tail is None or difference is None:
-            return self
-        tail = replace(self.quality.tail, own_points=own, difference_points=difference)
-        return replace(self, quality=replace(self.quality, tail=tail))
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
@@ -231,10 +220,7 @@ def store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
     own, reference = EnergyLimit.of([surface], [1]), job.load_reference()
     difference = None if reference is None else EnergyLimit.of([surface, reference], [1, -1])
-    stored = finish_octaves(job, Quality.of_surface(surface, Probe(), job.settings.lattice), values, own, difference)
-    pair = [surface] if reference is None else [surface, reference]
-    points = [PointSpectrum.of(clouds_among(some), tail.highest_frequency) for some in ([surface], pair)]
-    return stored.with_points(*points)
+    return finish_octaves(job, Quality.from_surface(surface, Probe()), values, own, difference)
 
 
 def finish_octaves(
@@ -284,7 +270,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
         probes.append(probe_block(surface, lattice, transform, orders, block, result.values, draws))
         backends.append(result.backend)
         points = result.points
-    quality = Quality.of_surface(surface, join(probes), lattice)
+    quality = Quality.from_surface(surface, join(probes))
     return StoredBlocks(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
 
 

@@ -208,7 +208,7 @@ class _Search:
         shortfalls: dict[str, AccuracyError] = {}
         for label in demanding:
             try:
-                solution = solve_in_octaves(self.problems[label], 0, _PILOT_FRACTION, pairs=False)
+                solution = solve_in_octaves(self.problems[label], 0, _PILOT_FRACTION)
             except AccuracyError as error:
                 shortfalls[label] = error
                 continue

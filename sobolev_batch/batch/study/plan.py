@@ -25,7 +25,6 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, require_finite_norm
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -140,8 +139,6 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     own = _load_reference(members[reference][1])
     similarity = Similarity.to_unit_ball(own) if study.scaling.mode == "reference" else study.scaling.fixed
     surface = similarity.apply(own)
-    if isinstance(surface, PointCloud) or any(member.is_point_cloud for _, member in members.values()):
-        require_finite_norm(study.orders)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
     if not isinstance(surface, Sphere):
         require_inside(surface, choice.lattice)

@@ -27,7 +27,6 @@ from sobolev_batch.spectral.metrics.inputs import (
     field_of,
     field_values,
     quality_of,
-    refuse_points,
 )
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
@@ -146,7 +145,6 @@ class _Difference:
         settings: TransformSettings,
         execution: Execution,
     ) -> Self:
-        refuse_points(target)
         is_given = isinstance(target, xr.DataArray)
         if is_given or lattice is None:
             field = field_of(target, lattice, orders)

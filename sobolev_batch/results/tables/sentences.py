@@ -17,13 +17,7 @@ _LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
 _LEAST_CHANGE = 0.5
 
 
-def answer(
-    name: str,
-    reference: str,
-    result: xr.Dataset | Mapping[str, float],
-    area_change: float,
-    parts: str = "triangles",
-) -> str:
+def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
     """Return a sentence that says how much a surface differs from the reference at one order.
 
     Args:
@@ -31,7 +25,6 @@ def answer(
         reference: Name of the reference.
         result: Variables of `distance` at one order, and the order.
         area_change: Area of the surface over that of the reference, minus one.
-        parts: What surfaces at no distance have in common.
 
     >>> numbers = {"distance": 0.3, "error": 0.003, "relative": 0.0102, "relative_error": 0.0001}
     >>> shares = {"area_share": 0.561, "area_share_error": 0.02, "excess": -0.007}
@@ -43,7 +36,7 @@ def answer(
     numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
     at_order = f"at order {float(result['order']):g}"
     if numbers["distance"] == numbers["error"] == 0:
-        return f"{name} and {reference} are identical: they have the same {parts}."
+        return f"{name} and {reference} are identical: they have the same triangles."
     if numbers["distance"] > numbers["error"]:
         amount = Digits.percent(numbers["relative"], numbers["relative_error"]).together
         return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."

@@ -14,7 +14,6 @@ from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_o
 from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
 from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, aliased, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
 from sobolev_batch.spectral.errors.reference import ReferenceEstimate, product_rounding
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
@@ -24,7 +23,6 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
@@ -39,7 +37,7 @@ class Frequencies:
         octaves: The octaves, which may be none.
         orders: Orders s.
         widths: Widths of all surfaces together, see `Support`.
-        has_tail: True where all that lies beyond the lattice is known: from octaves, and from the distances of points.
+        has_tail: True where all that lies beyond the lattice is known, from octaves.
     """
 
     lattice: Lattice
@@ -162,13 +160,10 @@ class Frequencies:
         if not self.has_tail:
             return estimate_norms(sums, self.weights, self._support(surfaces), errors)
         images = aliased(sums, self.weights, self.widths)
-        tail = self._tail(measure, surfaces, signs, self._needed_octaves(surfaces))
-        return tail.estimate(sums.totals, images, errors)
+        return self._tail(measure, surfaces, signs).estimate(sums.totals, images, errors)
 
     def _support(self, surfaces: Sequence[Surface]) -> Support:
-        points = PointSpectrum.of(clouds_among(surfaces), self.lattice.xi_max)
-        levels = None if points is None else points.highest
-        return Support(support_of(surfaces).areas, self.widths, point_levels=levels)
+        return Support(support_of(surfaces).areas, self.widths)
 
     def _lattice_sums(self, measure: Measure, other: Measure) -> Sums:
         """Return the sums of Re(a conj b) over the lattice."""
@@ -181,32 +176,8 @@ class Frequencies:
             for weights, a, b in zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
         ]
 
-    def _tail(
-        self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int], count: int | None = None
-    ) -> Tail:
-        """Return the tail from the first octaves, by default all, and what is known to lie beyond them."""
-        octaves = [octave.sampling.octave for octave in self.octaves][:count]
-        sums, inner = self._octave_sums(measure, measure)[:count], self._lattice_sums(measure, measure).outer
-        limit, clouds = EnergyLimit.of(surfaces, signs), tuple(clouds_among(surfaces))
-        if clouds:
-            known = (clouds, len(octaves))
-            if known not in self._pairs:
-                self._pairs[known] = PointPairs.of(clouds, octaves[-1].highest if octaves else self.lattice.xi_max)
-            limit = limit.with_points(self._pairs[known])
-        return Tail.of(octaves, sums, limit, self.orders, inner.tolist())
-
-    def _needed_octaves(self, surfaces: Sequence[Surface]) -> int:
-        """Return the number of octaves after which nothing is left to measure: of points, pairs tell the rest."""
-        clouds = tuple(clouds_among(surfaces))
-        if len(clouds) == len(surfaces):
-            pairs = PointPairs.where_few(clouds, self.lattice.xi_max)
-            count = pairs.octaves_from(self.lattice.xi_max)
-            if count <= len(self.octaves):
-                self._pairs[clouds, count] = pairs
-                return count
-        return len(self.octaves)
-
-    @cached_property
-    def _pairs(self) -> dict[tuple[tuple[PointCloud, ...], int], PointPairs]:
-        """Pairs of the points of clouds that tell all beyond a number of octaves."""
-        return {}
+    def _tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
+        """Return the tail from the octaves, and what is known to lie beyond them."""
+        octaves = [octave.sampling.octave for octave in self.octaves]
+        sums, inner = self._octave_sums(measure, measure), self._lattice_sums(measure, measure).outer
+        return Tail.of(octaves, sums, EnergyLimit.of(surfaces, signs), self.orders, inner.tolist())

@@ -13,7 +13,6 @@ from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, cor
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.errors.budget import aliased, change_of_root, sums_of_shells
-from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
 from sobolev_batch.spectral.errors.samples import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
@@ -27,7 +26,6 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
@@ -124,14 +122,13 @@ class MeasuredOctave:
         return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
 
 
-def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, *, pairs: bool = True) -> Solution:
+def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     Args:
         problem: Surfaces, orders and accuracy.
         seed: Seed of the random frequencies. The same seed gives the same result.
         aim: Fraction of the rtol to aim at.
-        pairs: True to use the distances between points of clouds, which the values in octaves do not tell.
 
     Returns:
         The first solution that meets the aim; else the last one that can be sampled in some minutes.
@@ -140,7 +137,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, *, pairs: bo
         AccuracyError: The accuracy lies below the rounding of fields.
     """
     aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
-    search = _Search.begin(aimed, seed, pairs=pairs)
+    search = _Search.begin(aimed, seed)
     for rounds_left in reversed(range(_ROUNDS)):
         search.measure_outwards()
         solution = search.solution()
@@ -155,36 +152,29 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, *, pairs: bo
 class _Search:
     """Octaves that are added and refined until the accuracy is met."""
 
-    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator, *, pairs: bool) -> None:
+    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator) -> None:
         self.problem = problem
         self.core = core
         self.cutoff = cutoff
         self.rng = rng
         self.octaves: list[MeasuredOctave] = []
         self.seconds = 0.0
-        self.spectra: dict[float, PointSpectrum | None] = {}
         self.sizes = [SurfaceSize.of(surface) for surface in problem.surfaces]
         self.normals = FaceNormals.of(problem.surfaces)
-        self.clouds = clouds_among(problem.surfaces)
-        # What the points of clouds add beyond so many octaves follows from their distances.
-        self.pairs = PointPairs.where_few(self.clouds, cutoff) if self.clouds and pairs else None
-        self.octaves_with_points = 0 if self.pairs is None else self.pairs.octaves_from(cutoff)
-        limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
-        self.limit = limit.with_points(self.pairs)
+        self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
 
     @classmethod
-    def begin(cls, problem: Problem, seed: int, *, pairs: bool) -> Self:
+    def begin(cls, problem: Problem, seed: int) -> Self:
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
         core = Core.of(problem, lattice, lattice.xi_max)
-        return cls(problem, core, lattice.xi_max, np.random.default_rng(seed), pairs=pairs)
+        return cls(problem, core, lattice.xi_max, np.random.default_rng(seed))
 
     @property
     def squares(self) -> Reals:
         """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
         tail = self._tail()
         known = tail.octaves + np.maximum(tail.beyond - tail.uncertainty, 0.0)
-        # Octaves may hold negative products of a surface and points, before what the points add is known.
-        return np.asarray(self.core.squares + np.maximum(known, 0.0))
+        return np.asarray(self.core.squares + known)
 
     @property
     def tail_changes(self) -> Reals:
@@ -214,7 +204,7 @@ class _Search:
             SurfaceValues(field, tuple(octave.values[number] for octave in self.octaves))
             for number, field in enumerate(core.fields)
         )
-        return Solution(found, core.lattice, values, has_tail=bool(self.octaves) or self._has_only_points)
+        return Solution(found, core.lattice, values, has_tail=bool(self.octaves))
 
     def refine(self) -> bool:
         """Take more samples where they are needed most; tell whether any could be taken."""
@@ -246,40 +236,15 @@ class _Search:
         return refined
 
     def _knows_the_rest(self) -> bool:
-        if len(self.octaves) < self._fewest_octaves:
-            return False
-        if self._has_only_points:
-            return True
-        return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
-
-    @property
-    def _fewest_octaves(self) -> int:
-        """Number of octaves that are needed before anything is known of what lies beyond."""
-        if self._has_only_points:
-            return self.octaves_with_points
         # Where faces repeat, the energy may jump from one octave to the next.
-        return max(_FEWEST_OCTAVES_OF_FACES if self.normals else 1, self.octaves_with_points)
-
-    @property
-    def _has_only_points(self) -> bool:
-        """True for clouds without another surface: all that lies beyond some octaves is known."""
-        return self.pairs is not None and not self.limit.value
+        if len(self.octaves) < (_FEWEST_OCTAVES_OF_FACES if self.normals else 1):
+            return False
+        return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
 
     def _tail(self) -> Tail:
         octaves = [octave.sampling.octave for octave in self.octaves]
         sums = [octave.sums for octave in self.octaves]
-        limit = self.limit
-        if self.pairs is None and self.clouds and octaves:
-            limit = limit.with_points(self._spectrum(octaves[-1].highest))
-        tail = Tail.of(octaves, sums, limit, self.problem.orders, self.core.energies)
-        # Nothing is known of the octaves between the last measured one and those that pairs of points tell of.
-        has_gap = len(octaves) < self.octaves_with_points
-        return replace(tail, uncertainty=tail.uncertainty + np.inf) if has_gap else tail
-
-    def _spectrum(self, start: float) -> PointSpectrum | None:
-        if start not in self.spectra:
-            self.spectra[start] = PointSpectrum.of(self.clouds, start)
-        return self.spectra[start]
+        return Tail.of(octaves, sums, self.limit, self.problem.orders, self.core.energies)
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
@@ -297,15 +262,11 @@ class _Search:
             for number, surface in enumerate(problem.surfaces)
         )
         squares = squared_moduli(_difference([one.values for one in found]))
-        if self.pairs is not None and sampling.octave.index > self.octaves_with_points:
-            # What points add is known there. Two clouds have no octaves so far out.
-            for own, surface in zip(found, problem.surfaces, strict=True):
-                squares -= squared_moduli(own.values) if isinstance(surface, PointCloud) else 0.0
         return MeasuredOctave(found, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
 
     def _first_sampling(self, octave: Octave) -> OctaveSampling:
         """Return the sampling that is predicted to be the cheapest one."""
-        energy = self._predicted_energy(octave)
+        energy = self._predicted_energy()
         orders = self.problem.orders
         inside = np.array([window_integral(octave, order) for order in orders])
         outside = np.array([tail_integral(octave.highest, order) for order in orders])
@@ -328,15 +289,10 @@ class _Search:
             beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
         return OctaveSampling(octave, (lattice,), self._drawn(octave, beside, _UNIFORM_BESIDE_LATTICE))
 
-    def _predicted_energy(self, octave: Octave) -> float:
-        """Predict the energy of the next octave: where pairs of points tell theirs, the rest of it."""
-        if self.pairs is None:
-            energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
-            return _GROWTH * energy if self.clouds else min(_GROWTH * energy, max(self.limit.value, energy))
-        points = 4 * np.pi * octave.highest**2 * self.pairs.squares
-        if octave.index <= self.octaves_with_points:
-            return points + 2 * self.problem.area
-        return self.limit.value + 2 * float(np.sqrt(self.limit.value * points))
+    def _predicted_energy(self) -> float:
+        """Predict the energy of the next octave."""
+        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
+        return min(_GROWTH * energy, max(self.limit.value, energy))
 
     def _finer_sampling(self, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
         """Return a sampling of an octave with a smaller variance, or None if it is small enough."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -15,7 +15,6 @@ from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Lattice
@@ -24,7 +23,6 @@ from sobolev_batch.spectral.transform.settings import Execution, TransformSettin
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, clouds_among, without_common_points
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -73,7 +71,7 @@ class Problem:
     ) -> Self:
         """Return the problem for surfaces alone, moved together to the centre of the lattice's period.
 
-        Triangles or points that both surfaces have cancel, and are left out; none may remain.
+        Triangles that both surfaces have cancel, and are left out; none may remain.
         """
         pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
         different = _without_common_parts(surfaces)
@@ -84,11 +82,6 @@ class Problem:
         surfaces = tuple(move.apply(surface) for surface in different.values())
         pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
         return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different))
-
-    def support_on(self, lattice: Lattice) -> Support:
-        """Return the support, with what points of clouds add beyond a lattice."""
-        points = PointSpectrum.of(clouds_among(self.surfaces), lattice.xi_max)
-        return self.support if points is None else replace(self.support, point_levels=points.highest)
 
     @property
     def area(self) -> float:
@@ -181,7 +174,7 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 
 def are_equal(a: Surface, b: Surface) -> bool:
-    """Return whether two meshes have the same triangles, or two clouds the same points, in whatever order."""
+    """Return whether two meshes have the same triangles, in whatever order."""
     if isinstance(a, Mesh) and isinstance(b, Mesh) and len(a.triangles) != len(b.triangles):
         return False
     return not _without_common_parts((a, b))
@@ -193,8 +186,6 @@ def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     match surfaces:
         case (Mesh(), Mesh()):
             rests = _without_shared_triangles(*surfaces)
-        case (PointCloud(), PointCloud()):
-            rests = without_common_points(*surfaces)
     return {sign: rest for sign, rest in zip((1, -1), rests, strict=False) if rest is not None}
 
 
@@ -228,7 +219,7 @@ class Solution:
         lattice: Lattice of the fields; None where nothing had to be computed.
         values: Values of each surface on the lattice and in octaves beyond it.
         shortfall: Why the numbers miss the accuracy; None if they do not.
-        has_tail: True where all that lies beyond the lattice was measured or is known, and the lattice ends in a step.
+        has_tail: True where all that lies beyond the lattice was measured, and the lattice ends in a step.
     """
 
     estimate: NormEstimate

@@ -273,7 +273,7 @@ def _next_step(problem: Problem, step: _Step, sums: Sums) -> _Step:
     """Return the step on the lattice that the sums of a step call for, or on a larger pilot's."""
     weights = SobolevWeights(step.lattice, problem.orders)
     try:
-        lattice = refined(sums, weights, problem.support_on(step.lattice), problem.accuracy, problem.label)
+        lattice = refined(sums, weights, problem.support, problem.accuracy, problem.label)
     except AccuracyError:
         larger = larger_pilot(step.lattice, problem.accuracy)
         if larger is None:
@@ -301,7 +301,7 @@ def difference_on(problem: Problem, lattice: Lattice, fields: Sequence[Field]) -
     difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
-    return estimate_norms(sums, weights, problem.support_on(lattice), errors), sums
+    return estimate_norms(sums, weights, problem.support, errors), sums
 
 
 def _of_pilot(accuracy: Accuracy) -> Accuracy:

@@ -22,7 +22,6 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.surfaces.shapes.point_cloud import clouds_among
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -254,12 +253,10 @@ def _beyond(problem: Problem) -> list[tuple[float, float]]:
 
     They follow from the areas alone. The energy on |ξ| = r is twice the area on average, and twice that where layers
     reinforce each other. If surfaces repeat, it comes in pulses at the odd multiples of a frequency, of which the first
-    may lie just beyond; points have no such law. Besides, no value of the transform is larger than the area.
+    may lie just beyond. Besides, no value of the transform is larger than the area.
     """
     (order,), area = problem.orders, problem.area
-    power, bounds = -2 * order - 3, []
-    if not clouds_among(problem.surfaces):
-        bounds.append((4 * area * (1 - 4**order) * float(zeta(-2 * order)), -2 * order - 1))
+    power, bounds = -2 * order - 3, [(4 * area * (1 - 4**order) * float(zeta(-2 * order)), -2 * order - 1)]
     if power > 0:
         bounds.append((4 * np.pi * area**2 / power, power))
     return bounds

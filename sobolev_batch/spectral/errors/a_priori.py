@@ -22,7 +22,6 @@ from sobolev_batch.spectral.quadrature.meshes import choose_rules
 from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, rule_ranges, typical_errors
 from sobolev_batch.spectral.transform.settings import COARSEST_EPS, FINEST_EPS, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
@@ -74,7 +73,7 @@ def choose_settings(
     """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
 
     Args:
-        surface: Surface of the field, a mesh, a parametrised one or a point cloud.
+        surface: Surface of the field, a mesh or a parametrised one.
         lattice: FrequencyLattice of the field.
         target: Largest permitted error.
         settings: Settings whose dtype and quadrature are kept.
@@ -86,8 +85,7 @@ def choose_settings(
         InputError: Fields of this kind of surface have no such settings.
     """
     raise InputError(
-        "settings follow from an accuracy for meshes, parametrised surfaces and point clouds, found "
-        f"{type(surface).__name__}"
+        f"settings follow from an accuracy for meshes and parametrised surfaces, found {type(surface).__name__}"
     )
 
 
@@ -107,15 +105,6 @@ def _(
     rest = (1 - _NUFFT_FRACTION) * np.array(target.norms)
     eps = _nufft_eps(surface.area, _FEWEST_NODES, lattice, target, settings)
     return replace(settings, eps=eps, tolerance=float(np.min(rest / (surface.area * np.sqrt(masses)))))
-
-
-@choose_settings.register
-def _(
-    surface: PointCloud, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
-) -> TransformSettings:
-    # As many points of equal weights have this sum of squares.
-    points = surface.area**2 / float(surface.weights @ surface.weights)
-    return replace(settings, eps=_nufft_eps(surface.area, points, lattice, target, settings))
 
 
 def _nufft_eps(

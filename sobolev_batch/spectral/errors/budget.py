@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import exprel, gammaln, kve
 
-from sobolev_batch.spectral.errors.point_spectrum import octave_masses
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
 
@@ -74,14 +73,11 @@ class Support:
         areas: Area of the surface, or of both together, (...).
         widths: Widths of all surfaces together along `DIRECTIONS`, (13,).
         reach: Largest |coordinate| of them; lattices are chosen by it.
-        point_levels: Largest mean |field|² by points of clouds, in octaves from ``xi_max`` on and beyond them,
-            (octaves + 1, ...); see `PointSpectrum`. None without clouds.
     """
 
     areas: Reals
     widths: Reals
     reach: float = 0.0
-    point_levels: Reals | None = None
 
 
 @dataclass(frozen=True)
@@ -195,7 +191,6 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
     The energy on |ξ| = r grows like r^p until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated
     surfaces. Between two surfaces closer than the wavelength, p is 2. The energy oscillates with the
     inverse width of the surfaces; if ξ_max covers few of these periods, the outer ranges may lie in a trough.
-    What the points of clouds add does not end there, but follows from their distances.
     """
     lattice = weights.lattice
     inner, outer = sums.outer
@@ -223,11 +218,7 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
         with np.errstate(divide="ignore", invalid="ignore"):
             tails.append(np.where(outer > 0, (growing + flat) / (2 * ratio), 0.0))
     periods = float(support.widths.max()) * lattice.xi_max
-    bounds: Reals = TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails)
-    if support.point_levels is None:
-        return bounds
-    count, above = len(support.point_levels), max(highest or 0.0, lattice.xi_max)
-    return bounds + np.tensordot(octave_masses(lattice.xi_max, count, weights.orders, above), support.point_levels, 1)
+    return np.asarray(TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails))
 
 
 def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:

@@ -101,7 +101,7 @@ def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Re
 
 
 def draw_count(terms: int) -> int:
-    """Return the number of frequencies to probe so many triangles or points at: fewer where each costs more."""
+    """Return the number of frequencies to probe so many triangles at: fewer where each costs more."""
     return int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
 
 

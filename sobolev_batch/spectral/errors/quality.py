@@ -9,12 +9,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.probe import Probe, norms_of_checks
-from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.extent import Extent
-from sobolev_batch.surfaces.shapes.point_cloud import clouds_among
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 
@@ -27,34 +24,26 @@ class TailQuality:
         squares: Contribution of each comparison to the squared norm of the error, without the weight of an order.
         own_limit: Limit of the surface's own energy for large |ξ|, and its standard error.
         difference_limit: Limit of the energy of its difference from the study's reference, likewise; None if unknown.
-        own_points: Spectrum of a point cloud beyond the octaves; None for other surfaces.
-        difference_points: Spectrum of the points in the difference from the reference; None if there are none.
     """
 
     radii: tuple[float, ...]
     squares: tuple[float, ...]
     own_limit: tuple[float, float]
     difference_limit: tuple[float, float] | None = None
-    own_points: PointSpectrum | None = None
-    difference_points: PointSpectrum | None = None
 
     def to_table(self) -> dict[str, Any]:
         """Return the quality as a table, from which `from_table` makes it again."""
-        points = {"own_points": self.own_points, "difference_points": self.difference_points}
         return {
             "radii": self.radii,
             "squares": self.squares,
             "own_limit": self.own_limit,
             "difference_limit": self.difference_limit,
-            **{name: spectrum.to_table() for name, spectrum in points.items() if spectrum is not None},
         }
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> Self:
         """Return the quality that a table holds."""
-        numbers = {name: _tuple(table[name]) for name in ("radii", "squares", "own_limit", "difference_limit")}
-        points = (PointSpectrum.from_table(table.get(name)) for name in ("own_points", "difference_points"))
-        return cls(*numbers.values(), *points)
+        return cls(*(_tuple(table[name]) for name in ("radii", "squares", "own_limit", "difference_limit")))
 
 
 @dataclass(frozen=True)
@@ -66,20 +55,17 @@ class Quality:
         extent: Extent of the surface.
         probe: Measured error of the field itself; empty for a closed form.
         tail: Quality of the values in octaves; None without octaves.
-        points: Spectrum of a point cloud beyond the lattice; None for other surfaces.
     """
 
     area: float
     extent: Extent
     probe: Probe
     tail: TailQuality | None = None
-    points: PointSpectrum | None = None
 
     @classmethod
-    def of_surface(cls, surface: Surface, probe: Probe, lattice: Lattice) -> Self:
-        """Return the quality of the field of a surface on a lattice."""
-        points = PointSpectrum.of(clouds_among([surface]), lattice.xi_max)
-        return cls(surface.area, surface.extent, probe, points=points)
+    def from_surface(cls, surface: Surface, probe: Probe) -> Self:
+        """Return the quality of the field of a surface."""
+        return cls(surface.area, surface.extent, probe)
 
     def error_norms(self, weights: SobolevWeights) -> NDArray[np.float64]:
         """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
@@ -92,25 +78,14 @@ class Quality:
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
         parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
-        # Neither is there in most cases, nor was the second one in earlier versions.
-        further = [None if part is None else part.to_table() for part in (self.tail, self.points)]
-        while further and further[-1] is None:
-            further.pop()
-        return json.dumps([*parts, *further])
+        return json.dumps(parts if self.tail is None else [*parts, self.tail.to_table()])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read a quality from a line of `to_json`."""
-        area, lowest, highest, shells, sums, *further = json.loads(text)
-        probe = Probe(tuple(shells), tuple(sums))
-        tail, points = (*further, None, None)[:2]
-        return cls(
-            area,
-            Extent(tuple(lowest), tuple(highest)),
-            probe,
-            None if tail is None else TailQuality.from_table(tail),
-            PointSpectrum.from_table(points),
-        )
+        area, lowest, highest, shells, sums, *tail = json.loads(text)
+        extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
+        return cls(area, extent, probe, TailQuality.from_table(*tail) if tail else None)
 
 
 def _tuple(value: Any) -> Any:

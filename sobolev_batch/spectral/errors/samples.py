@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.probe import Draws, Probe, draw, draw_count, join, measure, uniform_probe
-from sobolev_batch.spectral.exact.points import point_transform
 from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.smooth import exact_values, resolution_of
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -55,15 +53,8 @@ def _(surface: Smooth, frequencies: Reals) -> NDArray[np.complex128]:
     return exact_values(surface, frequencies)
 
 
-@exact_transform_of.register
-def _(surface: PointCloud, frequencies: Reals) -> NDArray[np.complex128]:
-    return point_transform(surface.points, surface.weights, frequencies)
-
-
 def term_count(surface: Surface) -> int:
-    """Return the number of triangles or points that an exact transform adds up; 1 for other surfaces."""
-    if isinstance(surface, PointCloud):
-        return len(surface.points)
+    """Return the number of triangles that an exact transform adds up; 1 for other surfaces."""
     return len(surface.triangles) if isinstance(surface, Mesh) else 1
 
 

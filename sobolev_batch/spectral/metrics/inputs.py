@@ -14,7 +14,6 @@ from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.shells import Complexes, Reals, shell_sums
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, require_finite_norm
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Operand = Surface | xr.DataArray
@@ -25,21 +24,19 @@ OperandLike = SurfaceLike | xr.DataArray
 BLOCK_SAMPLES = 1 << 22
 
 
-def as_operand(a: OperandLike, orders: Sequence[float] = ()) -> Operand:
+def as_operand(a: OperandLike) -> Operand:
     """Return a field as it is, and anything else as a surface.
 
     Raises:
-        OrderError: See `as_surface`.
         InputError: It is neither; or see `as_mesh`.
     """
-    return a if isinstance(a, xr.DataArray) else as_surface(a, orders)
+    return a if isinstance(a, xr.DataArray) else as_surface(a)
 
 
 def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
     """Return a field as it is, or transform a surface on a lattice.
 
     Raises:
-        OrderError: The norm of a point cloud is infinite for one of the orders.
         LatticeError: The field has other dimensions, or the surface does not fit into the lattice.
         InputError: The argument is neither a field nor a surface, a field is not complex, or a surface comes without a
             lattice.
@@ -51,11 +48,8 @@ def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -
             raise LatticeError(
                 f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
             )
-        quality = quality_of(a)
-        if quality is not None and quality.points is not None:
-            require_finite_norm(orders)
         return a
-    surface = as_surface(a, orders)
+    surface = as_surface(a)
     if lattice is None:
         raise InputError(
             f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
@@ -117,17 +111,6 @@ def point_array(values: ArrayLike, name: str) -> Reals:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name} must have the shape (n, 3), found {points.shape}")
     return points
-
-
-def refuse_points(target: Operand) -> None:
-    """Refuse a point cloud as the target of a fit.
-
-    Raises:
-        InputError: It is a point cloud, or its field.
-    """
-    quality = quality_of(target) if isinstance(target, xr.DataArray) else None
-    if isinstance(target, PointCloud) or (quality is not None and quality.points is not None):
-        raise InputError("meshes are fitted to surfaces and not to points; take a mesh of the points as the target")
 
 
 def quality_of(field: xr.DataArray) -> Quality | None:

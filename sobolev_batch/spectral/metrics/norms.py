@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 import xarray as xr
@@ -23,7 +22,6 @@ from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate, Support, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.point_spectrum import PointSpectrum
 from sobolev_batch.spectral.errors.reference import ReferenceEstimate
 from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
@@ -65,7 +63,7 @@ def norm(
     Args:
         a: Field from `fourier_transform` or a store, or a surface; a mesh in any form that `as_mesh` takes. The norm
             of a sphere without a lattice is a closed form.
-        order: One order s < -1/2, or several; s < -3/2 for point clouds.
+        order: One order s < -1/2, or several.
         lattice: Lattice to transform a surface on. A field brings its own.
         rtol: Largest relative error, in place of a lattice; see `distance`.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
@@ -82,7 +80,7 @@ def norm(
         the norm.
 
     Raises:
-        OrderError: An order is not below -1/2, or for point clouds -3/2.
+        OrderError: An order is not below -1/2.
         InputError: A surface comes without a lattice or an rtol, or with both.
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
@@ -122,7 +120,7 @@ def inner_product(
     Args:
         a: Field, or a surface; see `norm`. The inner product of two spheres without a lattice is a closed form.
         b: Field on the same lattice, or a surface.
-        order: One order s < -1/2, or several; s < -3/2 for point clouds.
+        order: One order s < -1/2, or several.
         lattice: Lattice to transform surfaces on. A field brings its own.
         rtol: Largest error relative to ||a||_s ||b||_s, in place of a lattice; the inner product itself may be zero.
         memory: Memory that a transform may take with rtol; see `distance`.
@@ -133,7 +131,7 @@ def inner_product(
         dimension. Attributes hold the lattice and the kernel. With rtol there is also the `error`, in units of length.
 
     Raises:
-        OrderError: An order is not below -1/2, or for point clouds -3/2.
+        OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
         InputError: A surface comes without a lattice or an rtol, or with both.
         AccuracyError: The rtol is out of reach.
@@ -146,7 +144,7 @@ def inner_product(
     if rtol is not None:
         accuracy = accuracy_of(rtol, memory)
         # Converted once, as three numbers are computed of them.
-        operands = as_operand(a, orders), as_operand(b, orders)
+        operands = as_operand(a), as_operand(b)
         return _inner_product_to_accuracy(operands, order, lattice, accuracy, seed)
     _refuse_settings_of_rtol(memory)
     if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
@@ -177,7 +175,7 @@ def distance(
     Args:
         a: Field, or a surface; see `norm`. The distance of two spheres without a lattice is a closed form.
         b: Field on the same lattice, or a surface.
-        order: One order s < -1/2, or several; s < -3/2 for point clouds.
+        order: One order s < -1/2, or several.
         lattice: Lattice to transform surfaces on. A field brings its own.
         rtol: Largest error of the distance relative to it, in place of a lattice. Lattice, triangle rules,
             eps and dtype are then chosen, and chosen again where the error of the result is too large. The
@@ -195,7 +193,7 @@ def distance(
         error is below rtol times the distance.
 
     Raises:
-        OrderError: An order is not below -1/2, or for point clouds -3/2.
+        OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
         InputError: A surface comes without a lattice, or an rtol with a lattice or a field.
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
@@ -208,7 +206,7 @@ def distance(
     ('2.8%', '8%', True)
     """
     orders = check_orders(order)
-    a, b = as_operand(a, orders), as_operand(b, orders)
+    a, b = as_operand(a), as_operand(b)
     if rtol is not None:
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         return to_accuracy("distance", (a, b), order, lattice, accuracy, seed)[0]
@@ -268,7 +266,7 @@ def to_accuracy(
         The dataset, and the reference of a distance between surfaces that are not equal.
     """
     orders = check_orders(order)
-    surfaces = [as_surface(operand, orders) for operand in operands if not isinstance(operand, xr.DataArray)]
+    surfaces = [as_surface(operand) for operand in operands if not isinstance(operand, xr.DataArray)]
     if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     check_seed(seed)
@@ -317,9 +315,7 @@ def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArra
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))
     errors = np.sum([quality.probe.norms(weights) for quality in qualities], axis=0)
-    points = reduce(PointSpectrum.between, (quality.points for quality in qualities), None)
-    support = Support(areas, _widths(fields), point_levels=None if points is None else points.highest)
-    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors)
+    estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, _widths(fields)), errors)
     if len(qualities) == len(fields):
         return estimate
     return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)

@@ -9,13 +9,11 @@ from typing import Self
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
-# Seconds for a quadrature point, for a sample of a lattice's block, and for pairs of a triangle, or of a point of a
-# cloud, and a frequency.
-_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS, _POINT_PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8, 2e-8
+# Seconds for a quadrature point, for a sample of a lattice's block, and for a pair of a triangle and a frequency.
+_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 # What a frequency costs beside its triangles, in triangles.
@@ -30,26 +28,22 @@ class SurfaceSize:
         triangles: Number of triangles; zero for a surface that is no mesh.
         area: Area, in squared units of length.
         is_closed_form: True for a surface whose transform is a formula.
-        points: Number of points of a cloud; zero for another surface.
     """
 
     triangles: int
     area: float
     is_closed_form: bool = False
-    points: int = 0
 
     @classmethod
     def of(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
-        if isinstance(surface, PointCloud):
-            return cls(0, surface.area, points=len(surface.points))
         triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
         return cls(triangles, surface.area, not isinstance(surface, Mesh | Smooth))
 
     @property
     def draw_seconds(self) -> float:
         """Time of the exact transform at one frequency."""
-        return _PAIR_SECONDS * (self.triangles + _OVERHEAD_TRIANGLES) + _POINT_PAIR_SECONDS * self.points
+        return _PAIR_SECONDS * (self.triangles + _OVERHEAD_TRIANGLES)
 
     def lattice_seconds(self, lattice: OctaveLattice) -> float:
         """Return the time of a transform on a lattice, in the cheaper of both ways."""
@@ -74,10 +68,8 @@ class SurfaceSize:
         seconds = _SAMPLE_SECONDS * lattice.half.size
         if self.is_closed_form:
             return seconds
-        if self.points:
-            return seconds + _POINT_SECONDS * self.points
         of_area = POINTS_PER_SQUARE * self.area * (2 * lattice.highest) ** 2
         return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
 
     def _exact_seconds(self, lattice: OctaveLattice) -> float:
-        return math.pi / 12 * lattice.M**3 * self.draw_seconds if self.triangles or self.points else math.inf
+        return math.pi / 12 * lattice.M**3 * self.draw_seconds if self.triangles else math.inf

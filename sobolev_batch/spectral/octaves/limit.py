@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import beta, betainc
 
-from sobolev_batch.spectral.errors.point_spectrum import PointPairs, PointSpectrum
 from sobolev_batch.spectral.octaves.normals import without_sign
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import OctaveSums
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
@@ -53,13 +51,11 @@ class EnergyLimit:
         value: The limit.
         deviation: Standard error of the limit, from random points.
         spread: How far the limit may be from the value beyond that; zero where the surfaces were compared.
-        points: What the points of clouds add from some frequency on; None without clouds.
     """
 
     value: float
     deviation: float = 0.0
     spread: float = 0.0
-    points: PointSpectrum | PointPairs | None = None
 
     @classmethod
     def between(cls, lowest: float, highest: float) -> EnergyLimit:
@@ -69,10 +65,10 @@ class EnergyLimit:
 
     @classmethod
     def of(cls, surfaces: Sequence[Surface], signs: Sequence[int], seed: int = 0) -> EnergyLimit:
-        """Return the limit for the sum of some surfaces' measures, each with a sign; clouds are left out."""
+        """Return the limit for the sum of some surfaces' measures, each with a sign."""
         rng = np.random.default_rng(seed)
         meshes = [(surface, sign) for surface, sign in zip(surfaces, signs, strict=True) if isinstance(surface, Mesh)]
-        value, variance = 2 * sum(surface.area for surface in surfaces if not isinstance(surface, PointCloud)), 0.0
+        value, variance = 2 * sum(surface.area for surface in surfaces), 0.0
         size = max((float(np.ptp(mesh.used_coordinates, axis=1).max()) for mesh, _ in meshes), default=0.0)
         candidates = _in_common_planes([mesh for mesh, _ in meshes], size)
         shared = [(mesh, sign) for mesh, (_, sign) in zip(candidates, meshes, strict=True) if mesh is not None]
@@ -86,17 +82,6 @@ class EnergyLimit:
             variance += (2 * mesh.area) ** 2 * float(terms.var()) / count
         return cls(max(value, 0.0), variance**0.5)
 
-    def with_points(self, points: PointSpectrum | PointPairs | None) -> EnergyLimit:
-        """Return the limit of the same surfaces together with clouds.
-
-        A point on a surface adds up to four times its weight to the energy or takes that away, as the cosine of its
-        distance from the surface in wavelengths. The surfaces' own energy lies between zero and twice the limit.
-        """
-        if points is None:
-            return self
-        cross = self.value + 4 * points.area if self.value else 0.0
-        return replace(self, spread=self.spread + cross, points=points)
-
 
 def beyond(
     octaves: Sequence[Octave],
@@ -107,8 +92,6 @@ def beyond(
 ) -> tuple[Reals, Reals]:
     """Return the integrals beyond the last octave (orders,), and how far off they may be.
 
-    What points of clouds add beyond the frequency from which it is known comes in addition.
-
     Args:
         octaves: Octaves that were measured.
         sums: Integrals over them.
@@ -116,14 +99,9 @@ def beyond(
         orders: Orders s.
         inner: Energies in the last octaves before the measured ones, from the inside out.
     """
-    if limit.points is not None and not limit.value:
-        return limit.points.beyond(orders)
     if not octaves:
         return np.zeros(len(orders)), np.full(len(orders), np.inf)
     tails = np.array([tail_integral(octaves[-1].highest, order) for order in orders])
-    if limit.points is not None:
-        of_points, off = limit.points.beyond(orders)
-        return of_points + limit.value * tails, off + (3 * limit.deviation + limit.spread) * tails
     energies = np.array([*inner, *(one.energy for one in sums)])
     deviations = np.array([*(0.0 for _ in inner), *(one.energy_deviation for one in sums)])
     mean, uncertain = _approach(limit.value, energies, deviations)

@@ -44,7 +44,7 @@ class Tail:
     ) -> Self:
         """Return the tail by the sums over octaves and the limit of the energy; see `beyond`.
 
-        Without octaves nothing is known of it, except of point clouds.
+        Without octaves nothing is known of it.
         """
         none = np.zeros(len(orders))
         measured = np.sum([one.squares for one in sums], axis=0) if sums else none

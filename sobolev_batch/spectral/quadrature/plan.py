@@ -17,7 +17,6 @@ from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Faces, Quadrature, RuleAssignment, WeightedPoints
 from sobolev_batch.spectral.quadrature.smooth import Resolution, resolution_of
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -174,31 +173,11 @@ class _SmoothPlan(QuadraturePlan):
         yield WeightedPoints.concatenated(gathered)
 
 
-@dataclass(frozen=True, eq=False)
-class _PointPlan(QuadraturePlan):
-    """Plan of a point cloud, whose points are there."""
-
-    cloud: PointCloud
-
-    # There are no rules, and the error of the NUFFT is of one size at all frequencies.
-    lowest_degree = 0
-
-    @property
-    def size(self) -> PointCount:
-        return PointCount(float(len(self.cloud.points)), len(self.cloud.points))
-
-    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
-        for first in range(0, len(self.cloud.points), capacity):
-            batch = slice(first, first + capacity)
-            coordinates = backend.upload(np.ascontiguousarray(self.cloud.points[batch].T))
-            yield WeightedPoints(coordinates, backend.upload(self.cloud.weights[batch]))
-
-
 def unknown_surface(surface: object) -> InputError:
     """Return the error that names the kinds of surfaces that are known."""
     return InputError(
-        "a surface must be a Mesh, a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a "
-        f"PointCloud, found {type(surface).__name__}"
+        "a surface must be a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), "
+        f"found {type(surface).__name__}"
     )
 
 
@@ -220,8 +199,3 @@ def _(surface: Mesh, highest_frequency: float, tolerance: float, quadrature: Qua
 @_plan_of.register
 def _(surface: Smooth, highest_frequency: float, tolerance: float, quadrature: Quadrature) -> QuadraturePlan:
     return _SmoothPlan(surface, highest_frequency, tolerance)
-
-
-@_plan_of.register
-def _(surface: PointCloud, highest_frequency: float, tolerance: float, quadrature: Quadrature) -> QuadraturePlan:
-    return _PointPlan(surface)

@@ -22,7 +22,7 @@ _TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
 _NANO = 1e-9
 
 
-def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings, points: int = 0) -> float:
+def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
     """Return the predicted processor time of a field.
 
     Args:
@@ -30,10 +30,9 @@ def field_seconds(triangles: int, area: float, lattice: Lattice, settings: Trans
         area: Area, in squared units of length.
         lattice: Lattice of the field.
         settings: Accuracy and dtype.
-        points: Number of points, of a point cloud.
     """
     spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
-    workload = Workload(points=points + expected_points(triangles, area, lattice, settings), triangles=triangles)
+    workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
     return _NANO * Batching(spec).projected_nanoseconds(spec.shape, workload, CPU_COSTS)
 
 

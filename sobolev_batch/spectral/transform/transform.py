@@ -21,7 +21,6 @@ from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -79,7 +78,7 @@ def transform_block(
         InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
             the surface is of an unknown kind.
     """
-    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere | PointCloud):
+    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere):
         require_inside(surface, lattice)
     return _transform(surface, _Target(lattice, block, settings, execution, plan))
 
@@ -130,8 +129,7 @@ def _(surface: Sphere, target: _Target) -> Transformed:
 
 @_transform.register(Mesh)
 @_transform.register(Smooth)
-@_transform.register(PointCloud)
-def _(surface: Mesh | Smooth | PointCloud, target: _Target) -> Transformed:
+def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
     lattice, execution = target.lattice, target.execution
     plan = target.plan or target.settings.plan(surface, lattice)
     low, high = surface.bounds

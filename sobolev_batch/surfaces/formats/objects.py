@@ -6,7 +6,7 @@ Libraries are told by the names of their classes, and none is imported.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.surfaces.formats.readers import read_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud, require_finite_norm
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -83,7 +82,7 @@ _EXPECTED = (
     "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh, PyVista, meshio or "
     "Open3D"
 )
-_SURFACES = "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), a PointCloud"
+_SURFACES = "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
 # Cells of meshio without area.
 _WITHOUT_AREA = ("vertex", "line", "line3")
 
@@ -121,21 +120,13 @@ def as_mesh(mesh: MeshLike) -> Mesh:
     return _converted(mesh, _EXPECTED)
 
 
-def as_surface(surface: SurfaceLike, orders: Sequence[float] = ()) -> Surface:
-    """Return a surface in closed form or a point cloud as it is, and anything else as a mesh; see `as_mesh`.
-
-    Args:
-        surface: Any of these.
-        orders: Orders of norms of it.
+def as_surface(surface: SurfaceLike) -> Surface:
+    """Return a surface in closed form as it is, and anything else as a mesh; see `as_mesh`.
 
     Raises:
-        OrderError: It is a point cloud, whose norm is infinite for one of the orders.
         InputError: It is no surface of a known kind.
         MeshError: See `as_mesh`.
     """
-    if isinstance(surface, PointCloud):
-        require_finite_norm(orders)
-        return surface
     if isinstance(surface, Sphere | Smooth):
         return surface
     return _converted(surface, f"{_EXPECTED}, {_SURFACES} or a Fourier field")

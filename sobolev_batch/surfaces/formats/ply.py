@@ -45,7 +45,7 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     Raises:
         MeshError: There are no vertices or faces, or the counts do not fit the contents.
     """
-    header = _checked_header(data, "vertices and faces", "vertex", "face")
+    header = _checked_header(data)
     with _opened(data, header) as source:
         del data
         ply = _read_checked(source, header)
@@ -53,35 +53,18 @@ def parse_ply(data: bytes, path: Path) -> Raw:
     return vertices, _triangles(ply["face"])
 
 
-def parse_ply_points(data: bytes, weight: str | None) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
-    """Return the vertices of a PLY file as points, and one of their properties as weights, if it is named.
-
-    Raises:
-        MeshError: There are no vertices, no property has this name, or the counts do not fit the contents.
-    """
-    header = _checked_header(data, "vertices", "vertex")
-    with _opened(data, header) as source:
-        del data
-        vertices = _read_checked(source, header)["vertex"]
-    names = [one.name for one in vertices.properties]
-    if weight is not None and weight not in names:
-        raise MeshError(f"the PLY vertices have no property {weight!r}; theirs are {', '.join(names)}")
-    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    return points, None if weight is None else vertices[weight]
-
-
-def _checked_header(data: bytes, what: str, *needed: str) -> _Header:
+def _checked_header(data: bytes) -> _Header:
     """Return the header of a file whose contents can have the counts that it announces."""
     start = data.find(_END, 0, HEADER_BYTES)
     header, length = _Header.parsed(data[: max(start, 0)]), len(data) - start - len(_END)
     counts = header.counts
-    if counts.get("vertex") and "face" in needed and not counts.get("face"):
+    if counts.get("vertex") and not counts.get("face"):
         raise MeshError(
-            f"the PLY file has {counts['vertex']} vertices and no faces: read it as points, by read_points or the "
-            "source points of a study"
+            f"the PLY file has {counts['vertex']} vertices and no faces: it holds points and no surface; make a mesh "
+            "of them first"
         )
-    if start < 0 or not set(needed) <= set(counts):
-        raise MeshError(f"no PLY header announces {what} in the first {HEADER_BYTES} bytes")
+    if start < 0 or not {"vertex", "face"} <= set(counts):
+        raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
     # The library would reserve memory for any count.
     if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")

@@ -269,7 +269,7 @@ _COMMANDS: dict[str, str] = {
 }
 # What other files hold that no command makes a surface of.
 _REPLACEMENTS: dict[str, str] = {
-    **dict.fromkeys((".csv", ".txt", ".xyz"), "points: read them by read_points or by the source points of a study"),
+    **dict.fromkeys((".csv", ".txt", ".xyz"), "points and no surface: make a mesh of them first"),
     **dict.fromkeys(
         (".annot", ".label", ".mgh"),
         "values at the vertices of a surface: give the surface, such as lh.pial",

@@ -1,4 +1,4 @@
-"""Shapes: meshes, spheres and point clouds, with their extents and similarity transforms.
+"""Shapes: meshes and spheres, with their extents and similarity transforms.
 
-In: arrays of vertices and triangles, of points and areas, or a radius. Out: frozen surfaces that everything else reads.
+In: arrays of vertices and triangles, or a radius. Out: frozen surfaces that everything else reads.
 """

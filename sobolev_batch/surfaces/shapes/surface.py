@@ -20,7 +20,7 @@ LARGEST_LENGTH = 1e150
 
 
 class Surface(Protocol):
-    """A surface in three-dimensional space, in the user's unit of length: a mesh, a formula or a point cloud."""
+    """A surface in three-dimensional space, in the user's unit of length: a mesh or a closed form."""
 
     @property
     def area(self) -> float:

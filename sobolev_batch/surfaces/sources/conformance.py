@@ -16,7 +16,6 @@ from pydantic import ValidationError
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -185,17 +184,12 @@ def _checked_identity(member: Member, report: _Report) -> object:
         "in load()",
     )
     surface = member.load()
-    if not isinstance(surface, Mesh | Sphere | Smooth | PointCloud):
+    if not isinstance(surface, Mesh | Sphere | Smooth):
         report.problems.append(
-            f"{label} makes a {type(surface).__name__}, expected a Mesh, Sphere, Ellipsoid, Torus, "
-            "ParametrisedSurface or PointCloud"
+            f"{label} makes a {type(surface).__name__}, expected a Mesh, Sphere, Ellipsoid, Torus or "
+            "ParametrisedSurface"
         )
         return None
-    report.require(
-        member.is_point_cloud == isinstance(surface, PointCloud),
-        f"{label} makes a {type(surface).__name__} and says is_point_cloud = {member.is_point_cloud}; override "
-        "is_point_cloud",
-    )
     if isinstance(surface, Mesh):
         _check_size(size, surface, label, report)
     identity = _identity(surface)
@@ -224,7 +218,7 @@ def _check_size(size: ExpectedSize, mesh: Mesh, label: str, report: _Report) -> 
 
 
 def _identity(surface: Surface) -> object:
-    return surface.digest if isinstance(surface, Mesh | PointCloud) else (type(surface), surface.area, surface.extent)
+    return surface.digest if isinstance(surface, Mesh) else (type(surface), surface.area, surface.extent)
 
 
 def _check_broken(source: Source, folder: Path, report: _Report) -> None:

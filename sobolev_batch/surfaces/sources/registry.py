@@ -24,7 +24,6 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.shapes.point_cloud import PointCloud
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import quoted
 
@@ -95,10 +94,9 @@ class ExpectedSize:
     """The predicted size of a surface.
 
     Attributes:
-        triangles: Approximate number of triangles; 0 for a closed form or a point cloud.
+        triangles: Approximate number of triangles; 0 for a closed form.
         projected_bytes: Approximate peak of the memory that `Member.load` takes.
         seconds: Approximate processor time that `Member.load` takes, where it does more than read or tile.
-        points: Approximate number of points of a point cloud; 0 for another surface.
 
     >>> import sobolev_batch as sb
     >>> sb.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
@@ -108,7 +106,6 @@ class ExpectedSize:
     triangles: int = 0
     projected_bytes: float = 0.0
     seconds: float = 0.0
-    points: int = 0
 
 
 @dataclass(frozen=True)
@@ -147,11 +144,6 @@ class Member(ABC):
     time: float | None = field(default=None, kw_only=True)
     metadata: Metadata = field(default=(), kw_only=True)
     is_quickly_loaded: ClassVar[bool] = False
-
-    @property
-    def is_point_cloud(self) -> bool:
-        """True if `load` makes a `PointCloud`; override it if so. A plan then refuses orders of -3/2 and above."""
-        return False
 
     @abstractmethod
     def load(self) -> Surface:
@@ -206,11 +198,6 @@ class SurfaceMember(Member):
     surface: Surface
     identity: Fingerprint
     is_quickly_loaded: ClassVar[bool] = True
-
-    @property
-    def is_point_cloud(self) -> bool:
-        """True if the surface is a `PointCloud`."""
-        return isinstance(self.surface, PointCloud)
 
     def load(self) -> Surface:
         """Return the surface."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,11 @@ import trimesh
 
 from sobolev_batch import (
     LatticeError,
-    Member,
     MeshError,
-    OrderError,
-    PointCloud,
-    Source,
     Study,
     StudyError,
-    SurfaceMember,
 )
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.surfaces.sources import registry
 from tests.support.studies import small_table
 
 
@@ -52,19 +45,6 @@ def test_the_similarity_takes_the_reference_to_the_unit_sphere(box_file: Path) -
     plan = plan_of(reference={"source": "files", "paths": ["box.off"]}, folder=box_file.parent)
     assert plan.similarity.scale == pytest.approx(1 / 3)
     assert plan.similarity.origin == pytest.approx((10.0, 0.0, 0.0))
-
-
-class Scans(Source):
-    """Points, as the source of another package."""
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        return (SurfaceMember("scan", -1, PointCloud([[0.0, 0.0, 1.0]], [1.0]), {"scan": 1}),)
-
-
-def test_orders_that_points_do_not_have_are_refused_for_all_sources(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry._registry(), "scans", EntryPoint("scans", f"{__name__}:Scans", ""))
-    with pytest.raises(OrderError, match=r"finite only for orders below -3/2, found -1\.5"):
-        plan_of(norm={"orders": [-1.5]}, family=[{"name": "scans", "source": "scans"}])
 
 
 def test_scaling_can_be_fixed_or_left_out() -> None:

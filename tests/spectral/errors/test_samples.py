@@ -68,7 +68,7 @@ def test_closed_forms_need_a_probe_in_single_precision_alone() -> None:
 
 def test_unknown_kinds_of_surfaces_are_refused_with_the_known_ones() -> None:
     draws = draws_for([Sphere()], LATTICE, ORDERS, 2)
-    with pytest.raises(InputError, match=r"exact transform are Mesh, PointCloud, Smooth, Sphere; found Lattice"):
+    with pytest.raises(InputError, match=r"exact transform are Mesh, Smooth, Sphere; found Lattice"):
         Sample.of(LATTICE, draws)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"for meshes, parametrised surfaces and point clouds, found Sphere"):
+    with pytest.raises(InputError, match=r"for meshes and parametrised surfaces, found Sphere"):
         choose_settings(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-3,)), TransformSettings())

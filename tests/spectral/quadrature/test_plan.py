@@ -68,7 +68,7 @@ def test_a_closed_form_has_no_points() -> None:
 
 
 def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> None:
-    with pytest.raises(InputError, match=r"must be a Mesh, a Sphere, a parametrised .* or a PointCloud, found str"):
+    with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised surface .*, found str"):
         QuadraturePlan.of("torus.ply", 8.66, 1e-9)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"expected a Mesh, .*; found dict"):
         fourier_transform({}, Lattice(1.0, 4))  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch import MeshError, read_mesh, read_points
+from sobolev_batch import MeshError, read_mesh
 from sobolev_batch.machine import MachineMemory
 from sobolev_batch.surfaces.formats.readers import expected_size
 from sobolev_batch.surfaces.sources.files import FileMember
@@ -133,15 +133,6 @@ def test_files_beyond_the_memory_are_refused_unread(tmp_path: Path, ending: str)
     with pytest.raises(MeshError, match=expected):
         read_mesh(path)
     assert time.process_time() - before < 1
-
-
-@pytest.mark.usefixtures("little_memory")
-@pytest.mark.parametrize("name", ["scan.ply", "scan.xyz"])
-def test_points_beyond_the_memory_are_refused_unread(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(BINARY_PLY)
-    os.truncate(tmp_path / name, 7 * 10**9)
-    with pytest.raises(MeshError, match=rf"{name}: takes up to 49\.0GB of memory to read, and may take 75% of 4\.0GB"):
-        read_points(tmp_path / name, area=1.0)
 
 
 def test_packed_files_are_refused_as_soon_as_they_exceed_the_memory(

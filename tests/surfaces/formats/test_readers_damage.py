@@ -93,6 +93,7 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "ply, a face too few": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, face_count=11), "announces|length"),
     "ply, a vertex for a face": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, vertex_count=9, face_count=11), ""),
     "ply, a face for a vertex": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, vertex_count=7, face_count=13), ""),
+    "ply, points alone": (".ply", ply(BOX_VERTICES, []), "8 vertices and no faces: it holds points and no surface"),
     "ply, very many faces": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, face_count=10**15), "announces"),
     "ply, very many vertices": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, vertex_count=10**15), "announces"),
     "ply binary, a face too many": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, face_count=13), ""),
@@ -622,7 +623,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
         ("scan.blend", r"blender --background scan.blend --python-expr '.*ply_export.*' -- scan.blend scan.ply"),
         ("lh.aparc.annot", ".annot files hold values at the vertices of a surface: give the surface, such as lh.pial"),
         ("t1.nii.gz", ".nii files hold a volume: make the surface in it a mesh first"),
-        ("scan.xyz.gz", ".xyz files hold points: read them by read_points or by the source points of a study"),
+        ("scan.xyz.gz", ".xyz files hold points and no surface: make a mesh of them first"),
         ("scan.pts", "MeshLab and ParaView open many others and save them as .ply"),
     ],
 )

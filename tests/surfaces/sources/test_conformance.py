@@ -15,7 +15,6 @@ from sobolev_batch import (
     Member,
     Mesh,
     MeshError,
-    PointCloud,
     Source,
     Sphere,
     StudyError,
@@ -37,7 +36,6 @@ FINE: dict[str, Any] = {"source": "icosphere", "levels": [5]}
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
     (tmp_path / "bad.off").write_bytes(BAD_BOX)
-    (tmp_path / "scan.csv").write_text("x,y,z,area\n0,0,0,0.5\n1,0,0,0.25\n")
     return tmp_path
 
 
@@ -60,8 +58,6 @@ def test_predicted_sizes_of_larger_meshes_are_held_against_them(folder: Path) ->
         MISSING,
         {"source": "files", "paths": ["bad.off"]},
         {"source": "files", "paths": ["*.stl"]},
-        {"source": "points", "paths": ["box.off"], "area": 1.0},
-        {"source": "points", "paths": ["scan.csv"], "weight": "patch"},
         {"source": "decimate", "mesh": MISSING, "triangles": [80]},
         {"source": "decimate", "mesh": {"source": "sphere"}, "triangles": [80]},
         {"source": "spherical-levels", "mesh": MISSING, "sphere": MISSING, "levels": [1]},
@@ -223,15 +219,6 @@ class Random(Balls):
     member_type = Each
 
 
-class MakesPoints(Balls):
-    @dataclass(frozen=True)
-    class Each(BallMember):
-        def load(self) -> Any:
-            return PointCloud([[0.0, 0.0, self.radius]], [1.0])
-
-    member_type = Each
-
-
 class Large(Balls):
     @dataclass(frozen=True)
     class Each(BallMember):
@@ -270,8 +257,7 @@ class LargeAndLight(Large):
         (Unpicklable, "the member 'one' raises TypeError: it holds a handle"),
         (RelativePaths, "makes another surface or fingerprint after pickling, in another working directory"),
         (CarriesItsSurface, "bytes when it is pickled, 1048576 are allowed; make its surface in load()"),
-        (MakesSomethingElse, "makes a ndarray, expected a Mesh, Sphere, Ellipsoid, Torus, ParametrisedSurface or"),
-        (MakesPoints, "the member 'one' makes a PointCloud and says is_point_cloud = False; override is_point_cloud"),
+        (MakesSomethingElse, "makes a ndarray, expected a Mesh, Sphere, Ellipsoid, Torus or ParametrisedSurface"),
         (Random, "makes another surface or fingerprint after pickling"),
         (Large, "predicts 0 triangles and makes 20480; predict them in expected_size()"),
         (LargeAndLight, "predicts 1000 bytes for making a mesh of 737328; predict the peak of its memory"),

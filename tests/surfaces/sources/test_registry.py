@@ -58,7 +58,7 @@ def test_all_sources_are_registered() -> None:
         parse_source({"source": "nothing"})
     assert str(caught.value) == (
         "no source is named 'nothing'; known are decimate, ellipsoid, ellipsoid-levels, files, fit, flow, "
-        "icosphere, moved, noisy, points, refine, remesh, sphere, spherical-levels, torus, torus-grid"
+        "icosphere, moved, noisy, refine, remesh, sphere, spherical-levels, torus, torus-grid"
     )
 
 
@@ -197,11 +197,6 @@ def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], plac
     assert places <= {place, place.rsplit(".", 1)[0]}
 
 
-def test_areas_of_points_are_given_once() -> None:
-    with pytest.raises(ValidationError, match='both "weight" and "area" are given; give one of them'):
-        parse_source({"source": "points", "paths": ["a.csv"], "weight": 4, "area": 1.0})
-
-
 @pytest.mark.parametrize("name", ["decimate", "remesh", "spherical-levels"])
 def test_nested_sources_must_exist(name: str) -> None:
     with pytest.raises(StudyError, match="no source is named 'nothing'"):
@@ -239,10 +234,9 @@ def test_sources_survive_pickling(kind: str) -> None:
 
 def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
-    (tmp_path / "scan.csv").write_text("x,y,z,area\n0,0,0,0.5\n")
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
-    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 24
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 23
 
 
 @pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])
