@@ -51,7 +51,7 @@ def summary() -> sb.Summary:
         (summary(), ["2 computed, 1 reused, 30 failed", f"{HOSTILE}/19: ", "and 10 more", "error of 25 %"]),
         (sb.StudyDraft(Path(HOSTILE), [HOSTILE], {HOSTILE: "damaged"}), [f"{HOSTILE}: damaged"]),
         (
-            sb.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {}, {"norm": HOSTILE}, withdrawn=True),
+            sb.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {"norm": HOSTILE}, withdrawn=True),
             ["damaged", "3 of 4", f"{HOSTILE}: gone", "computes what is damaged again"],
         ),
         (sb.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0), ["3 of 5 complete, 1 failed, 1 to go"]),

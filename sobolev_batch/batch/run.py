@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.analysis.compare import Comparer
+from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.clients import available_cores, local_client, memory_limit, thread_client
@@ -33,7 +33,7 @@ from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.verify import damaged_rows
-from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.batch.workspace import Workspace, failed_proximities
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.machine import require_machine_memory
@@ -48,8 +48,6 @@ _MOST_ROUNDS = 3
 # Fields that turn out damaged are computed again; where that goes on, something destroys them.
 _MOST_REPAIRS = 3
 
-Result = TypeVar("Result")
-
 
 @dataclass(frozen=True)
 class Summary:
@@ -60,8 +58,8 @@ class Summary:
         computed: Labels of the meshes whose fields were computed now.
         reused: Labels of the meshes whose fields were already stored.
         failed: Reason for each mesh whose field could not be computed, by its label.
-        not_compared: For each mesh whose field is stored, but not the witness function or the Hausdorff and Chamfer
-            distances that the study asks for: the comparison that is missing, and the reason.
+        not_compared: Reason for each mesh whose field is stored, but not the Hausdorff and Chamfer distances that the
+            study asks for.
         imprecise: Largest relative error of the distances of each mesh that are less accurate than the study asks for.
 
     >>> import sobolev_batch as sb
@@ -91,14 +89,14 @@ class Summary:
         )
 
     @classmethod
-    def _of(cls, workspace: Workspace, computed: set[int], not_compared: Mapping[str, str]) -> Self:
+    def _of(cls, workspace: Workspace, computed: set[int]) -> Self:
         labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
         return cls(
             workspace.store.path,
             tuple(label for i, label in labels.items() if i in computed and label not in failed),
             tuple(label for i, label in labels.items() if i not in computed),
             failed,
-            not_compared,
+            _not_compared(workspace),
             _imprecise(workspace),
         )
 
@@ -320,8 +318,8 @@ def carry_out(
         workspace.withdraw_lost_fields()
         if others:
             workspace.withdraw_results_of(take_over(workspace, others))
-        if not workspace.pending and are_tabulated(workspace) and Comparer.of(workspace).is_done:
-            return Summary._of(workspace, set(), {})
+        if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
+            return Summary._of(workspace, set())
         with clients as client, Watch(client, study.backend == "gpu", give_up_after).kept() as watch:
             heartbeat.find_obstacle = lambda: watch.obstacle
             heartbeat.cluster = client.scheduler.address
@@ -354,12 +352,12 @@ class _Run:
     heartbeat: Heartbeat
 
     def carry_out(self, workspace: Workspace) -> Summary:
-        """Compute, on larger lattices until the accuracy is reached, and compare."""
+        """Compute, on larger lattices until the accuracy is reached, and measure proximities."""
         rows = workspace.pending
         workspace.withdraw_results_of(rows)
         computed: set[int] = set()
         for rounds_left in reversed(range(_MOST_ROUNDS)):
-            repaired, distances = self._repairing(workspace, rows, self._compute)
+            repaired, distances = self._repairing(workspace, rows)
             computed.update(rows, repaired)
             choice = _larger_lattice(workspace.plan, distances) if rounds_left else None
             if choice is None:
@@ -370,28 +368,20 @@ class _Run:
             self.heartbeat.write("running")
             workspace.withdraw_lost_fields()
             rows = workspace.pending
-        repaired, not_compared = self._repairing(workspace, (), self._compare)
-        return Summary._of(workspace, computed | repaired, not_compared)
+        measure_proximities(self.cluster, workspace)
+        return Summary._of(workspace, computed)
 
     def _compute(self, workspace: Workspace, rows: Sequence[int]) -> NormEstimate | None:
         """Compute the fields of rows and the tables, and return the distances to the reference if they are new."""
         compute_fields(self.cluster, workspace, rows)
         return tabulate_fields(self.cluster, workspace)
 
-    def _compare(self, workspace: Workspace, rows: Sequence[int]) -> dict[str, str]:
-        """Compute the fields of rows again, make the comparisons, and return those that could not be made."""
-        if rows:
-            self._compute(workspace, rows)
-        return Comparer.of(workspace).run(self.cluster)
-
-    def _repairing(
-        self, workspace: Workspace, rows: Sequence[int], attempt: Callable[[Workspace, Sequence[int]], Result]
-    ) -> tuple[set[int], Result]:
-        """Repeat an attempt with the rows that turn out damaged, and return these rows and its result."""
+    def _repairing(self, workspace: Workspace, rows: Sequence[int]) -> tuple[set[int], NormEstimate | None]:
+        """Compute, again with the rows that turn out damaged, and return these rows and what `_compute` does."""
         repaired: set[int] = set()
         for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
             try:
-                return repaired, attempt(workspace, rows)
+                return repaired, self._compute(workspace, rows)
             except DamageError as error:
                 if not attempts_left:
                     raise
@@ -401,6 +391,12 @@ class _Run:
                 workspace.withdraw(rows, "its values are not what was stored")
                 repaired.update(rows)
         raise AssertionError("unreachable: the last attempt returns or raises")
+
+
+def _not_compared(workspace: Workspace) -> dict[str, str]:
+    if workspace.plan.study.proximity is None:
+        return {}
+    return failed_proximities(dict(enumerate(workspace.labels)), workspace.complete)
 
 
 def _imprecise(workspace: Workspace) -> dict[str, float]:

@@ -14,12 +14,10 @@ from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, Kind
 from sobolev_batch.batch.store.hierarchy import RECORDS
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.html import reasons, table_html
@@ -39,7 +37,6 @@ class Verification:
         complete: Number of surfaces with a completion record; their fields were read.
         total: Number of surfaces of the study.
         fields: Damage of fields and their records, by the label of the surface.
-        comparisons: Damage of witness functions and of records of comparisons, likewise.
         tables: Damage of tables and coordinates, by the name of the array.
         withdrawn: True if the damaged records, and the tables if anything is damaged, were withdrawn, so that the
             next run computes them again.
@@ -47,7 +44,7 @@ class Verification:
             object without a store is 0.
 
     >>> import sobolev_batch as sb
-    >>> sb.Verification("results.zarr", 5, 5, {}, {}, {}, withdrawn=False).is_sound
+    >>> sb.Verification("results.zarr", 5, 5, {}, {}, withdrawn=False).is_sound
     True
     """
 
@@ -55,7 +52,6 @@ class Verification:
     complete: int
     total: int
     fields: Mapping[str, str]
-    comparisons: Mapping[str, str]
     tables: Mapping[str, str]
     withdrawn: bool
     objects: Mapping[str, Verification] = field(default_factory=dict)
@@ -73,18 +69,13 @@ class Verification:
             sum(one.complete for one in objects.values()),
             sum(one.total for one in objects.values()),
             joined(lambda one: one.fields),
-            joined(lambda one: one.comparisons),
             joined(lambda one: one.tables),
             bool(damaged) and all(one.withdrawn for one in damaged),
             objects,
         )
 
     def _repr_html_(self) -> str:
-        damage = [
-            *reasons("field", self.fields),
-            *reasons("comparison", self.comparisons),
-            *reasons("table", self.tables),
-        ]
+        damage = [*reasons("field", self.fields), *reasons("table", self.tables)]
         remark = [("withdrawn", "the next run computes what is damaged again")] if self.withdrawn else []
         verdict = f"Verification: {'sound' if self.is_sound else 'damaged'}"
         counts = f"{self.complete} of {self.total} complete"
@@ -93,7 +84,7 @@ class Verification:
     @property
     def is_sound(self) -> bool:
         """True where nothing is damaged."""
-        return not self.fields and not self.comparisons and not self.tables
+        return not self.fields and not self.tables
 
 
 def verify(store: str | Path | Location, on_progress: Callable[[int, int], None] | None = None) -> Verification:
@@ -127,7 +118,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     verified = {
         name: _verify_study(place, on_progress)
         if Store(place).exists()
-        else Verification(str(place), 0, 0, {}, {}, {}, withdrawn=False)
+        else Verification(str(place), 0, 0, {}, {}, withdrawn=False)
         for name, place in collection.stores.items()
     }
     return Verification._of_objects(collection.location, verified)
@@ -178,35 +169,29 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
-    comparisons = {kind: _damaged_records(store, kind) for kind in KINDS}
-    comparisons["witness"] |= _damaged_witnesses(store, complete)
-    withdraw = lock is not None and bool(damaged or tables or any(comparisons.values()))
+    withdraw = lock is not None and bool(damaged or tables)
     if lock is not None and withdraw:
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
         store.restore_documents(documents)
-        _withdraw(store, damaged, comparisons)
+        _withdraw(store, damaged)
     return Verification(
         store.path,
         len(complete),
         len(labels),
         {labels[row]: damaged[row] for row in sorted(damaged)},
-        {labels[row]: damage for rows in comparisons.values() for row, damage in sorted(rows.items())},
         tables,
         withdraw,
     )
 
 
-def _withdraw(store: Store, fields: Iterable[int], comparisons: Mapping[Kind, Iterable[int]]) -> None:
-    """Withdraw the tables, and the records of damaged fields and comparisons."""
+def _withdraw(store: Store, fields: Iterable[int]) -> None:
+    """Withdraw the tables, and the records of damaged fields."""
     # From a table, as long as there are some.
     store.repair_labels()
     Tables(store).invalidate()
     for row in fields:
         store.write_record(row, None)
-    for kind, rows in comparisons.items():
-        for row in rows:
-            ComparisonRecords(store, kind).write(row, None)
 
 
 def _damaged_run(store: Store) -> dict[str, str]:
@@ -215,23 +200,6 @@ def _damaged_run(store: Store) -> dict[str, str]:
     except DamageError as error:
         return {RECORDS: error.what}
     return {}
-
-
-def _damaged_records(store: Store, kind: Kind) -> dict[int, str]:
-    damaged = ComparisonRecords(store, kind).damaged()
-    return {row: f"the record of its {kind} is damaged ({what})" for row, what in damaged.items()}
-
-
-def _damaged_witnesses(store: Store, complete: Mapping[int, Record]) -> dict[int, str]:
-    witnesses = Witnesses(store)
-    # Those that readers do not find are still to be made.
-    if not witnesses.are_listed():
-        return {}
-    records = complete_records(ComparisonRecords(store, "witness").read())
-    counts = {row: record.facts.vertices for row, record in complete.items()}
-    checksums = {row: record.checksum for row, record in records.items() if row in complete}
-    damaged = witnesses.damaged(counts, checksums)
-    return {row: f"its witness function is damaged ({what})" for row, what in damaged.items()}
 
 
 def _damage_of(store: Store, row: int, record: Record) -> str:

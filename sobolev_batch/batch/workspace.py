@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Self
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.comparison_records import ComparisonRecord
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
@@ -16,8 +15,6 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import Plan, Row
 
 _log = logging.getLogger(__name__)
-
-AnyRecord = TypeVar("AnyRecord", Record, ComparisonRecord)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +98,20 @@ class Workspace:
             )
 
 
-def complete_records(records: Sequence[AnyRecord | None]) -> dict[int, AnyRecord]:
+def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
     """Return the records that are complete, by their rows."""
     return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
+
+
+def failed_proximities(labels: Mapping[int, str], records: Mapping[int, Record]) -> dict[str, str]:
+    """Return why distances could not be measured, by the labels of the meshes.
+
+    Args:
+        labels: Label of each mesh by its row.
+        records: Records of meshes with fields, by their rows.
+    """
+    return {
+        labels[row]: f"no proximity: {record.proximity.reason}"
+        for row, record in records.items()
+        if record.proximity is not None and record.proximity.reason
+    }

@@ -59,13 +59,13 @@ class Reporter:
             echo(f"{part}{count} {progress.label}: {progress.record.status}, {outcome}", err=True)
         elif progress.stage == "reduction" and progress.done == progress.total:
             echo(f"{part}tables reduced", err=True)
-        elif progress.stage == "comparisons" and progress.done == progress.total:
-            echo(f"{part}{progress.total} comparisons with the reference finished", err=True)
+        elif progress.stage == "proximity" and progress.done == progress.total:
+            echo(f"{part}{progress.total} Hausdorff and Chamfer distances measured", err=True)
 
     def _draw(self, progress: Progress) -> None:
         if progress.done == 0:
             self._close()
-            stage = {"fields": "transforms", "reduction": "tables    ", "comparisons": "comparisons"}[progress.stage]
+            stage = {"fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}[progress.stage]
             label = f"{progress.part}: {stage}" if progress.part else stage
             self._bar = progress_bar(progress.total, label)
             self._bar.__enter__()

@@ -97,7 +97,7 @@ def verify_command(context: click.Context, store: Location) -> None:
         counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
         echo(f"{name}: {counts if one.total else 'it has no results yet'}")
     tables = {f"table {name}": damage for name, damage in result.tables.items()}
-    for name, damage in (*result.fields.items(), *result.comparisons.items(), *tables.items()):
+    for name, damage in (*result.fields.items(), *tables.items()):
         echo(f"{name}: {damage}")
     if result.is_sound:
         echo("nothing is damaged")
@@ -107,7 +107,7 @@ def verify_command(context: click.Context, store: Location) -> None:
         if result.withdrawn
         else "the store cannot be written from here, so nothing was withdrawn"
     )
-    surfaces = len({*result.fields, *result.comparisons})
+    surfaces = len(result.fields)
     echo(f"{surfaces} surfaces and {len(result.tables)} arrays of tables are damaged; {remedy}")
     context.exit(EXIT_OTHER)
 

@@ -27,9 +27,9 @@ _SOURCE, _STATE = "source", "state"
 def open_store(store: str | Path | Location) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 
-    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study asks for them also
-    witness and proximity. docs/store.md lists their variables with dimensions and units. Fields stay on disk until
-    you ask for values of them; they have the accessor `field.sobolev`.
+    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study asks for it also
+    proximity. docs/store.md lists their variables with dimensions and units. Fields stay on disk until you ask for
+    values of them; they have the accessor `field.sobolev`.
 
     Args:
         store: Path or URL of the store.

@@ -71,7 +71,7 @@ class StudyPlan:
     def seconds(self) -> float:
         """Time that a run will take on the workers, if they have their cores for themselves.
 
-        It leaves out comparisons with the reference, and distances of very many pairs.
+        It leaves out Hausdorff and Chamfer distances, and distances of very many pairs.
         """
         return self._forecast.seconds
 
@@ -163,9 +163,6 @@ class StudyPlan:
         yield from self._octave_lines()
         yield from self._transform_lines()
         yield "backend", study.backend
-        if study.witness:
-            witness_orders = ", ".join(f"{order:g}" for order in study.witness)
-            yield "witness", f"of order {witness_orders}, at the vertices of every mesh"
         if study.proximity is not None:
             yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
         yield from self._task_lines()
@@ -174,8 +171,8 @@ class StudyPlan:
         first, *others = self._forecast.lines
         yield "time", first
         yield from (("", line) for line in others)
-        if study.witness or study.proximity is not None:
-            yield "", "witness functions, Hausdorff and Chamfer distances take more"
+        if study.proximity is not None:
+            yield "", "Hausdorff and Chamfer distances take more"
 
     def _octave_lines(self) -> Iterator[tuple[str, str]]:
         tail = self._plan.tail

@@ -10,12 +10,11 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock
 from sobolev_batch.batch.storage.timestamps import age_seconds, utc_now
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords, failed_comparisons
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.batch.workspace import complete_records
+from sobolev_batch.batch.workspace import complete_records, failed_proximities
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.formatting import duration
@@ -37,8 +36,8 @@ class Status:
         complete: Number of surfaces that are computed.
         total: Number of surfaces of the study.
         failed: Reason for each surface that could not be computed, by label.
-        not_compared: For each surface that is computed but lacks its witness function or its Hausdorff and Chamfer
-            distances: which of them, and why.
+        not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
+            study asks for.
         run: Record of the latest run, or None.
         reduced: True once the store has tables.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
@@ -80,9 +79,7 @@ class Status:
         opened = Store.open(place)
         run, removed, records = opened.read_run(), opened.removed, opened.records()
         labels = {row: label for row, label in enumerate(opened.labels()) if label not in removed}
-        # Nothing is read of comparisons that the study does not ask for.
-        comparisons = {kind: ComparisonRecords(opened, kind) for kind in KINDS}
-        notes = {kind: records.read() for kind, records in comparisons.items() if records.name in opened.documents}
+        asks_for_proximity = opened.attributes()["study"]["table"].get("proximity") is not None
         complete = {row: record for row, record in complete_records(records).items() if row in labels}
         tables = Tables(opened)
         return cls(
@@ -94,7 +91,7 @@ class Status:
                 for row, label in labels.items()
                 if (record := records[row]) is not None and record.status == "failed"
             },
-            failed_comparisons(labels, notes, complete),
+            failed_proximities(labels, complete) if asks_for_proximity else {},
             run,
             tables.attributes("convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,

@@ -13,6 +13,7 @@ from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table, variable
@@ -108,7 +109,9 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(
     root.write_text(json.dumps(document))
     before = {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
     for use in (open_store, Status.of, lambda place: run(study_of(folder), place, client)):
-        with pytest.raises(StoreError, match=f"its schema has version {version}, this program reads 3; name another"):
+        with pytest.raises(
+            StoreError, match=f"its schema has version {version}, this program reads {SCHEMA_VERSION}; name another"
+        ):
             use(store_path)
     assert before == {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
 

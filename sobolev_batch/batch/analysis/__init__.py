@@ -1,4 +1,4 @@
 """Analysis: what is computed from stored fields, as tasks of its own.
 
-In: complete fields. Out: norms, distances, convergence, witness functions and proximities, as tables.
+In: complete fields. Out: norms, distances, convergence, Hausdorff and Chamfer distances, as tables.
 """

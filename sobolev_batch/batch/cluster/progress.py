@@ -8,7 +8,7 @@ from typing import Literal
 
 from sobolev_batch.batch.store.records import Record
 
-Stage = Literal["cluster", "fields", "reduction", "comparisons"]
+Stage = Literal["cluster", "fields", "reduction", "proximity"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Progress:
 
     Attributes:
         stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
-            tables are computed, "comparisons" while meshes are compared with the reference.
+            tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
         record: Completion record of that mesh.

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import LOCK_KEYS
-from sobolev_batch.batch.store.comparison_records import KINDS, ComparisonRecords
 from sobolev_batch.batch.store.hierarchy import (
     FIELD,
     LABELS,
@@ -283,10 +282,6 @@ def _extend(store: Store, plan: Plan) -> None:
     # Empty qualities are written too, since a missing chunk counts as lost.
     for name, values in ((QUALITY, [""] * len(added)), *((name, added) for name in (LABELS, *of_octaves[1:]))):
         store.write(name, slice(len(labels), None), np.array(values, dtype=object))
-    for records in (ComparisonRecords(store, kind) for kind in KINDS):
-        # xarray cannot read arrays of one group together that differ along `mesh`.
-        if store.has(records.name):
-            records.create(rows)
 
 
 def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:

@@ -41,8 +41,6 @@ OCTAVES = "octaves/octaves"
 OCTAVE_LABELS = "octaves/mesh"
 RECORDS = "records"
 RECORD = "records/record"
-WITNESS_GROUP = "witness"
-WITNESS = "witness/witness"
 # Length of the checksum at the end of a chunk.
 _CHECKSUM_BYTES = 4
 # Attributes of the root: digest of the content of each chunk of small arrays, and that of the root itself.
@@ -135,7 +133,7 @@ class Hierarchy:
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
         store = self.zarr_store(name)
-        if not name.startswith(f"{RECORDS}/") and name not in (FIELD, OCTAVES, WITNESS):
+        if not name.startswith(f"{RECORDS}/") and name not in (FIELD, OCTAVES):
             store = NotingStore(store, self.digests)
         path = StorePath(store, name)
         metadata = zarr.AsyncArray.from_dict(path, self.document(name)).metadata

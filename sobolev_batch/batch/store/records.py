@@ -90,6 +90,29 @@ class Facts:
 
 
 @dataclass(frozen=True)
+class ProximityRecord:
+    """Hausdorff and Chamfer distances of a mesh from the reference, see `Proximity`.
+
+    Attributes:
+        key: Digest of all that they depend on.
+        reason: Reason of a failure; empty otherwise.
+        hausdorff, chamfer, chamfer_error: Distances in the study's unit of length; NaN after a failure.
+        seconds: Time spent in their task.
+    """
+
+    key: str
+    reason: str = ""
+    hausdorff: float = float("nan")
+    chamfer: float = float("nan")
+    chamfer_error: float = float("nan")
+    seconds: float = 0.0
+
+    def completes(self, key: str) -> bool:
+        """Return whether the distances with this key were measured."""
+        return not self.reason and self.key == key
+
+
+@dataclass(frozen=True)
 class Record(JsonRecord):
     """Completion record of one surface, written after everything else of it.
 
@@ -105,6 +128,7 @@ class Record(JsonRecord):
         worker: Address of the worker that finished it.
         backend: Backend of the transform.
         finished: Time at which it was finished, in UTC.
+        proximity: Hausdorff and Chamfer distances from the reference, where the study asks for them.
     """
 
     kind = "completion record"
@@ -119,6 +143,7 @@ class Record(JsonRecord):
     worker: str = ""
     backend: str = ""
     finished: str = ""
+    proximity: ProximityRecord | None = None
 
     def completes(self, key: str) -> bool:
         """Return whether the field with this key exists already."""

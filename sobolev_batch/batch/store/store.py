@@ -31,7 +31,6 @@ from sobolev_batch.batch.store.hierarchy import (
     RECORD,
     RECORDS,
     ROOT,
-    WITNESS,
     Hierarchy,
     StoredChunks,
 )
@@ -64,7 +63,7 @@ class Store(Hierarchy):
         carried = {
             name: document
             for name, document in self.documents.items()
-            if name in (FIELD, OCTAVES, WITNESS) or name.startswith(f"{RECORDS}/")
+            if name in (FIELD, OCTAVES) or name.startswith(f"{RECORDS}/")
         }
         return {"location": self.location, "documents": carried, "digests": {}}
 

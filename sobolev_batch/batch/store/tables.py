@@ -16,7 +16,6 @@ from sobolev_batch.batch.store.hierarchy import (
     QUALITY,
     RECORDS,
     ROOT,
-    WITNESS_GROUP,
     Hierarchy,
     StoredChunks,
 )
@@ -25,7 +24,7 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.lattice import AXES
 
 # All other groups are tables.
-_GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS, WITNESS_GROUP)
+_GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS)
 
 
 @dataclass(frozen=True)
@@ -37,13 +36,11 @@ class Tables:
     def invalidate(self) -> tuple[str, ...]:
         """Hide the tables from readers until they are written and listed again, and return their names.
 
-        While they are written they do not fit together. Witness functions are hidden too: they belong to the
-        fields that are replaced.
+        While they are written they do not fit together.
         """
         names = tuple(self._names())
-        hidden = [*names, *(name for name in self.store.documents if name.split("/")[0] == WITNESS_GROUP)]
-        if hidden:
-            self.store.hide(hidden)
+        if names:
+            self.store.hide(names)
             # Errors of norms need them, and they are written before tables are listed again.
             self.store.forget_digests(QUALITY)
             self.store.consolidate()
@@ -73,8 +70,8 @@ class Tables:
     def lost(self) -> tuple[str, ...]:
         """Return the arrays of tables with missing chunks. No chunk is read."""
         names = self._names()
-        # Errors of norms need the qualities, which are written with them; witness functions need their axes.
-        others = [*([QUALITY] if names else ()), *self._axes_of_witness()]
+        # Errors of norms need the qualities, which are written with them.
+        others = [QUALITY] if names else []
         return tuple(self._incomplete(names, self._groups()) + self._incomplete(others, others))
 
     def without_records(self, records: Sequence[object | None]) -> tuple[int, ...]:
@@ -95,7 +92,7 @@ class Tables:
     def damaged(self) -> dict[str, str]:
         """Return the damage of each small array, of tables and coordinates, that cannot be read."""
         of_octaves = [name for name in self.store.documents if name.startswith(f"{OCTAVES_GROUP}/") and name != OCTAVES]
-        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *of_octaves, *self._axes_of_witness()]
+        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *of_octaves]
         lost = {*self.lost(), *self._incomplete(coordinates, coordinates)}
         damage = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
         for name in [*coordinates, QUALITY, *self._names()]:
@@ -105,10 +102,6 @@ class Tables:
                 except DamageError as error:
                     damage[name] = error.what
         return damage
-
-    def _axes_of_witness(self) -> list[str]:
-        names = (f"{WITNESS_GROUP}/{name}" for name in ("mesh", "order"))
-        return [name for name in names if name in self.store.documents]
 
     def _groups(self) -> list[str]:
         return sorted({name.split("/")[0] for name in self.store.documents if name} - set(_GROUPS_OF_TASKS))

@@ -137,13 +137,6 @@ class _ScalingSection(Section):
         return self
 
 
-class _WitnessSection(Section):
-    orders: Orders | None = None
-
-    def settings(self, orders_of_norm: tuple[float, ...]) -> tuple[float, ...]:
-        return orders_of_norm if self.orders is None else self.orders
-
-
 class _ProximitySection(Section):
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
 
@@ -173,7 +166,6 @@ class StudyDocument(Section):
     reference: dict[str, Any]
     family: Annotated[list[dict[str, Any]], Field(min_length=1)]
     scaling: _ScalingSection = _ScalingSection()
-    witness: _WitnessSection | None = None
     proximity: _ProximitySection | None = None
 
     @model_validator(mode="after")

@@ -92,8 +92,6 @@ class Study:
         families: Families of surfaces to compare.
         reference: Surface that they are compared with.
         scaling: Choice of the common unit of length.
-        witness: Orders for which every mesh's witness function against the reference is stored, at its vertices;
-            empty if none are asked for.
         proximity: Number of points that are drawn on each mesh for its Hausdorff and Chamfer distances from the
             reference; None if these are not asked for.
         folder: Folder in which relative paths start.
@@ -124,7 +122,6 @@ class Study:
     families: tuple[Family, ...]
     reference: Source | FamilyReference
     scaling: Scaling
-    witness: tuple[float, ...]
     proximity: int | None
     folder: Path
     table: Mapping[str, Any]
@@ -191,7 +188,7 @@ class Study:
 
         Args:
             table: Sections study, lattice or accuracy, norm, transform, reference, family (a list), scaling,
-                witness, proximity.
+                proximity.
             folder: Folder in which relative paths start.
 
         A pandas.DataFrame may stand where a list of tables does, such as for ``meshes`` of the source ``files``.
@@ -280,7 +277,6 @@ class Study:
             families=families,
             reference=reference,
             scaling=scaling,
-            witness=() if document.witness is None else document.witness.settings(orders),
             proximity=None if document.proximity is None else document.proximity.points,
             folder=folder,
             octaves=0 if document.lattice is None else document.lattice.octaves,
@@ -322,7 +318,6 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "families": (tuple,),
     "reference": (Source, FamilyReference),
     "scaling": (Scaling,),
-    "witness": (tuple,),
     "proximity": (int, NoneType),
     "folder": (Path,),
     "table": (Mapping,),

@@ -249,13 +249,6 @@ def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tup
             f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
             f"length: wavelengths down to {1 / highest:.4g} units",
         )
-    if table.get("witness") is not None:
-        chosen = table["witness"].get("orders") or study["orders"]
-        yield (
-            "witness",
-            f"at the vertices of every mesh, order {minus(', '.join(f'{order:g}' for order in chosen))}; it holds the "
-            f"wavelengths of the lattice, down to {1 / lattice.xi_max:.4g} units",
-        )
     if table.get("proximity") is not None:
         yield "proximity", "Hausdorff and Chamfer distances of every mesh to the reference"
     dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]

@@ -127,25 +127,21 @@ def test_an_interrupted_run_goes_on_from_what_is_stored(
 
 
 @pytest.mark.all
-def test_comparisons_are_those_of_a_folder(server: Server, s3_client: Client, url: str, tmp_path: Path) -> None:
-    table = small_table(
-        reference={"source": "icosphere", "levels": [4]}, witness={"orders": [-2.0]}, proximity={"points": 100}
-    )
+def test_proximities_are_those_of_a_folder(server: Server, s3_client: Client, url: str, tmp_path: Path) -> None:
+    table = small_table(reference={"source": "icosphere", "levels": [4]}, proximity={"points": 100})
     fewer = {**table, "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}]}
     folder = tmp_path / "results.zarr"
     for place in (url, str(folder)):
         run(Study.from_table(fewer), place, s3_client)
         assert not run(Study.from_table(table), place, s3_client).not_compared
-    for group, name in (("witness", "witness"), ("proximity", "hausdorff"), ("proximity", "chamfer")):
-        ours, theirs = (variable(open_store(place), group, name).load() for place in (url, str(folder)))
+    for name in ("hausdorff", "chamfer"):
+        ours, theirs = (variable(open_store(place), "proximity", name).load() for place in (url, str(folder)))
         assert np.isfinite(ours.isel(mesh=slice(0, 4))).sum() == np.isfinite(theirs.isel(mesh=slice(0, 4))).sum() > 0
         xr.testing.assert_allclose(ours, theirs, rtol=1e-9)
     assert verify(url).is_sound
-    run(Study.from_table({**table, "witness": {"orders": [-3.0]}}), url, s3_client)
-    assert variable(open_store(url), "witness", "order").values.tolist() == [-3.0]
     run(Study.from_table(small_table(reference=table["reference"])), url, s3_client)
     prefix = url.removeprefix(f"s3://{BUCKET}/")
-    assert not [key for key in server.keys(prefix) if "/witness/" in key or "/proximity/" in key]
+    assert not [key for key in server.keys(prefix) if "/proximity/" in key]
 
 
 def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:

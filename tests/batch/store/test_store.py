@@ -141,7 +141,7 @@ def test_opening_what_is_no_store(tmp_path: Path) -> None:
 def test_a_newer_schema_is_refused(store_path: Path) -> None:
     prepare_store(store_path, small_plan())
     zarr.open_group(str(store_path), mode="r+").attrs["schema_version"] = 99
-    with pytest.raises(StoreError, match="its schema has version 99, this program reads 3"):
+    with pytest.raises(StoreError, match="its schema has version 99, this program reads"):
         Store.open(store_path)
 
 

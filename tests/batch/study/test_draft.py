@@ -219,7 +219,6 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "more.toml").write_text("\n".join(line for line in offers if not line.startswith(("`", "Compare"))))
     more = sb.Study.from_toml(tmp_path / "more.toml")
     assert more.proximity == 10_000
-    assert more.witness == (-2.0,)
     assert [family.name for family in more.families] == ["scan", "quadric decimation"]
 
 

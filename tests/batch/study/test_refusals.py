@@ -76,7 +76,6 @@ WRONG: list[tuple[str, str, str]] = [
     (SPHERE, 'source = "family"\nfamily = "ico"\nmember = 1', "[reference]: member must be text in quotes, such as"),
     (BEFORE, "[proximity]\npoints = 1e4\n[norm]", "points must be a whole number, such as points = 10000, found 10000"),
     (BEFORE, "[transform]\nquadrature = 1.5\n[norm]", "quadrature must be text in quotes or a whole number, such as"),
-    (BEFORE, '[witness]\norders = "all"\n[norm]', "[witness]: orders must be a list, such as orders = [-4.0], found"),
     # Values out of range.
     (ORDERS, "orders = []", "[norm]: orders must be a list with 1 or more entries, such as orders = [-4.0], found []"),
     (ORDERS, "orders = [-2.0, -0.5]", "[norm]: orders: the norm of a surface is finite only for orders below -1/2, fo"),

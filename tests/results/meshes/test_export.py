@@ -5,21 +5,16 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-import xarray as xr
 from click.testing import CliRunner, Result
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.batch.store.comparison_records import ComparisonRecords
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.witness_array import Witnesses
 from sobolev_batch.cli import cli
 from sobolev_batch.results.meshes.export import Exporter
 from sobolev_batch.results.meshes.witness import witness_at_vertices
@@ -133,63 +128,6 @@ def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
     assert there.field_data["notes"][0] == "witness function of the mesh files/beside against reference, study " + (
         r"Kugeln gr\xf6\xdfer"
     )
-
-
-@pytest.mark.slow
-def test_stored_values_are_taken(spheres: Spheres) -> None:
-    place, folder = spheres
-    exporter = Exporter.of(place, folder=folder)
-    first, second, _ = LABELS
-    values = np.full((2, 1, 700), np.nan)
-    values[0, 0, :642] = np.arange(642)
-    stored = xr.Dataset(
-        {"witness": (("mesh", "order", "vertex"), values)}, coords={"mesh": [first, second], "order": [-2.5]}
-    )
-    tree = xr.DataTree.from_dict({**exporter.tree.to_dict(), "/witness": stored})
-    tree.attrs = exporter.tree.attrs
-    exporter = replace(exporter, tree=tree)
-    field = exporter.field(first)
-    assert (field.values[1] == np.arange(642)).all()
-    # Another order, and a mesh that nobody asked for.
-    expected = evaluated(place, first, field.mesh.vertices)
-    assert field.values[0] == pytest.approx(expected[0], rel=1e-9)
-    other = exporter.field(second)
-    expected = evaluated(place, second, other.mesh.vertices)
-    assert other.values == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
-
-
-@pytest.mark.slow
-def test_values_that_a_run_has_stored_are_taken(tmp_path: Path) -> None:
-    table = {
-        "study": {"name": "stored"},
-        "lattice": {"xi_max": 3.0, "M": 16},
-        "norm": {"orders": list(ORDERS)},
-        "witness": {},
-        "reference": {"source": "sphere"},
-        "family": [{"name": "ico", "source": "icosphere", "levels": [1, 2]}],
-    }
-    place = "memory://stored.zarr"
-    sb.run(sb.Study.from_table(table), place)
-    label, path = "ico/2", tmp_path / "a.ply"
-    tree = sb.open_store(place)
-    expected = tree["witness"].to_dataset()["witness"].sel(mesh=label).to_numpy()[:, :162]
-    fresh = witness_at_vertices(tree.drop_nodes("witness"), label, sb.icosphere(2), ORDERS)
-    assert expected == pytest.approx(fresh, rel=1e-7)
-    # No evaluation finds these.
-    store = Store.open(place)
-    row, records = store.labels().index(label), ComparisonRecords(store, "witness")
-    record = records.read_row(row)
-    assert record is not None
-    store.array("witness/witness")[row, :, :162] = 2 * expected
-    with pytest.raises(sb.DamageError, match="witness/witness is damaged"):
-        sb.write_witness(place, label, path)
-    records.write(row, replace(record, checksum=Witnesses(store).write(row, 2 * expected)))
-    sb.write_witness(place, label, path)
-    vertices = PlyData.read(path)["vertex"]
-    for name, row in zip(("witness_minus_4", "witness_minus_2_5"), expected, strict=True):
-        assert (vertices[name] == 2 * row).all()
-    sb.write_witness(place, label, path, [-3.0])
-    assert np.isfinite(PlyData.read(path)["vertex"]["witness_minus_3"]).all()
 
 
 @pytest.mark.slow

@@ -349,12 +349,12 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
 
 @pytest.mark.all
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    status = replace(Status.of(store), not_compared={"files/good": "no witness: <i>changed</i>"})
+    status = replace(Status.of(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
     monkeypatch.setattr(Status, "of", lambda _: status)
     text = make_report(store).text
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
-    assert "no witness: &lt;i&gt;changed&lt;/i&gt;" in text
+    assert "no proximity: &lt;i&gt;changed&lt;/i&gt;" in text
 
 
 @pytest.mark.slow

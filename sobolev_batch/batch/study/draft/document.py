@@ -34,9 +34,6 @@ _TAIL = """
 
 # [proximity]              # Hausdorff and Chamfer distances beside ours; needs the extra "vtk"
 # points = 10000
-
-# [witness]                # store where each mesh differs from the reference
-# orders = [-2.0]
 """
 _DECIMATED = """
 [[family]]

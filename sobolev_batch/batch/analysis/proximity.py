@@ -1,0 +1,218 @@
+"""Hausdorff and Chamfer distances of meshes from the reference, where a study asks for them.
+
+One task measures those of a mesh, from both meshes and no field, and adds them to the mesh's completion record. A
+table is made from the records.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.batch.analysis.ordering import TableOrder
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
+from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.fields.sizing import MESH_BYTES
+from sobolev_batch.batch.store.records import ProximityRecord, Record
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.study.plan import Row
+from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
+from sobolev_batch.spectral.metrics.datasets import describe
+from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES, Proximity, proximity
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+
+_log = logging.getLogger(__name__)
+
+# Raise it whenever the distances come out differently: they are then measured again.
+_VERSION = 2
+_GROUP = "proximity"
+
+
+def have_proximities(workspace: Workspace) -> bool:
+    """Return True where the store has all distances that the study asks for, and readers find them."""
+    attributes = Tables(workspace.store).attributes(_GROUP)
+    if workspace.plan.study.proximity is None:
+        return attributes is None
+    is_listed = attributes is not None and attributes.get("digest") == _digest(workspace)
+    return is_listed and not _pending(workspace)
+
+
+def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
+    """Measure the distances that the records lack, and write their table, or remove one that nobody asks for.
+
+    Raises:
+        StoreError: The store could not be read or written.
+        ClusterError: The scheduler was lost.
+    """
+    pending = _pending(workspace)
+    if pending:
+        _measure(cluster, workspace, pending)
+    if have_proximities(workspace):
+        return
+    workspace.store.remove(_GROUP)
+    workspace.store.consolidate()
+    if workspace.plan.study.proximity is not None:
+        Tables(workspace.store).write(_GROUP, _dataset(workspace))
+        workspace.store.consolidate()
+
+
+def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> None:
+    plan, complete, reference = workspace.plan, workspace.complete, workspace.reference
+    points = plan.study.proximity or 0
+    loading_bytes = {
+        i: max(workspace.rows[i].member.expected_size().projected_bytes, MESH_BYTES * complete[i].facts.triangles)
+        for i in (reference, *keys)
+    }
+    tasks = []
+    for i, key in keys.items():
+        triangles = complete[i].facts.triangles + complete[reference].facts.triangles
+        search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * points
+        pair = tuple(StoredMesh(workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
+        arguments = workspace.store, i, complete[i], key, pair, plan.similarity, points
+        projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
+        tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i]))
+    steps = Steps(cluster.notify, "proximity", len(tasks))
+    for task, outcome in cluster.run(tasks, max(task.projected_bytes for task in tasks)):
+        record = outcome
+        if not isinstance(outcome, Record):
+            reason = describe_failure(outcome)
+            _log.error("%s: no proximity: %s", task.label, reason)
+            record = replace(complete[task.row], proximity=ProximityRecord(keys[task.row], reason))
+            workspace.store.write_record(task.row, record)
+        workspace.records[task.row] = record
+        steps.advance(task.label)
+
+
+@dataclass(frozen=True)
+class StoredMesh:
+    """A mesh whose field is stored.
+
+    Attributes:
+        row: Row of the plan.
+        digest: Digest of the mesh whose field is stored, in the study's unit.
+    """
+
+    row: Row
+    digest: str
+
+    def load(self, similarity: Similarity) -> Mesh:
+        """Load the mesh, in the study's unit.
+
+        Raises:
+            MeshError: It cannot be loaded, or is not the mesh whose field is stored.
+        """
+        surface = similarity.apply(self.row.member.load())
+        if not isinstance(surface, Mesh) or surface.digest != self.digest:
+            raise MeshError(
+                f"what is made of {self.row.label} now is not the mesh whose field is stored; a file may have "
+                "changed: run the study again"
+            )
+        return surface
+
+
+def measure_proximity(
+    store: Store,
+    index: int,
+    record: Record,
+    key: str,
+    pair: tuple[StoredMesh, StoredMesh],
+    similarity: Similarity,
+    points: int,
+) -> Record:
+    """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
+
+    A mesh that cannot be measured does not raise: the reason is part of the record.
+
+    Args:
+        store: Store of the record.
+        index: Row of the mesh in the store.
+        record: Record of the mesh's field.
+        key: Key of the distances.
+        pair: Mesh and reference.
+        similarity: Similarity of the study.
+        points: Number of points that are drawn on each of the two.
+
+    Raises:
+        StoreError: The store cannot be read or written, which is not the mesh's fault.
+    """
+    # Dask has a task done again whose worker was lost with the result.
+    stored = store.read_record(index)
+    if stored is not None and stored.proximity is not None and stored.proximity.completes(key):
+        return stored
+    started = time.perf_counter()
+    try:
+        distances = proximity(*(mesh.load(similarity) for mesh in pair), points=points)
+        measured = ProximityRecord(key, "", **asdict(distances))
+    except StoreError:
+        raise
+    except Exception as error:
+        if not isinstance(error, InputError):
+            _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0].row.label, exc_info=error)
+        measured = ProximityRecord(key, one_line(error))
+    record = replace(record, proximity=replace(measured, seconds=time.perf_counter() - started))
+    store.write_record(index, record)
+    return record
+
+
+def _keys(workspace: Workspace) -> dict[int, str]:
+    """Return the key of the distances of each mesh that the study asks for: a digest of all they depend on."""
+    points, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
+    if points is None or reference not in complete:
+        return {}
+    inputs = {
+        i: [_VERSION, record.facts.digest, complete[reference].facts.digest, points]
+        for i, record in complete.items()
+        # Closed forms have no triangles.
+        if i != reference and record.facts.triangles
+    }
+    return {i: hashlib.sha256(json.dumps(parts).encode()).hexdigest() for i, parts in inputs.items()}
+
+
+def _pending(workspace: Workspace) -> dict[int, str]:
+    """Return the keys of the distances that are to be measured, by the rows of their meshes."""
+    measured = {i: record.proximity for i, record in workspace.complete.items()}
+    return {
+        i: key for i, key in _keys(workspace).items() if (record := measured[i]) is None or not record.completes(key)
+    }
+
+
+def _dataset(workspace: Workspace) -> xr.Dataset:
+    """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
+    records, rows = _current(workspace), TableOrder.of(workspace).rows
+    columns: dict[str, Any] = {
+        name: [getattr(records[i], name) if i in records else np.nan for i in rows]
+        for name in (field.name for field in fields(Proximity))
+    }
+    columns["reason"] = np.array([records[i].reason if i in records else "" for i in rows], dtype=object)
+    attributes = {
+        "reference": workspace.plan.reference,
+        "points": workspace.plan.study.proximity,
+        "digest": _digest(workspace),
+    }
+    labels = np.array([workspace.labels[i] for i in rows], dtype=object)
+    variables = {name: ("mesh", values) for name, values in columns.items()}
+    return describe(xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes))
+
+
+def _current(workspace: Workspace) -> dict[int, ProximityRecord]:
+    """Return the distances of the meshes and points that there are now, by the rows of the meshes."""
+    keys = _keys(workspace)
+    records = {i: record.proximity for i, record in workspace.complete.items() if i in keys}
+    return {i: record for i, record in records.items() if record is not None and record.key == keys[i]}
+
+
+def _digest(workspace: Workspace) -> str:
+    records, rows = _current(workspace), TableOrder.of(workspace).rows
+    lines = [[workspace.labels[i], asdict(records[i]) if i in records else None] for i in rows]
+    return hashlib.sha256(json.dumps(lines).encode()).hexdigest()
