@@ -26,7 +26,7 @@ from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
-    from sobolev_batch.results.figures.pictures import PictureFormat
+    from sobolev_batch.results.figures.style import PictureFormat
     from sobolev_batch.results.meshes.views import Axis
 
 _FOLLOW_SECONDS = 2.0
@@ -247,12 +247,13 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.pictures import Output, parse_size
-    from sobolev_batch.results.figures.plots import Selection, write_plots
+    from sobolev_batch.results.figures.convergence_plots import LEAGUE
+    from sobolev_batch.results.figures.plots import write_plots
+    from sobolev_batch.results.figures.selection import Selection
+    from sobolev_batch.results.figures.style import Output, parse_size
     from sobolev_batch.results.figures.witness_plots import write_witness_plots
     from sobolev_batch.results.league.league import league
-    from sobolev_batch.results.league.plot import write_league_plots
-    from sobolev_batch.results.open import fields_read, open_store
+    from sobolev_batch.results.open import fields_read
     from sobolev_batch.results.tables.sizes import EDGE_LENGTH
 
     written_as = Output(formats or ("png",), None if size is None else parse_size(size))
@@ -260,18 +261,19 @@ def plot_command(
         if meshes:
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
         leagues = league(store, orders or None, x=x or "triangles", methods=families or None)
-        for path in write_league_plots(leagues, output, written_as):
+        with written_as.drawing():
+            figure = LEAGUE.figure(leagues, size=written_as.size)
+        for path in written_as.write({"league": figure}, output):
             echo(path)
         return
-    selection = Selection(orders or None, families or None, x or EDGE_LENGTH)
     with fields_read(store):
-        tree = open_store(store)
+        selection = Selection.from_store(store, orders or None, families or None, x or EDGE_LENGTH)
         # First, since a label may be wrong.
-        witness_paths, missing = write_witness_plots(tree, output, folder, meshes, up, selection, written_as)
-        plots = write_plots(tree, output, selection, written_as)
-    for path in (*plots.paths, *witness_paths):
+        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, written_as)
+        paths, omissions = write_plots(selection, output, written_as)
+    for path in (*paths, *witness_paths):
         echo(path)
-    for name, notes in plots.notes.items():
+    for name, notes in omissions.items():
         echo(f"{name}: {'; '.join(notes)}", err=True)
     if missing:
         labels_by_reason: dict[str, list[str]] = {}

@@ -106,8 +106,7 @@ def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> No
 
 def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave_store: Path) -> None:
     axes = plot_energy(octave_store)
-    legend = axes.get_legend()
-    assert legend is not None
+    (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["limit", "ico", "ball"]
     energies = np.asarray(axes.lines[-1].get_xydata())[:, 1]
     radii = np.linspace(0, 200, 200_001)[1:]

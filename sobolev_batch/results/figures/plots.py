@@ -1,91 +1,342 @@
-"""All plots of a store, written into a folder."""
+"""The plots of a store, one by one and all of them into a folder."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import xarray as xr
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 
+from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.convergence_plots import (
-    convergence_figure,
-    evolution_figure,
+    LEAGUE,
+    draw_convergence,
+    draw_evolution,
     moving_families,
 )
-from sobolev_batch.results.figures.pair_plots import has_pairs, map_figure, matrix_figure
-from sobolev_batch.results.figures.pictures import Output, write_figures
-from sobolev_batch.results.figures.spectra import MOST_MESHES, Spectra
-from sobolev_batch.results.figures.spectrum_plots import energy_figure, spectrum_figure
-from sobolev_batch.results.figures.style import notes_of
-from sobolev_batch.results.figures.transform_plots import transform_figure
-from sobolev_batch.results.tables.groups import Families, chosen_families, chosen_orders, finished_group
+from sobolev_batch.results.figures.pair_plots import draw_map, draw_matrix, has_pairs
+from sobolev_batch.results.figures.selection import Selection
+from sobolev_batch.results.figures.spectrum_plots import (
+    computed_members,
+    draw_energy,
+    draw_spectrum,
+    draw_transform,
+    transform_panels,
+)
+from sobolev_batch.results.figures.style import Output, Plot, notes_of
+from sobolev_batch.results.league.league import League
+from sobolev_batch.results.open import AnyStore, fields_read
+from sobolev_batch.results.tables.groups import Families
 from sobolev_batch.results.tables.sizes import EDGE_LENGTH
-from sobolev_batch.spectral.shells import Orders
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Choice of what plots show.
-
-    Attributes:
-        order: Orders of the norm; default all of the store.
-        family: Families, by names or globs; default all.
-        x: Horizontal axis of convergence.
-    """
-
-    order: Orders | None = None
-    family: Families = None
-    x: str = EDGE_LENGTH
+def _orders(selection: Selection) -> Sequence[float]:
+    return selection.orders
 
 
-@dataclass(frozen=True)
-class WrittenPlots:
-    """Files of plots.
+def _orders_of_pairs(selection: Selection) -> Sequence[float]:
+    return selection.orders if has_pairs(selection.tree) else ()
 
-    Attributes:
-        paths: Paths of the pictures.
-        notes: What each picture leaves out, by its name.
-    """
 
-    paths: tuple[Path, ...]
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+# By the names of their files. The panels show one order each, or one family.
+PLOTS: dict[str, Plot[Selection]] = {
+    "convergence": Plot(draw_convergence, _orders, 3.6, "Relative distance over mean edge length"),
+    "over-time": Plot(
+        draw_evolution,
+        lambda selection: selection.orders if moving_families(selection) else (),
+        3.6,
+        "Distance over time",
+    ),
+    "transform": Plot(draw_transform, transform_panels, 3.4, "Fourier fields along the first axis"),
+    "matrix": Plot(draw_matrix, _orders_of_pairs, 5.6, "Distances of all pairs", "compressed"),
+    "map": Plot(draw_map, _orders_of_pairs, 4.4, "Map of the meshes"),
+    "spectrum": Plot(
+        draw_spectrum,
+        lambda selection: selection.orders if selection.has_spectra else (),
+        4.0,
+        "Squared distance by wavelength",
+    ),
+    "energy": Plot(
+        draw_energy,
+        lambda selection: (None,) if selection.has_spectra else (),
+        3.6,
+        "Energy of the differences by wavelength",
+    ),
+}
 
 
 def write_plots(
-    tree: xr.DataTree, folder: str | Path, selection: Selection | None = None, output: Output | None = None
-) -> WrittenPlots:
-    """Write the plots of an open store into a folder, with a panel for each order or family.
+    selection: Selection, folder: str | Path, output: Output | None = None
+) -> tuple[tuple[Path, ...], Mapping[str, Sequence[str]]]:
+    """Write the plots of a store into a folder, with a panel for each order or family.
 
     The files are convergence, transform, spectrum and energy, which has one panel; where the study asks for the
     distances of all pairs, matrix and map too, and where meshes have times, over-time. Each has the suffixes that the
     output asks for.
 
+    Returns:
+        Paths of the pictures, and what each of them leaves out, by its name.
+
     Raises:
-        InputError: The store has no tables yet, or lacks an order or a family.
+        InputError: The store lacks the horizontal axis.
         StoreError: The folder cannot be written.
     """
-    selection, output = selection or Selection(), output or Output()
+    output = output or Output()
     with output.drawing():
-        figures = _figures(tree, selection, output)
-    paths = write_figures(figures, Path(folder), output)
+        figures = {
+            name: plot.figure(selection, items, output.size)
+            for name, plot in PLOTS.items()
+            if (items := plot.items(selection))
+        }
     notes = {name: notes_of(figure) for name, figure in figures.items()}
-    return WrittenPlots(paths, {name: lines for name, lines in notes.items() if lines})
+    return output.write(figures, folder), {name: lines for name, lines in notes.items() if lines}
 
 
-def _figures(tree: xr.DataTree, selection: Selection, output: Output) -> dict[str, Figure]:
-    orders = chosen_orders(finished_group(tree, "convergence"), selection.order)
-    family, size = chosen_families(tree, selection.family), output.size
-    figures = {"convergence": convergence_figure(tree, orders, selection.x, family, size)}
-    if moving_families(tree, family):
-        figures["over-time"] = evolution_figure(tree, orders, family, size)
-    if (transforms := transform_figure(tree, family, size)) is not None:
-        figures["transform"] = transforms
-    if has_pairs(tree):
-        figures["matrix"] = matrix_figure(tree, orders, family, size)
-        figures["map"] = map_figure(tree, orders, family, size)
-    if "similarity" in tree.attrs and (spectra := Spectra.of(tree, orders, MOST_MESHES, family)) is not None:
-        figures["spectrum"] = spectrum_figure(spectra, orders, size)
-        figures["energy"] = energy_figure(tree, spectra, size)
-    return figures
+def _plotted(name: str, selection: Selection, axes: Axes | None) -> Axes:
+    """Draw the first order of a selection, and return the axes."""
+    return PLOTS[name].on(axes, selection, selection.orders[0])
+
+
+def plot_convergence(
+    store: AnyStore,
+    order: float | None = None,
+    ax: Axes | None = None,
+    *,
+    x: str = EDGE_LENGTH,
+    family: Families = None,
+) -> Axes:
+    """Plot the relative distance to the reference against the size or the cost of the meshes, family by family.
+
+    Both axes are logarithmic. Bars show errors; a hollow marker is a distance that is not larger than its error.
+    Families that go from coarse to fine are joined, and a dotted line has the slope of second-order convergence. The
+    title counts the meshes that have no place in the plot. Without ``ax``, the plot
+    has a figure of its own, ``ax.figure``, which pyplot does not know, with the legend beside it.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
+        x: Horizontal axis: "edge_length" (mean, in the study's unit), "triangles", "vertices", "seconds" that the tasks
+            of the mesh took, or a number among the metadata of the meshes.
+        family: Families to draw, by names or globs; default all.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, or lacks the order, a family or the horizontal axis.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_convergence("storage/icosphere.zarr", order=-10)
+    >>> ax.get_xlabel()
+    "mean edge length in the study's unit"
+    >>> ax.figure.savefig("convergence.pdf")
+    >>> sb.plot_convergence("storage/icosphere.zarr", x="triangles", family="ico*").get_xlabel()
+    'number of triangles'
+    """
+    return _plotted("convergence", Selection.from_store(store, order, family, x), ax)
+
+
+def plot_evolution(
+    store: AnyStore,
+    order: float | None = None,
+    ax: Axes | None = None,
+    *,
+    truth: str | None = None,
+    family: Families = None,
+) -> Axes:
+    """Plot the distances of moving meshes from the true surface over time, one line for each family.
+
+    The vertical axis is logarithmic; bars show errors, and a dotted line marks the first time at which a new mesh pays.
+
+    Args:
+        store: Path, URL or opened DataTree of a store whose meshes have times.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
+        truth: Family of the true surface at the same times; default the study's reference.
+        family: Families to draw, by names or globs; default all that move.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: See `evolution`; or no family that moves is chosen.
+
+    >>> import sobolev_batch as sb
+    >>> ball = {"source": "icosphere", "levels": [2]}
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "carried"},
+    ...     "lattice": {"xi_max": 2.0, "M": 20},
+    ...     "norm": {"orders": [-4.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "carried", "source": "flow", "times": [0, 1, 2], "mesh": ball}],
+    ... })
+    >>> _ = sb.run(study, "memory://carried.zarr")
+    >>> ax = sb.plot_evolution("memory://carried.zarr")
+    >>> ax.get_xlabel()
+    'time'
+    """
+    return _plotted("over-time", Selection.from_store(store, order, family, truth=truth), ax)
+
+
+def plot_matrix(
+    store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None
+) -> Axes:
+    """Plot the distances of all pairs as a heat map, with similar meshes beside each other.
+
+    Colours are on a logarithmic scale; where a few distances lie far beyond the others, arrows end it. White pairs are
+    equal. Up to 300 meshes are drawn: the first ones and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on; its figure gets a colour bar too.
+        family: Families to draw beside the reference, by names or globs; default all.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order or a family, or has distances to the reference alone.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_matrix("storage/icosphere.zarr", order=-10)
+    >>> len(ax.get_yticklabels())
+    5
+    """
+    return _plotted("matrix", Selection.from_store(store, order, family), ax)
+
+
+def plot_map(store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None) -> Axes:
+    """Plot the meshes as points of a plane whose distances approximate the Sobolev distances.
+
+    The plane shows most of the meshes' variance (classical scaling); distances in it are never larger than the true
+    ones. Up to 300 meshes are drawn: the first ones and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on.
+        family: Families to draw beside the reference, by names or globs; default all.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order or a family, or has distances to the reference alone.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_map("storage/icosphere.zarr", order=-10)
+    >>> [text.get_text() for text in ax.figure.legends[0].get_texts()]
+    ['icosphere', 'reference']
+    """
+    return _plotted("map", Selection.from_store(store, order, family), ax)
+
+
+def plot_spectrum(
+    store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None
+) -> Axes:
+    """Plot the fractions of each mesh's squared distance to the reference by wavelength, as a heat map.
+
+    The field of each mesh is read; up to 24 meshes are drawn, evenly through each family. The title says so.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: One of the store's orders; default its first.
+        ax: Axes to draw on; its figure gets a colour bar too.
+        family: Families to draw, by names or globs; default all.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks the order or a family, or has no mesh to compare.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_spectrum("storage/icosphere.zarr", order=-10)
+    >>> [text.get_text() for text in ax.get_yticklabels()]
+    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3']
+    """
+    return _plotted("spectrum", Selection.from_store(store, order, family), ax)
+
+
+def plot_energy(store: AnyStore, ax: Axes | None = None, *, family: Families = None) -> Axes:
+    """Plot the energy of each mesh's difference from the reference by wavelength, as a fraction of its limit.
+
+    The energy is ∫_{|ξ|=r} |a^ - b^|² dS. For large |ξ| it tends to twice the area of both surfaces, if no parts of
+    them coincide. A mesh agrees with the reference at the wavelengths where its line is far below 1. Where the line
+    reaches 1, they have nothing in common. Both axes are logarithmic, and long wavelengths are on the left. Bars show
+    standard errors. The field of each mesh is read; up to 24 meshes are drawn, evenly through each family. The title
+    says so.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        ax: Axes to draw on.
+        family: Families to draw, by names or globs; default all.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks a family, or has no mesh to compare.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_energy("storage/icosphere.zarr")
+    >>> [text.get_text() for text in ax.figure.legends[0].get_texts()]
+    ['limit', 'icosphere']
+    """
+    return _plotted("energy", Selection.from_store(store, None, family), ax)
+
+
+def plot_transform(store: AnyStore, family: Families = None, ax: Axes | None = None) -> Axes:
+    """Plot the real part of Fourier fields along the positive ξ_x axis, for some meshes and the reference.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        family: Families of meshes, by names or globs, of which up to five are drawn; default the first family that has
+            any.
+        ax: Axes to draw on.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: The store has no tables yet, lacks a family, or has no computed mesh of it.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> ax = sb.plot_transform("storage/icosphere.zarr")
+    >>> [line.get_label() for line in ax.lines]
+    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3', 'reference']
+    """
+    selection = Selection.from_store(store, None, family)
+    members = list(computed_members(selection))
+    if not members:
+        known = computed_members(Selection.from_store(selection.tree))
+        raise InputError(f"no mesh of the family is computed, only of: {', '.join(known) or 'none'}")
+    with fields_read(store):
+        return PLOTS["transform"].on(ax, selection, members[:1] if family is None else members)
+
+
+def plot_league(league: League, ax: Axes | None = None) -> Axes:
+    """Plot the mean relative distance of each method of a league against the mean size of its meshes.
+
+    The points are geometric means over the objects: of the coarsest meshes, of the next ones, and so on. Bars show the
+    errors of the distances. Both axes are logarithmic.
+
+    Args:
+        league: League at one order, see `league`.
+        ax: Axes to draw on.
+
+    Returns:
+        The axes.
+
+    >>> import sobolev_batch as sb
+    >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> ax = sb.plot_league(at_order)
+    >>> ax.get_xlabel()
+    'number of triangles'
+    """
+    return LEAGUE.on(ax, [league], league)

@@ -1,23 +1,26 @@
-"""Axes, colours, labels and error bars that all plots share."""
+"""What all plots share: colours, titles, legends, error bars, panels, and files of a format and size."""
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
 
+import matplotlib as mpl
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.tables.formatting import middle_cut
-from sobolev_batch.results.tables.groups import families_of
+from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.visible import visible
 
 Reals = NDArray[np.float64]
@@ -25,6 +28,8 @@ Reals = NDArray[np.float64]
 Size = tuple[float, float]
 # Layouts that leave room for labels and legends; the latter is for axes of a fixed aspect, such as images.
 Layout = Literal["constrained", "compressed"]
+PictureFormat = Literal["png", "svg", "pdf"]
+Subject = TypeVar("Subject")
 
 WIDTH_INCHES = 6.4
 # Arrows of a colour bar by whether values lie below it and above it.
@@ -34,11 +39,24 @@ _COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#7
 _MARKERS = "osD^vPX"
 _DASHES = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1)))
 _LONGEST_LABEL = 24
-_LOW_INCHES = 2.2
+# Inches: a legend stands beside the panels of a figure of this width, else below them; sizes of a line, of a handle
+# and of a character; and the fractions of the height that it may take.
+_LEGEND_BESIDE, _LEGEND_LINE, _LEGEND_HANDLE, _LEGEND_CHARACTER = 5.0, 0.17, 0.5, 0.07
+_HIGHEST_BESIDE, _HIGHEST_BELOW = 0.9, 0.4
 # An error bar makes the axis no longer than this below its value, as a fraction of it; the rest is cut off.
 _SHOWN_OF_BARS = 0.25
 # No logarithmic axis of a plot reaches this fraction of a value.
 _OUT_OF_SIGHT = 1e-30
+_NUMBER = r"(\d+\.?\d*|\.\d+)"
+_PER_INCH = {"in": 1.0, "cm": 2.54, "mm": 25.4}
+_SMALLEST_INCHES, _LARGEST_INCHES = 1.0, 40.0
+# Dots per inch: of a PNG for screens, and of one for paper, where a size is asked for, and of images in PDF and SVG.
+_SCREEN_DPI, _PAPER_DPI = 150, 300
+# Points; figures narrower than a page have the smaller one.
+_FONT_SIZE, _SMALL_FONT_SIZE = 10.0, 8.0
+# Journals ask for fonts embedded as TrueType. Without a salt, the ids in an SVG are random.
+_SAVING: dict[Any, Any] = {"pdf.fonttype": 42, "svg.hashsalt": "sobolev-batch"}
+_METADATA: Mapping[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 
 @dataclass(frozen=True)
@@ -50,9 +68,80 @@ class Style:
     dashes: str | tuple[int, tuple[float, ...]]
 
 
-def new_axes(height_inches: float, layout: Layout = "constrained") -> Axes:
-    """Return axes in a figure of their own, which pyplot does not know."""
-    return Figure(figsize=(WIDTH_INCHES, height_inches), layout=layout).subplots()
+def style_of(i: int) -> Style:
+    """Return the style of the i-th family."""
+    turn = i // len(_COLORS)
+    return Style(_COLORS[i % len(_COLORS)], _MARKERS[(i + turn) % len(_MARKERS)], _DASHES[turn % len(_DASHES)])
+
+
+@dataclass(frozen=True)
+class Plot(Generic[Subject]):
+    """A kind of plot, which has a panel for each item of a subject.
+
+    Attributes:
+        draw: Function that draws an item of the subject on axes.
+        items: Function that returns the items, such as orders; none where the subject has nothing to draw.
+        height: Height of a panel in inches.
+        text: Alternative text of a picture.
+        layout: Layout of the figure.
+    """
+
+    draw: Callable[[Subject, Any, Axes], None]
+    items: Callable[[Subject], Sequence[Any]]
+    height: float
+    text: str
+    layout: Layout = "constrained"
+
+    def figure(self, subject: Subject, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:
+        """Return a figure with a panel for each item, below each other, and one legend.
+
+        Args:
+            subject: What is drawn.
+            items: Items to draw; default all.
+            size: Width and height of each panel in inches instead of its own.
+        """
+        items = self.items(subject) if items is None else items
+        width, height = size or (WIDTH_INCHES, self.height)
+        figure = Figure(figsize=(width, height * len(items)), layout=self.layout)
+        for item, axes in zip(items, figure.subplots(len(items), 1, squeeze=False)[:, 0], strict=True):
+            self.draw(subject, item, axes)
+        _add_legend(figure)
+        return figure
+
+    def on(self, axes: Axes | None, subject: Subject, item: Any) -> Axes:
+        """Draw one item on axes with a legend within them, or on axes of a new figure, and return the axes."""
+        if axes is None:
+            return self.figure(subject, [item]).axes[0]
+        self.draw(subject, item, axes)
+        if axes.get_legend() is None and axes.get_legend_handles_labels()[1]:
+            axes.legend(fontsize="small")
+        return axes
+
+
+def _add_legend(figure: Figure) -> None:
+    """Add one legend for all panels that have none, with as many entries as there is room for."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        if axes.get_legend() is None:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                entries.setdefault(label, handle)
+    if not entries:
+        return
+    width, height = figure.get_size_inches()
+    lines = int(_HIGHEST_BESIDE * height / _LEGEND_LINE)
+    is_beside = width >= _LEGEND_BESIDE and len(entries) <= lines
+    column = _LEGEND_HANDLE + _LEGEND_CHARACTER * max(map(len, entries))
+    columns = 1 if is_beside else max(1, int(width / column))
+    most = lines if is_beside else max(2, columns * int(_HIGHEST_BELOW * height / _LEGEND_LINE))
+    if len(entries) > most:
+        kept = list(entries.items())[: most - 1]
+        entries = {**dict(kept), f"and {len(entries) - len(kept)} more": Line2D([], [], linestyle="none")}
+    place: Literal["outside right upper", "outside lower center"] = (
+        "outside right upper" if is_beside else "outside lower center"
+    )
+    figure.legend(
+        list(entries.values()), list(entries), loc=place, ncols=columns, fontsize="small", frameon=False
+    )  # fmt: skip
 
 
 def hide_frame(axes: Axes) -> None:
@@ -61,33 +150,21 @@ def hide_frame(axes: Axes) -> None:
     axes.spines[:].set_visible(False)
 
 
-def figure_of(axes: Axes) -> Figure:
-    """Return the figure of axes, which may lie in a part of it."""
-    figure = axes.figure
-    return figure.figure if isinstance(figure, SubFigure) else figure
-
-
 def inches(axes: Axes) -> Size:
     """Return width and height of axes, before labels and legends take their part."""
-    place, box, dpi = axes.get_position(original=True), axes.figure.bbox, figure_of(axes).dpi
-    return float(place.width * box.width / dpi), float(place.height * box.height / dpi)
+    figure = axes.figure.figure if isinstance(axes.figure, SubFigure) else axes.figure
+    place, box = axes.get_position(original=True), axes.figure.bbox
+    return float(place.width * box.width / figure.dpi), float(place.height * box.height / figure.dpi)
 
 
-def vertical_label(axes: Axes, label: str) -> str:
-    """Return a label of the vertical axis, on two lines where the axes are too low for one."""
-    if inches(axes)[1] >= _LOW_INCHES:
-        return label
-    spaces = [i for i, character in enumerate(label) if character == " "]
-    middle = min(spaces, key=lambda i: abs(i - len(label) / 2))
-    return f"{label[:middle]}\n{label[middle + 1 :]}"
-
-
-@contextmanager
-def missing_glyphs_allowed() -> Iterator[None]:
-    """Draw characters that the font lacks as boxes, without a warning."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        yield
+def set_log_scale(axes: Axes, names: Literal["x", "y", "xy"]) -> None:
+    """Make axes logarithmic, with small labels between powers of ten, and a grid."""
+    for name in names:
+        axes.set(**{f"{name}scale": "log"})
+        axes.tick_params(axis=name, which="both", labelsize="small")  # type: ignore[arg-type]
+    # Labels of less than a decade would overlap.
+    axes.tick_params(axis="x", which="minor", labelsize="xx-small")
+    axes.grid(visible=True, which="major", alpha=0.3)
 
 
 def set_title(axes: Axes, title: str, *notes: str) -> None:
@@ -111,23 +188,90 @@ def shortened(label: str, longest: int = _LONGEST_LABEL) -> str:
     return escaped(middle_cut(visible(label), longest))
 
 
-def family_styles(tree: xr.DataTree) -> Mapping[str, Style]:
-    """Return the style of each family of the study, whichever of them are drawn."""
-    return {family: style_of(i) for i, family in enumerate(dict.fromkeys(families_of(tree).values()))}
-
-
-def style_of(i: int) -> Style:
-    """Return the style of the i-th family."""
-    turn = i // len(_COLORS)
-    return Style(_COLORS[i % len(_COLORS)], _MARKERS[(i + turn) % len(_MARKERS)], _DASHES[turn % len(_DASHES)])
-
-
-def draw_error_bars(axes: Axes, places: Reals, values: Reals, errors: Reals, color: str) -> None:
-    """Draw error bars on a logarithmic axis, which they do not stretch: one that ends near zero is cut off."""
+def draw_curve(
+    axes: Axes, places: Reals, values: Reals, errors: Reals, style: Style, label: str, *, is_joined: bool = True
+) -> None:
+    """Draw the values of a family with error bars, on a logarithmic axis which the bars do not stretch."""
+    axes.plot(
+        places,
+        values,
+        marker=style.marker,
+        linestyle=style.dashes if is_joined else "none",
+        color=style.color,
+        label=label,
+        markersize=4,
+        linewidth=1.2,
+    )
     known = np.nan_to_num(errors)
+    # A bar that ends near zero is cut off.
     low, high = np.maximum(values - known, _OUT_OF_SIGHT * values), values + known
     bars = np.stack([np.column_stack([places, low]), np.column_stack([places, high])], axis=1)
-    axes.add_collection(LineCollection(list(bars), colors=color, linewidths=0.8), autolim=False)
+    axes.add_collection(LineCollection(list(bars), colors=style.color, linewidths=0.8), autolim=False)
     seen = np.concatenate([np.maximum(low, _SHOWN_OF_BARS * values), high])
     axes.update_datalim(np.column_stack([np.tile(places, 2), seen]))
     axes.autoscale_view()
+
+
+@dataclass(frozen=True)
+class Output:
+    """Formats and size of pictures.
+
+    Attributes:
+        formats: Formats of each picture.
+        size: Width and height of each panel in inches; default those of the plots.
+    """
+
+    formats: tuple[PictureFormat, ...] = ("png",)
+    size: Size | None = None
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Draw and save with text that can be read at this size, and edited in an SVG; nothing stays set afterwards."""
+        is_narrow = self.size is not None and self.size[0] < _LEGEND_BESIDE
+        settings: dict[Any, Any] = {"font.size": _SMALL_FONT_SIZE if is_narrow else _FONT_SIZE, "svg.fonttype": "none"}
+        with mpl.rc_context(settings):
+            yield
+
+    def write(self, figures: Mapping[str, Figure], folder: str | Path) -> tuple[Path, ...]:
+        """Write figures into a folder by their file names without suffix, and return the paths.
+
+        Raises:
+            StoreError: The folder cannot be written.
+        """
+        folder, paths = Path(folder), []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for stem, figure in figures.items():
+                for style in self.formats:
+                    dpi = _SCREEN_DPI if style == "png" and self.size is None else _PAPER_DPI
+                    paths.append(folder / f"{stem}.{style}")
+                    with self.drawing():
+                        save(figure, paths[-1], style, dpi)
+        except OSError as error:
+            raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
+        return tuple(paths)
+
+
+def save(figure: Figure, target: object, style: PictureFormat, dpi: int = _SCREEN_DPI) -> None:
+    """Write a figure without a date; characters that its font lacks become boxes."""
+    with warnings.catch_warnings(), mpl.rc_context(_SAVING):
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        figure.savefig(target, format=style, dpi=dpi, metadata=_METADATA[style])  # type: ignore[arg-type]
+
+
+def parse_size(text: str) -> Size:
+    """Return a size in inches from a text such as "8.4x6cm", "84x60mm" or "3.3x2.4in".
+
+    Raises:
+        InputError: It is no size, or below 1 or above 40 inches.
+
+    >>> parse_size("3.3x2.4in"), parse_size("25.4x50.8mm")
+    ((3.3, 2.4), (1.0, 2.0))
+    """
+    match = re.fullmatch(rf"\s*{_NUMBER}\s*[x×]\s*{_NUMBER}\s*(in|cm|mm)?\s*", text)
+    if match is None:
+        raise InputError(f"a size is WIDTHxHEIGHT in in, cm or mm, such as 8.4x6cm; found {quoted(text)}")
+    width, height = (float(number) / _PER_INCH[match[3] or "in"] for number in match.groups()[:2])
+    if not all(_SMALLEST_INCHES <= side <= _LARGEST_INCHES for side in (width, height)):
+        raise InputError(f"a picture is 1 to 40 inches wide and high, found {width:.3g} x {height:.3g} inches")
+    return width, height

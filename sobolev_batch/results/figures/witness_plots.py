@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -15,22 +14,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.pictures import Output, write_figures
-from sobolev_batch.results.figures.plots import Selection
+from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import (
     EXTENDS,
     WIDTH_INCHES,
+    Output,
     Size,
     escaped,
-    new_axes,
     set_title,
     shortened,
 )
 from sobolev_batch.results.meshes.render import Pictures, color_limits, render
-from sobolev_batch.results.meshes.viewpoint import COVERED_AREA, best_viewpoint
-from sobolev_batch.results.meshes.views import PICTURES, Axis, MeshView, make_views
+from sobolev_batch.results.meshes.views import COVERED_AREA, FRONT, PICTURES, Axis, MeshView, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
-from sobolev_batch.results.tables.groups import chosen_order, chosen_orders, finished_group
+from sobolev_batch.results.tables.groups import chosen_order, finished_group
 from sobolev_batch.surfaces.sources.names import file_stem
 
 _HEIGHT_INCHES = 5.0
@@ -53,7 +50,7 @@ def plot_witness(
     """Plot a mesh coloured by its witness function: red where it has area that the reference lacks, else blue.
 
     The study makes the mesh again, and VTK draws it; this needs the extra "vtk". It is seen from the front and above,
-    or from another side if that shows far more of the worst places; the title says which. Where a few values are far
+    or from the side of the worst places if these are hidden there; then the title says so. Where a few values are far
     larger than all others, the colours end below them: the colour bar has arrows, with at most 1 % of the area beyond.
 
     Args:
@@ -85,7 +82,7 @@ def plot_witness(
         raise InputError(f"{label}: {reason}")
     (view,) = made.views
     ((picture,),) = render([view], 1)
-    axes = ax or new_axes(_HEIGHT_INCHES)
+    axes = ax or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
     axes.set_axis_off()
     axes.imshow(picture)
     set_title(axes, escaped(mesh), _seen(view))
@@ -94,26 +91,24 @@ def plot_witness(
 
 
 def write_witness_plots(
-    tree: xr.DataTree,
+    selection: Selection,
     output_folder: str | Path,
     folder: str | Path = ".",
     meshes: Sequence[str] = (),
     up: Axis = "z",
-    selection: Selection | None = None,
     output: Output | None = None,
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder.
 
-    Each mesh gets a file witness-* with colours and a viewpoint of its own; several also stand beside each other in
-    the file witness, from one viewpoint and on one scale of colours, at the first order.
+    Each mesh gets a file witness-* with colours and a view of its own; several also stand beside each other in the
+    file witness, seen from the front and on one scale of colours, at the first order.
 
     Args:
-        tree: Open store with tables.
+        selection: Store, orders, and families to choose from.
         output_folder: Folder of the pictures.
         folder: Folder where relative paths in the study start.
         meshes: Labels, or patterns such as "scans/*"; by default those that `make_views` chooses.
         up: Axis that points upwards in the meshes' own coordinates.
-        selection: Orders, and families to choose from.
         output: Formats and size of the pictures.
 
     Returns:
@@ -123,11 +118,10 @@ def write_witness_plots(
         InputError: A label, order or family is unknown, or too many meshes are named.
         StoreError: The folder cannot be written.
     """
-    selection, output = selection or Selection(), output or Output()
-    orders = chosen_orders(finished_group(tree, "convergence"), selection.order)
-    made = make_views(tree, folder, meshes, PICTURES, up, orders, selection.family)
+    tree, output = selection.tree, output or Output()
+    made = make_views(tree, folder, meshes, PICTURES, up, selection.orders, selection.families)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
-    compared = _seen_alike(made.views[:_MOST_MESHES])
+    compared = [replace(view, eye=FRONT) for view in made.views[:_MOST_MESHES]]
     try:
         rendered = render(made.views, MOST_ORDERS)
         on_one_scale = render(compared, 1, common=True) if len(compared) > 1 else []
@@ -141,7 +135,7 @@ def write_witness_plots(
         if on_one_scale:
             pictures = [one_order for (one_order, *_) in on_one_scale]
             figures["witness"] = _comparison_figure(compared, pictures, len(made.views), output.size)
-    return write_figures(figures, Path(output_folder), output), made.missing
+    return output.write(figures, output_folder), made.missing
 
 
 def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:
@@ -165,16 +159,7 @@ def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None)
 
 
 def _seen(view: MeshView) -> str:
-    return str(view.viewpoint) and f"view {view.viewpoint}"
-
-
-def _seen_alike(views: Sequence[MeshView]) -> list[MeshView]:
-    """Return the views from the one side that shows most of the places which are worst at the first order."""
-    if not views:
-        return []
-    limits = color_limits(views, common=True)[0][:1]
-    viewpoint = best_viewpoint(np.sum([view.seen_of_worst(limits) for view in views], axis=0))
-    return [replace(view, viewpoint=viewpoint) for view in views]
+    return "" if np.array_equal(view.eye, FRONT) else "seen from the side of the largest values"
 
 
 def _comparison_figure(
@@ -184,9 +169,8 @@ def _comparison_figure(
     columns = min(_PANELS_IN_A_ROW, len(views))
     rows = -(-len(views) // columns)
     omission = f"{len(views)} of {total} meshes" if len(views) < total else ""
-    notes = ", ".join(filter(None, (omission, _seen(views[0]))))
     tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
-    own_size = (WIDTH_INCHES, 0.8 + 0.3 * bool(notes) + rows * (0.3 + tallest * WIDTH_INCHES / columns))
+    own_size = (WIDTH_INCHES, 0.8 + 0.3 * bool(omission) + rows * (0.3 + tallest * WIDTH_INCHES / columns))
     figure = Figure(figsize=size or own_size, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False)
     for axes in panels.ravel():
@@ -194,8 +178,8 @@ def _comparison_figure(
     for axes, view, picture in zip(panels.ravel(), views, pictures, strict=False):
         axes.imshow(picture)
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
-    if notes:
-        figure.suptitle(notes, fontsize="medium")
+    if omission:
+        figure.suptitle(omission, fontsize="medium")
     _add_colorbar(figure, panels, views, color_limits(views, common=True)[0][0], 0)
     return figure
 

@@ -37,7 +37,7 @@ def render(
     program: Path = _PROGRAM,
     timeout_seconds: float = 300.0,
 ) -> list[Pictures]:
-    """Draw each mesh from its viewpoint, once for each of its first orders.
+    """Draw each mesh from the side of its eye, once for each of its first orders.
 
     Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" between plus and
     minus `color_limits`.
@@ -64,7 +64,7 @@ def render(
     for i, (view, limits) in enumerate(zip(views, color_limits(views, common), strict=True)):
         scene |= {
             f"limits_{i}": limits[:orders],
-            f"eye_{i}": view.viewpoint.direction,
+            f"eye_{i}": view.eye,
             f"vertices_{i}": view.vertices,
             f"triangles_{i}": view.triangles,
             f"values_{i}": view.values[:orders],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import fast_simplification
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.meshes.rebuild import MeshRebuilder, matching_labels
-from sobolev_batch.results.meshes.viewpoint import FRONT, Viewpoint, best_viewpoint, color_limit, seen_of_worst
 from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group, reference_of
@@ -26,6 +25,16 @@ Triangles = NDArray[np.int32]
 
 Axis = Literal["x", "y", "z"]
 _AXES: tuple[Axis, ...] = get_args(Axis)
+
+# Unit vector to the viewer of the usual view, with the third axis upwards.
+FRONT: Reals = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
+# Colours cover this fraction of the area, and all of it unless the largest value exceeds the others by the factor.
+COVERED_AREA, _OUTLYING = 0.99, 1.25
+# Places count by this power of their values: the worst ones alone decide.
+_POWER = 4
+# The worst places face one way if the mean of their normals is as long, and the usual view shows them if the cosine
+# between both is as large. A view is not steeper than this height of the unit vector.
+_ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
 
 # Of a store, unless meshes are named.
 _MOST_EXTREMES = 4
@@ -68,7 +77,7 @@ class MeshView:
         orders: Orders s.
         original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
             and more where it subdivides them.
-        viewpoint: Side from which pictures show it.
+        eye: Unit vector (3,) to the viewer of pictures.
     """
 
     label: str
@@ -77,16 +86,50 @@ class MeshView:
     values: Reals
     orders: tuple[float, ...]
     original_triangles: int
-    viewpoint: Viewpoint = FRONT
+    eye: Reals = field(default_factory=FRONT.copy)
 
     @property
     def color_limits(self) -> Reals:
-        """Ends (orders,) of scales of colours on which a few outliers do not make the rest white."""
-        return np.array([color_limit(self.vertices, self.triangles, values) for values in self.values])
+        """Ends (orders,) of scales of colours on which a few outliers do not make the rest white.
 
-    def seen_of_worst(self, limits: Reals) -> Reals:
-        """Return how much of the places with the strongest colours each viewpoint shows; see `best_viewpoint`."""
-        return seen_of_worst(self.vertices, self.triangles, self.values[: len(limits)], limits)
+        The modulus that is not exceeded on 99 % of the area, or the largest one if that is hardly larger; 1 for zeros.
+        """
+        # A third of each triangle belongs to each of its corners.
+        areas = np.repeat(np.linalg.norm(self._normals, axis=1), 3)
+        areas = np.bincount(self.triangles.ravel(), areas, minlength=len(self.vertices))
+        limits = []
+        for moduli in np.abs(self.values):
+            order = np.argsort(moduli)
+            below = np.cumsum(areas[order])
+            covering = moduli[order][min(np.searchsorted(below, COVERED_AREA * below[-1]), len(order) - 1)]
+            largest = moduli.max()
+            limits.append(largest if largest <= _OUTLYING * covering or covering == 0 else covering)
+        return np.array([float(limit) or 1.0 for limit in limits])
+
+    def towards_worst(self) -> Self:
+        """Return the view from the side of the worst places at the first order, if the usual view hides them."""
+        strength = (np.minimum(np.abs(self.values[0]) / self.color_limits[0], 1.0) ** _POWER)[self.triangles].mean(
+            axis=1
+        )
+        # The orientation of triangles is not to be trusted: away from the middle of the mesh.
+        middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+        outwards = np.einsum("ij,ij->i", self._normals, self.vertices[self.triangles].mean(axis=1) - middle)
+        facing = strength @ (self._normals * np.where(outwards < 0, -1, 1)[:, None])
+        total = strength @ np.linalg.norm(self._normals, axis=1)
+        length = float(np.linalg.norm(facing))
+        if length <= _ONE_WAY * total or facing @ FRONT >= _SHOWN * length:
+            return self
+        eye = facing / length
+        level = np.hypot(*eye[:2]) or 1.0
+        height = float(np.clip(eye[2], -_STEEPEST, _STEEPEST))
+        sideways = eye[:2] / level if np.hypot(*eye[:2]) > 1e-6 else FRONT[:2] / np.hypot(*FRONT[:2])
+        return replace(self, eye=np.append(sideways * np.sqrt(1 - height**2), height))
+
+    @property
+    def _normals(self) -> Reals:
+        """Normals (m, 3) of the triangles, whose lengths are twice the areas."""
+        first, second, third = (self.vertices[self.triangles[:, k]] for k in range(3))
+        return np.asarray(np.cross(second - first, third - first))
 
 
 @dataclass(frozen=True)
@@ -170,8 +213,7 @@ def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], 
         values = witness_at(tree, label, orders, vertices, dtype="complex64")
     # A cyclic permutation of the axes, which does not mirror the mesh.
     upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
-    view = MeshView(label, upright, triangles, values, orders, len(corners))
-    return replace(view, viewpoint=best_viewpoint(view.seen_of_worst(view.color_limits)))
+    return MeshView(label, upright, triangles, values, orders, len(corners)).towards_worst()
 
 
 def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:

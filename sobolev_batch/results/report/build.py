@@ -19,7 +19,7 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.meshes.views import Axis, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, location_of, require_unchanged
 from sobolev_batch.results.report.charts import chart_data, chart_omissions, league_data
@@ -166,11 +166,12 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
 
     tree = as_tree(store)
     content = Content.of(tree, Status.of(store), limits)
+    selection = Selection.from_store(tree, most_spectra=limits.spectra)
+    spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
-        spectra = Spectra.of(tree, most=limits.spectra)
         views = make_views(tree, folder, witnesses, up=up)
     charts = chart_data(tree, spectra, views, limits)
-    pictures = study_pictures(tree, spectra, views)
+    pictures = study_pictures(selection, views)
     text = _filled("study", content, charts, spectra=spectra, views=views, pictures=pictures)
     require_unchanged(tree)
     return Page(text, (*content.omissions, *chart_omissions(tree, charts, spectra, views), *unpictured(tree, pictures)))

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.results.figures.embedding import Embedding, clustered_order
-from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.figures.convergence_plots import bars_of, mean_curve
+from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
+from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.league.curves import Curve
 from sobolev_batch.results.league.league import League
-from sobolev_batch.results.league.plot import bars_of, mean_curve
 from sobolev_batch.results.meshes.views import MeshView, Views
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.tables.convergence import table
@@ -157,7 +157,7 @@ def _matrices(tree: xr.DataTree, orders: list[float], limits: ReportLimits) -> J
 
 
 def _matrix(matrix: Matrix) -> Json:
-    embedding = Embedding.of(matrix.values)
+    embedding = Embedding.from_distances(matrix.values)
     return {
         "values": [_numbers(row[:i]) for i, row in enumerate(matrix.values)],
         "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(matrix.errors)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sobolev_batch.results.figures.pair_plots import MOST_MESHES
-from sobolev_batch.results.figures.spectra import MOST_MESHES as MOST_SPECTRA
+from sobolev_batch.results.figures.selection import MOST_MESHES as MOST_SPECTRA
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import xarray as xr
@@ -12,17 +12,15 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.convergence_plots import convergence_figure, evolution_figure
-from sobolev_batch.results.figures.pair_plots import has_pairs, map_figure, matrix_figure
-from sobolev_batch.results.figures.pictures import save
-from sobolev_batch.results.figures.spectra import Spectra
-from sobolev_batch.results.figures.spectrum_plots import energy_figure, spectrum_figure
+from sobolev_batch.results.figures.convergence_plots import LEAGUE
+from sobolev_batch.results.figures.plots import PLOTS
+from sobolev_batch.results.figures.selection import Selection
+from sobolev_batch.results.figures.style import save
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
 from sobolev_batch.results.league.league import League
-from sobolev_batch.results.league.plot import league_figure
 from sobolev_batch.results.meshes.render import render
 from sobolev_batch.results.meshes.views import Views
-from sobolev_batch.results.tables.groups import finished_group, has_times
+from sobolev_batch.results.tables.groups import finished_group
 
 # Orders that printed pictures show; more would make the page heavy.
 MOST_PICTURED_ORDERS = 6
@@ -46,37 +44,23 @@ class Picture:
 Pictures = dict[str, list[Picture]]
 
 
-def study_pictures(tree: xr.DataTree, spectra: Spectra | None, views: Views) -> Pictures:
+def study_pictures(selection: Selection, views: Views) -> Pictures:
     """Return the pictures of an open store, by the chart that they stand for."""
-    orders = finished_group(tree, "convergence")["order"].values.tolist()[:MOST_PICTURED_ORDERS]
-
-    def one_for_each_order(text: str, draw: Callable[[Sequence[float]], Figure]) -> list[Picture]:
-        return [Picture(_data_url(draw([order])), f"{text}, order {order:g}") for order in orders]
-
     pictures = {
-        "convergence": one_for_each_order(
-            "Relative distance over mean edge length", lambda orders: convergence_figure(tree, orders)
-        ),
-        "evolution": [],
-        "matrix": [],
-        "map": [],
-        "spectrum": [],
-        "energy": [],
-        "witness": _witness_pictures(views),
-    }
-    if has_times(tree):
-        pictures["evolution"] = one_for_each_order("Distance over time", lambda orders: evolution_figure(tree, orders))
-    if has_pairs(tree):
-        pictures["matrix"] = one_for_each_order("Distances of all pairs", lambda orders: matrix_figure(tree, orders))
-        pictures["map"] = one_for_each_order("Map of the meshes", lambda orders: map_figure(tree, orders))
-    if spectra is not None:
-        pictures["spectrum"] = one_for_each_order(
-            "Squared distance by wavelength", lambda orders: spectrum_figure(spectra, orders)
-        )
-        pictures["energy"] = [
-            Picture(_data_url(energy_figure(tree, spectra)), "Energy of the differences by wavelength")
+        name: [
+            Picture(
+                _data_url(plot.figure(selection, [item])), plot.text + ("" if item is None else f", order {item:g}")
+            )
+            for item in plot.items(selection)[:MOST_PICTURED_ORDERS]
         ]
-    return pictures
+        for name, plot in PLOTS.items()
+        if name != "transform"
+    }
+    return {**pictures, "witness": _witness_pictures(views)}
+
+
+def _text(text: str, order: float | None) -> str:
+    return text if order is None else f"{text}, order {order:g}"
 
 
 def unpictured(tree: xr.DataTree, pictures: Pictures) -> Iterator[str]:
@@ -91,7 +75,7 @@ def league_pictures(leagues: Sequence[League]) -> Pictures:
     """Return a picture of the league of each order."""
     return {
         "league": [
-            Picture(_data_url(league_figure([one])), f"Mean relative distance by method, order {one.order:g}")
+            Picture(_data_url(LEAGUE.figure(leagues, [one])), f"{LEAGUE.text}, order {one.order:g}")
             for one in leagues[:MOST_PICTURED_ORDERS]
         ]
     }

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import pandas as pd
 
-from sobolev_batch.results.figures.spectra import spread
+from sobolev_batch.results.figures.selection import spread
 from sobolev_batch.results.report.cells import Body, Cell, Heading, PageTable, TableRow
 from sobolev_batch.results.tables.convergence import nearest
 from sobolev_batch.results.tables.formatting import Digits, minus

@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.convergence_plots import convergence_figure
+from sobolev_batch.results.figures.plots import PLOTS
+from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import notes_of
 
 
@@ -17,7 +18,7 @@ def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTr
     axes = sb.plot_convergence(tree)
     assert axes.get_title() == "order -10\nnot drawn: 1 not computed"
     assert sb.plot_convergence(tree, -2.5).get_title().startswith("order -2.5\n")
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
+    labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert labels == ["f_1", "slope 2"]
     data = axes.lines[0].get_xydata()
     assert np.allclose(data, [[0.1, 0.025], [0.2, 0.1]])
@@ -67,9 +68,7 @@ def changed(tree: xr.DataTree, **values: list[float]) -> xr.DataTree:
 def test_distances_below_their_errors_are_hollow_and_stretch_no_axis(tree: xr.DataTree) -> None:
     unsure = changed(tree, relative_error=[1e-3, 0.2, np.nan, 0.0], resolved=[1, 0, 0, 1])
     axes = sb.plot_convergence(unsure)
-    legend = axes.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["f_1", "slope 2", "not above its error"]
+    assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == ["f_1", "slope 2", "not above its error"]
     hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and np.size(line.get_xydata())]
     assert [np.asarray(line.get_xydata()).tolist() for line in hollow] == [[[0.1, 0.025]]]
     assert axes.get_ylim()[0] > 0.025 / 10
@@ -77,7 +76,7 @@ def test_distances_below_their_errors_are_hollow_and_stretch_no_axis(tree: xr.Da
 
 
 def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
-    figure = convergence_figure(changed(tree, relative=[0.0, 0.0, np.nan, 0.0]), [-10.0, -2.5])
+    figure = PLOTS["convergence"].figure(Selection.from_store(changed(tree, relative=[0.0, 0.0, np.nan, 0.0])))
     assert notes_of(figure) == ["not drawn: 1 not computed, 2 equal to the reference", "families not drawn: f_1"]
     assert [axes.get_title().split("\n")[0] for axes in figure.axes] == ["order -10", "order -2.5"]
     nameless = sb.plot_convergence(tree, x="triangles", family="f?1")

@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.pair_plots import map_figure, matrix_figure
+from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
 
 
 def store_of(points: np.ndarray) -> xr.DataTree:
@@ -30,25 +30,10 @@ def store_of(points: np.ndarray) -> xr.DataTree:
     return xr.DataTree.from_dict({"/meshes": meshes, "/distances": pairs, "/convergence": convergence})
 
 
-@pytest.mark.slow
-def test_names_on_a_map_hide_nothing() -> None:
-    tree = store_of(np.random.default_rng(5).normal(size=(60, 2)))
-    for size in ((6.4, 4.4), (3.3, 2.4)):
-        figure = map_figure(tree, [-2.0], size=size)
-        figure.draw_without_rendering()
-        (axes,) = figure.axes
-        boxes = [name.get_window_extent() for name in axes.texts]
-        assert len(boxes) > 5
-        assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
-        places = axes.transData.transform(np.concatenate([line.get_xydata() for line in axes.lines]))
-        assert not any(box.contains(*place) for box in boxes for place in places)
-        assert all(axes.bbox.contains(*corner) for box in boxes for corner in (box.min, box.max))
-
-
 def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
     points = np.random.default_rng(6).normal(size=(40, 3))
     points[1] = points[2] + 1e-12
-    figure = matrix_figure(store_of(points), [-2.0])
+    figure = sb.plot_matrix(store_of(points)).figure
     image, bar = figure.axes[0].images[0], figure.axes[1]
     assert image.get_clim()[0] > 1e-3
     assert image.colorbar is not None
@@ -58,3 +43,42 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
     assert even.colorbar is not None
     assert even.colorbar.extend == "neither"
     assert even.get_clim()[1] == cdist(points[2:], points[2:]).max()
+
+
+def test_groups_stand_together() -> None:
+    places = np.array([0.0, 10.0, 0.2, 10.1, 0.1, 9.9])[:, None]
+    order = clustered_order(cdist(places, places))
+    sorted_places = places[order, 0]
+    assert (np.diff(sorted_places) > 0).all() or (np.diff(sorted_places) < 0).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_meshes(count: int) -> None:
+    places = np.arange(count, dtype=float)[:, None]
+    distances = cdist(places, places) if count else np.zeros((0, 0))
+    assert clustered_order(distances).tolist() == list(range(count))
+    assert Embedding.from_distances(distances).points.shape == (count, 2)
+
+
+def test_a_plane_is_found_again() -> None:
+    rng = np.random.default_rng(3)
+    points = np.zeros((20, 5))
+    points[:, :2] = rng.normal(size=(20, 2)) * [3, 1]
+    turn = np.linalg.qr(rng.normal(size=(5, 5)))[0]
+    distances = cdist(points @ turn, points @ turn)
+    found = Embedding.from_distances(distances)
+    assert np.allclose(cdist(found.points, found.points), distances, atol=1e-12)
+    assert found.explained == pytest.approx(1.0)
+    assert found.points[:, 0].var() >= found.points[:, 1].var()
+
+
+def test_a_map_never_exaggerates() -> None:
+    points = np.random.default_rng(4).normal(size=(15, 6))
+    distances = cdist(points, points)
+    found = Embedding.from_distances(distances)
+    assert (cdist(found.points, found.points) <= distances + 1e-12).all()
+    assert 0.3 < found.explained < 1
+
+
+def test_equal_meshes_have_no_variance() -> None:
+    assert np.isnan(Embedding.from_distances(np.zeros((4, 4))).explained)

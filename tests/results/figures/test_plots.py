@@ -1,11 +1,13 @@
-"""Plots of a store put together by hand."""
+"""Plots of a store put together by hand, their legends and their files."""
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,6 +16,8 @@ from matplotlib.figure import Figure
 
 import sobolev_batch as sb
 from sobolev_batch.results.figures.plots import write_plots
+from sobolev_batch.results.figures.selection import Selection
+from sobolev_batch.results.figures.style import Output, Plot, parse_size, set_log_scale, style_of
 
 
 def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
@@ -53,19 +57,19 @@ def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> N
     places = np.concatenate([line.get_xydata() for line in sb.plot_map(pairs, -10.0).lines])
     assert np.ptp(places[:, 0]) == pytest.approx(0.4)
     assert np.allclose(places[:, 1], 0, atol=1e-7)
-    names = [path.name for path in write_plots(pairs, tmp_path).paths]
-    assert names == ["convergence.png", "transform.png", "matrix.png", "map.png"]
+    paths, _ = write_plots(Selection.from_store(pairs), tmp_path)
+    assert [path.name for path in paths] == ["convergence.png", "transform.png", "matrix.png", "map.png"]
     alone = sb.plot_matrix(pairs, -10.0, family="_*")
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
 @pytest.mark.slow
 def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:
-    for path in write_plots(tree, tmp_path / "new" / "folder").paths:
+    for path in write_plots(Selection.from_store(tree), tmp_path / "new" / "folder")[0]:
         assert path.read_bytes().startswith(b"\x89PNG")
     (tmp_path / "file").write_text("")
     with pytest.raises(sb.StoreError, match="pictures cannot be written there"):
-        write_plots(tree, tmp_path / "file")
+        write_plots(Selection.from_store(tree), tmp_path / "file")
 
 
 @pytest.mark.process
@@ -92,3 +96,70 @@ def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
     for plot in (sb.plot_matrix, sb.plot_map):
         with pytest.raises(sb.InputError, match="distances to the reference alone; set pairs"):
             plot(alone)
+
+
+def lines(_subject: object, count: int, axes: Axes) -> None:
+    set_log_scale(axes, "xy")
+    for i in range(count):
+        axes.plot([0.3, 2], [i + 1, i + 2], label=f"family number {i}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(6.4, 3.6), (3.3, 2.4)])
+@pytest.mark.parametrize("count", [1, 8, 40])
+def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: tuple[float, float]) -> None:
+    with Output(("png",), size).drawing():
+        figure = Plot[None](lines, lambda _: (), 3.6, "").figure(None, [1, count], size)
+        figure.draw_without_rendering()
+    (legend,) = figure.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    left_out = [f"and {count - len(names) + 1} more"] if len(names) < count or "more" in names[-1] else []
+    assert names == [*(f"family number {i}" for i in range(len(names) - len(left_out))), *left_out]
+    assert len(names) >= min(count, 10)
+    box = legend.get_window_extent()
+    assert all(figure.bbox.contains(*corner) for corner in (box.min, box.max))
+    for axes in figure.axes:
+        assert axes.bbox.height > 0.4 * figure.bbox.height / 2.2
+        assert not box.overlaps(axes.get_tightbbox())  # type: ignore[arg-type]
+
+
+def test_forty_families_have_styles_of_their_own() -> None:
+    assert len({style_of(i) for i in range(49)}) == 49
+
+
+@pytest.mark.all
+def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path) -> None:
+    settings = dict(mpl.rcParams)
+    selection, output = Selection.from_store(tree), Output(("pdf", "svg", "png"))
+    written = [write_plots(selection, tmp_path / folder, output)[0] for folder in ("a", "b")]
+    assert [path.name for path in written[0]][:3] == ["convergence.pdf", "convergence.svg", "convergence.png"]
+    for one, other in zip(*written, strict=True):
+        assert one.read_bytes() == other.read_bytes(), one
+    pdf, svg, _ = (path.read_bytes() for path in written[0][:3])
+    # A TrueType font in full, which journals ask for, and no outlines in its place.
+    assert b"/FontFile2" in pdf
+    assert b"/Type3" not in pdf
+    assert b"CreationDate" not in pdf
+    assert b"<text" in svg
+    assert b"relative Sobolev distance" in svg
+    assert b"<dc:date>" not in svg
+    assert dict(mpl.rcParams) == settings
+
+
+@pytest.mark.slow
+def test_the_size_is_that_of_a_panel(tree: xr.DataTree, tmp_path: Path) -> None:
+    output = Output(("png",), parse_size("3x2in"))
+    (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path, output)
+    # The header of a PNG: two panels of 300 dots per inch.
+    assert struct.unpack(">II", path.read_bytes()[16:24]) == (900, 1200)
+
+
+@pytest.mark.parametrize("text", ["8.4x6cm", "84x60mm", "84 × 60 mm"])
+def test_sizes_in_other_units(text: str) -> None:
+    assert parse_size(text) == pytest.approx((8.4 / 2.54, 6 / 2.54))
+
+
+@pytest.mark.parametrize("text", ["6", "6x", "6x4m", "axb", "1.2.3x4", "100x100", "0x4", "5x5mm"])
+def test_wrong_sizes(text: str) -> None:
+    with pytest.raises(sb.InputError, match=r"size|inches"):
+        parse_size(text)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
+from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.witness_plots import write_witness_plots
 from sobolev_batch.results.meshes import render as rendering
 from sobolev_batch.results.meshes.render import render
@@ -97,7 +98,7 @@ def test_meshes_seen_from_their_edge_and_no_witness() -> None:
 @drawing
 def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
-    paths, _ = write_witness_plots(open_store(place), tmp_path, folder, LABELS[:2])
+    paths, _ = write_witness_plots(Selection.from_store(place), tmp_path, folder, LABELS[:2])
     assert [path.name for path in paths][-1] == "witness.png"
     assert len(paths) == 3
 
@@ -146,7 +147,7 @@ def test_plot_does_without_what_cannot_be_drawn(
     assert "No such file" in reason
     assert not list(tmp_path.glob("witness-*"))
     monkeypatch.setattr(rendering, "find_spec", lambda _: None)
-    paths, absent = write_witness_plots(open_store(place), tmp_path, folder, LABELS[:2])
+    paths, absent = write_witness_plots(Selection.from_store(place), tmp_path, folder, LABELS[:2])
     assert paths == ()
     assert list(absent) == list(LABELS[:2])
     for reason in absent.values():

@@ -22,7 +22,7 @@ from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere,
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.cli import cli
-from sobolev_batch.results.figures.spectra import Spectra
+from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.meshes.views import make_views
 from sobolev_batch.results.report import build, pictures
 from sobolev_batch.results.report.build import make_report
@@ -362,7 +362,7 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
     def damaged(*_: object, **__: object) -> None:
         raise ValueError("Stored and computed checksum do not match.")
 
-    monkeypatch.setattr(Spectra, "of", damaged)
+    monkeypatch.setattr(Spectra, "from_tree", damaged)
     with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
         make_report(store)
 

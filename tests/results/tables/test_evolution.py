@@ -187,8 +187,7 @@ def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
 
 def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
     axes = sb.plot_evolution(store, -4.0, truth="true")
-    legend = axes.get_legend()
-    assert legend is not None
+    (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
     assert axes.get_title() == "order -4"
     late = sb.plot_evolution(store, -4.0, truth="true", family="l*")

@@ -1,15 +1,19 @@
-"""Spectra of the distances of some meshes to the reference, from the stored fields."""
+"""What plots show of a store: orders, families, and the spectra of their meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.errors import InputError
+from sobolev_batch.results.figures.style import Style, style_of
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.results.tables.groups import (
     Families,
@@ -20,6 +24,7 @@ from sobolev_batch.results.tables.groups import (
     finished_group,
     reference_of,
 )
+from sobolev_batch.results.tables.sizes import EDGE_LENGTH
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.shells import Orders
 
@@ -29,6 +34,72 @@ Reals = NDArray[np.float64]
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
 MOST_MESHES = 24
 _MOST_SAMPLES = 1 << 28
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What plots show of an open store.
+
+    Attributes:
+        tree: Open store with tables.
+        orders: Orders of the norm.
+        families: Names of families.
+        x: Horizontal axis of convergence.
+        truth: Family of the true surface of meshes that move; default the reference.
+        most_spectra: Number of meshes at most in spectra.
+    """
+
+    tree: xr.DataTree
+    orders: tuple[float, ...]
+    families: tuple[str, ...]
+    x: str = EDGE_LENGTH
+    truth: str | None = None
+    most_spectra: int = MOST_MESHES
+
+    @classmethod
+    def from_store(
+        cls,
+        store: AnyStore,
+        order: Orders | None = None,
+        family: Families = None,
+        x: str = EDGE_LENGTH,
+        truth: str | None = None,
+        most_spectra: int = MOST_MESHES,
+    ) -> Self:
+        """Choose orders, and families by names or globs; by default all of a store.
+
+        Raises:
+            InputError: The store has no tables yet, or lacks an order or a family.
+        """
+        tree = as_tree(store)
+        orders = chosen_orders(finished_group(tree, "convergence"), order)
+        return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth, most_spectra)
+
+    @cached_property
+    def styles(self) -> Mapping[str, Style]:
+        """Style of each family of the study, whichever of them are drawn."""
+        return {family: style_of(i) for i, family in enumerate(dict.fromkeys(families_of(self.tree).values()))}
+
+    @cached_property
+    def spectra(self) -> Spectra:
+        """Spectra of the chosen families.
+
+        Raises:
+            InputError: The store has no mesh to compare.
+            DamageError: A field is damaged.
+        """
+        with fields_read(self.tree):
+            spectra = Spectra.from_tree(self.tree, self.orders, self.families, self.most_spectra)
+        if spectra is None:
+            raise InputError("the store has no mesh to compare: the reference or all others are not computed")
+        return spectra
+
+    @property
+    def has_spectra(self) -> bool:
+        """True if the store has a mesh to compare, of the chosen families."""
+        complete, family_of, reference = complete_meshes(self.tree), families_of(self.tree), reference_of(self.tree)
+        others = any(family_of[label] in self.families for label in complete if label != reference)
+        return "similarity" in self.tree.attrs and reference in complete and others
 
 
 @dataclass(frozen=True)
@@ -58,20 +129,19 @@ class Spectra:
     own: float
 
     @classmethod
-    def of(
-        cls, tree: xr.DataTree, order: Orders | None = None, most: int = MOST_MESHES, family: Families = None
+    def from_tree(
+        cls, tree: xr.DataTree, orders: Sequence[float], families: Sequence[str], most: int = MOST_MESHES
     ) -> Self | None:
         """Return the spectra of an open store; None where it has nothing to compare.
 
         Args:
             tree: Open store.
-            order: One of its orders, or several; default all.
+            orders: Orders of it.
+            families: Names of families.
             most: Number of meshes at most, evenly through each family.
-            family: Families, by names or globs; default all.
         """
-        orders = tuple(chosen_orders(finished_group(tree, "convergence"), order))
         reference, complete = reference_of(tree), complete_meshes(tree)
-        families, family_of = chosen_families(tree, family), families_of(tree)
+        family_of = families_of(tree)
         others = [label for label in complete if label != reference and family_of[label] in families]
         if reference not in complete or not others:
             return None
@@ -85,15 +155,15 @@ class Spectra:
         else:
             of_reference = fields.sel(mesh=reference).load()
             spectra = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
-        shares = np.stack([np.asarray(one["share"].transpose("order", "band")) for one in spectra])
+        shares = np.stack([np.asarray(bands["share"].transpose("order", "band")) for bands in spectra])
         longest, shortest = (spectra[0][name].to_numpy() for name in ("longest_wavelength", "shortest_wavelength"))
         areas = finished_group(tree, "meshes")["area"]
         limits = 2 * (areas.sel(mesh=labels).to_numpy() + areas.sel(mesh=reference).item())
-        energies = np.stack([one["energy"].to_numpy() for one in spectra]) / limits[:, None]
+        energies = np.stack([bands["energy"].to_numpy() for bands in spectra]) / limits[:, None]
         errors = np.zeros_like(energies)
         if "octaves" in tree:
-            errors = np.stack([one["energy_error"].to_numpy() for one in spectra]) / limits[:, None]
-        return cls(tuple(labels), len(others), orders, shares, longest, shortest, energies, errors, 1 / scale)
+            errors = np.stack([bands["energy_error"].to_numpy() for bands in spectra]) / limits[:, None]
+        return cls(tuple(labels), len(others), tuple(orders), shares, longest, shortest, energies, errors, 1 / scale)
 
     @property
     def omission(self) -> str:
