@@ -9,9 +9,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-import lzma
 import os
-import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -25,7 +23,6 @@ from tests.support.mesh_files import (
     BIG,
     LITTLE,
     Gltf,
-    VtkXml,
     box_scene,
     freesurfer,
     freesurfer_quads,
@@ -43,7 +40,6 @@ Attack = Callable[[Path], Path]
 
 _MEGABYTE = 1 << 20
 _INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
-_VTP = VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES)
 _GIFTI = gifti(BOX_VERTICES, _INT_TRIANGLES)
 
 
@@ -189,34 +185,6 @@ def _sparse(ending: str, start: bytes, size: int) -> Attack:
     return _special(ending, make)
 
 
-def _vtk_start(*lines: str, binary: bool = False, version: str = "4.2") -> bytes:
-    kind = "BINARY" if binary else "ASCII"
-    start = [f"# vtk DataFile Version {version}", "a box", kind, "DATASET POLYDATA", *lines]
-    return "".join(f"{line}\n" for line in start).encode()
-
-
-def _vtp_with(values: bytes, form: str = "raw", compressor: str = "zlib", name: str = "Points") -> bytes:
-    """The box with other bytes in place of an array."""
-    xml = VtkXml(form, compressor)
-    content = xml.vtp(BOX_VERTICES, BOX_TRIANGLES)
-    start = len(xml.appended)
-    xml.appended += values
-    content = xml.file("PolyData", [content.partition(b"<PolyData>\n")[2].partition(b"</PolyData>")[0].decode()])
-    return re.sub(rb'(Name="%s"[^>]*offset=")\d+' % name.encode(), rb"\g<1>%d" % start, content)
-
-
-def _vtk_blocks(count: int, size: int, last: int, packed: list[bytes]) -> bytes:
-    """An array that announces so many blocks of such a size, and has these."""
-    return struct.pack(f"<{3 + len(packed)}I", count, size, last, *map(len, packed)) + b"".join(packed)
-
-
-def _same_array(pieces: int) -> bytes:
-    """Pieces that all have one array for their points."""
-    xml = VtkXml("raw")
-    first = xml.piece(np.zeros((80_000, 3)), BOX_TRIANGLES)
-    return xml.file("PolyData", [first] * pieces)
-
-
 def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
     assert old in content
     return content.replace(old, new, 1)
@@ -225,7 +193,7 @@ def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
 _DIGITS = b"9" * 5000
 _MANY_ARRAYS = _GIFTI.replace(b'NumberOfDataArrays="2"', b'NumberOfDataArrays="60002"')
 _EMPTY_ARRAY = b'<DataArray Dimensionality="1" Dim0="0"><Data/></DataArray>'
-_FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", ".vtk", ".vtp", ".vtu", "_lh.pial")
+_FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial")
 
 ATTACKS: dict[str, Attack] = {
     # What is no file.
@@ -378,15 +346,6 @@ ATTACKS: dict[str, Attack] = {
         ".gii.gz",
         _gzipped(lambda: _MANY_ARRAYS.replace(b"</GIFTI>", _EMPTY_ARRAY * 60_000 + b"</GIFTI>")),
     ),
-    "vtp, long attribute unpacked": _file(
-        ".vtp.gz", _gzipped(lambda: _with_noise(b'<VTKFile type="', b'">') + b"</VTKFile>")
-    ),
-    "vtp, deep elements unpacked": _file(
-        ".vtp.gz", _gzipped(lambda: b'<VTKFile type="PolyData">' + b"<a>" * 5 * _MEGABYTE + b"</VTKFile>")
-    ),
-    "vtk, numbers unpacked": _file(
-        ".vtk.gz", _gzipped(lambda: _vtk_start(f"POINTS {5 * _MEGABYTE // 3} float") + b"11 " * 5 * _MEGABYTE)
-    ),
     "obj, short lines unpacked": _file(".obj.gz", _gzipped(lambda: b"v\n" * 7 * _MEGABYTE)),
     "obj, long line unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11" * 5 * _MEGABYTE + b"\n")),
     "obj, continued lines unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11\\\n" * 3 * _MEGABYTE)),
@@ -407,76 +366,6 @@ ATTACKS: dict[str, Attack] = {
                 + b"\n1\n"
             )
         ),
-    ),
-    # VTK.
-    "vtk, points without end": _file(".vtk", _vtk_start("POINTS 999999999999999999 double", binary=True) + bytes(99)),
-    "vtk, points that overflow": _file(".vtk", _vtk_start("POINTS 6148914691236517206 double") + b"1 " * 99),
-    "vtk, count of many digits": _file(".vtk", _vtk_start("POINTS " + "9" * 5000 + " float")),
-    "vtk, negative count": _file(".vtk", _vtk_start("POINTS -8 float", binary=True) + bytes(99)),
-    "vtk, one cell of all corners": _file(
-        ".vtk",
-        _vtk_start("POINTS 1 float", "0 0 0", f"POLYGONS 1 {1 + _MEGABYTE}") + b"%d" % _MEGABYTE + b" 0" * _MEGABYTE,
-    ),
-    "vtk, cells without corners": _file(
-        ".vtk", _vtk_start("POINTS 1 float", "0 0 0", f"POLYGONS {_MEGABYTE} {_MEGABYTE}") + b"0 " * _MEGABYTE
-    ),
-    "vtk, strips of all corners": _file(
-        ".vtk",
-        _vtk_start("POINTS 1 float", "0 0 0", f"TRIANGLE_STRIPS 1 {1 + _MEGABYTE}")
-        + b"%d" % _MEGABYTE
-        + b" 1" * _MEGABYTE,
-    ),
-    "vtk, offsets without end": _file(
-        ".vtk",
-        _vtk_start("POINTS 0 float", "POLYGONS 9 9", "OFFSETS vtktypeint64", binary=True, version="5.1")
-        + b"\x7f\xff\xff\xff\xff\xff\xff\xff" * 9,
-    ),
-    "vtk, empty fields": _file(".vtk", _vtk_start("FIELD FieldData 200000") + b"x 0 0 float\n" * 200_000),
-    "vtk, fields without end": _file(
-        ".vtk", _vtk_start("FIELD FieldData 999999999999999999") + b"x 1 1 int 1 " * 99_999
-    ),
-    "vtk, huge field": _file(".vtk", _vtk_start("FIELD FieldData 1", "x 999999999 999999999 double", binary=True)),
-    "vtk, metadata": _file(".vtk", _vtk_start() + b"METADATA\n" * 200_000),
-    "vtk, metadata and blank lines": _file(".vtk", _vtk_start() + b"METADATA\n\n" * 200_000),
-    "vtk, long word": _file(".vtk", _vtk_start("x" * _MEGABYTE)),
-    "vtk, long number": _file(".vtk", _vtk_start("POINTS 1 float", "9" * _MEGABYTE + " 0 0")),
-    "vtk, blanks": _file(".vtk", _vtk_start("POINTS 9 float") + b" " * 2 * _MEGABYTE + b"1"),
-    "vtk, endless title": _file(".vtk", b"# vtk DataFile Version 4.2\n" + b"x" * 2 * _MEGABYTE),
-    "vtp, a billion laughs": _file(".vtp", _entities(10, "&a{};").replace(b"GIFTI", b"VTKFile")),
-    "vtp, entity of a file": _file(
-        ".vtp", b'<!DOCTYPE VTKFile [<!ENTITY a SYSTEM "file:///etc/hostname">]>' + _VTP.partition(b"?>\n")[2]
-    ),
-    "vtp, bomb": _file(".vtp", lambda: _vtp_with(_vtk_blocks(1, 96, 0, [zlib.compress(bytes(200 * _MEGABYTE), 9)]))),
-    "vtp, bomb that is announced": _file(
-        ".vtp",
-        lambda: _vtp_with(_vtk_blocks(1, 200 * _MEGABYTE, 0, [zlib.compress(bytes(200 * _MEGABYTE), 9)])),
-    ),
-    "vtp, bomb of LZMA": _file(
-        ".vtp",
-        lambda: _vtp_with(_vtk_blocks(1, 2**31, 0, [lzma.compress(bytes(64 * _MEGABYTE))]), compressor="lzma"),
-    ),
-    "vtp, blocks without end": _file(".vtp", _vtp_with(_vtk_blocks(2**32 - 1, 2**32 - 1, 0, [b""]))),
-    "vtp, empty blocks": _file(".vtp", _vtp_with(_vtk_blocks(500_000, 0, 0, [b""] * 500_000))),
-    "vtp, blocks of nothing": _file(
-        ".vtp", lambda: _vtp_with(_vtk_blocks(50_000, 0, 0, [zlib.compress(b"")] * 50_000))
-    ),
-    "vtp, array without end": _file(".vtp", _vtp_with(b"\xff" * 100, compressor="")),
-    "vtp, offset of many digits": _file(".vtp", re.sub(rb'offset="', b'offset="' + _DIGITS, VtkXml("raw").vtp([], []))),
-    "vtp, negative offset": _file(
-        ".vtp", VtkXml("raw").vtp(BOX_VERTICES, BOX_TRIANGLES).replace(b'offset="', b'offset="-9')
-    ),
-    "vtp, one array in many pieces": _file(".vtp", partial(_same_array, 2000)),
-    "vtp, many pieces": _file(".vtp", lambda: VtkXml().file("PolyData", ["<Piece/>\n"] * 200_000)),
-    "vtp, many points": _file(".vtp", _VTP.replace(b'Points="8"', b'Points="99999999999999999999"')),
-    "vtp, count of many digits": _file(".vtp", _VTP.replace(b'Polys="12"', b'Polys="' + _DIGITS + b'"')),
-    "vtp, negative counts": _file(".vtp", _VTP.replace(b'Points="8"', b'Points="-8"')),
-    "vtp, deep elements": _file(".vtp", b"<VTKFile>" + b"<Piece>" * 200_000 + b"</VTKFile>"),
-    "vtp, many starts of raw data": _file(".vtp", b"<AppendedData " * 150_000 + b"</VTKFile>"),
-    "vtp, text that is no base64": _file(
-        ".vtp", VtkXml("binary").vtp([[0, 0, 0]], []).replace(b'binary">', b'binary">*')
-    ),
-    "vtu, huge numbers of corners": _file(
-        ".vtu", VtkXml().vtu(BOX_VERTICES, BOX_TRIANGLES, [5] * 12).replace(b">3 6 9", b">9223372036854775807 6 9")
     ),
     # FreeSurfer.
     "freesurfer, triangles without end": _file(

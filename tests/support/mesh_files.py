@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
-import lzma
 import struct
-import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -226,154 +224,6 @@ def gifti(
     return bytes(nibabel.GiftiImage(darrays=arrays).to_bytes())
 
 
-VTK_TYPES = {"float": ("Float32", "f4"), "double": ("Float64", "f8")}
-
-
-def _counted(faces: Faces) -> list[int]:
-    return [number for face in faces for number in (len(face), *face)]
-
-
-def vtk(
-    vertices: ArrayLike,
-    faces: Faces,
-    *,
-    binary: bool = False,
-    version: str = "4.2",
-    real: str = "float",
-    section: str = "POLYGONS",
-    kinds: Sequence[int] | None = None,
-    counts: tuple[int, int] | None = None,
-) -> bytes:
-    """Return a legacy VTK file of polygon data; with ``kinds``, of an unstructured grid of cells of these kinds."""
-    rows = np.asarray(vertices, dtype=np.float64)
-
-    def part(values: ArrayLike, code: str) -> bytes:
-        array = np.asarray(values)
-        if binary:
-            return array.astype(f">{code}").tobytes() + b"\n"
-        text = numbers(array) if code[0] == "f" else " ".join(map(str, array.ravel().tolist()))
-        return f"{text}\n".encode()
-
-    dataset = "POLYDATA" if kinds is None else "UNSTRUCTURED_GRID"
-    lines = ["# vtk DataFile Version " + version, "a box", "BINARY" if binary else "ASCII", f"DATASET {dataset}"]
-    content = "".join(f"{line}\n" for line in lines).encode()
-    content += f"POINTS {len(rows)} {real}\n".encode() + part(rows, VTK_TYPES[real][1])
-    name = section if kinds is None else "CELLS"
-    corners = [corner for face in faces for corner in face]
-    if version[0] < "5":
-        count, total = counts or (len(faces), len(corners) + len(faces))
-        content += f"{name} {count} {total}\n".encode() + part(_counted(faces), "i4")
-    else:
-        count, total = counts or (len(faces) + 1, len(corners))
-        ends = np.cumsum([0, *map(len, faces)])
-        content += f"{name} {count} {total}\nOFFSETS vtktypeint64\n".encode() + part(ends, "i8")
-        content += b"CONNECTIVITY vtktypeint64\n" + part(corners, "i8")
-    if kinds is not None:
-        content += f"CELL_TYPES {len(kinds)}\n".encode() + part(kinds, "i4")
-    return content
-
-
-class VtkXml:
-    """An XML file of VTK, which may be changed by replacing text.
-
-    Args:
-        form: "ascii", "binary", "appended" or "raw".
-        compressor: "zlib", "lzma" or none.
-        order: "<" or ">".
-        header: Type of the numbers before arrays, "u4" or "u8".
-        block: Bytes of a compressed block.
-    """
-
-    def __init__(
-        self, form: str = "ascii", compressor: str = "", order: str = "<", header: str = "u4", block: int = 64
-    ) -> None:
-        self.form, self.compressor, self.order, self.header, self.block = form, compressor, order, header, block
-        self.appended = b""
-
-    def array(self, name: str, values: ArrayLike, code: str) -> str:
-        """Return an element DataArray."""
-        array = np.asarray(values)
-        kind = {"f": "Float", "i": "Int", "u": "UInt"}[code[0]] + str(8 * int(code[1]))
-        start = (
-            f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{array.shape[-1] if array.ndim > 1 else 1}"'
-        )
-        if self.form == "ascii":
-            text = numbers(array) if code[0] == "f" else " ".join(map(str, array.ravel().tolist()))
-            return f'{start} format="ascii">{text}</DataArray>\n'
-        packed = self.packed(array.astype(self.order + code).tobytes())
-        if self.form == "binary":
-            return f'{start} format="binary">{packed.decode()}</DataArray>\n'
-        self.appended += packed
-        return f'{start} format="appended" offset="{len(self.appended) - len(packed)}"/>\n'
-
-    def packed(self, content: bytes, *, size: int | None = None) -> bytes:
-        """Return bytes as they stand in the file; ``size`` is what they are said to have."""
-        encode = bytes if self.form == "raw" else base64.b64encode
-        length = len(content) if size is None else size
-        if not self.compressor:
-            return encode(np.array([length], self.order + self.header).tobytes() + content)
-        blocks = [content[i : i + self.block] for i in range(0, len(content), self.block)]
-        pack = zlib.compress if self.compressor == "zlib" else lzma.compress
-        packed = [pack(block) for block in blocks]
-        last = length % self.block
-        header = np.array([len(blocks), self.block, last, *map(len, packed)], self.order + self.header)
-        return encode(header.tobytes()) + encode(b"".join(packed))
-
-    def file(self, dataset: str, pieces: Sequence[str]) -> bytes:
-        """Return the file of some pieces."""
-        name = {"zlib": "vtkZLibDataCompressor", "lzma": "vtkLZMADataCompressor"}.get(self.compressor)
-        compressor = "" if name is None else f' compressor="{name}"'
-        order = {"<": "LittleEndian", ">": "BigEndian"}[self.order]
-        header = {"u4": "UInt32", "u8": "UInt64"}[self.header]
-        content = (
-            f'<?xml version="1.0"?>\n<VTKFile type="{dataset}" version="1.0" byte_order="{order}" '
-            f'header_type="{header}"{compressor}>\n<{dataset}>\n{"".join(pieces)}</{dataset}>\n'
-        ).encode()
-        if self.form in ("appended", "raw"):
-            encoding = "raw" if self.form == "raw" else "base64"
-            content += f'<AppendedData encoding="{encoding}">\n_'.encode() + self.appended + b"\n</AppendedData>\n"
-        return content + b"</VTKFile>\n"
-
-    def cells(self, section: str, faces: Faces, index: str = "i4", kinds: Sequence[int] | None = None) -> str:
-        """Return an element of cells."""
-        arrays = self.array("connectivity", [corner for face in faces for corner in face], index)
-        arrays += self.array("offsets", np.cumsum(list(map(len, faces))), index)
-        if kinds is not None:
-            arrays += self.array("types", kinds, "u1")
-        return f"<{section}>\n{arrays}</{section}>\n"
-
-    def piece(
-        self,
-        vertices: ArrayLike,
-        faces: Faces = (),
-        strips: Faces = (),
-        *,
-        real: str = "f4",
-        index: str = "i4",
-        more: str = "",
-    ) -> str:
-        """Return a piece of polygon data."""
-        content = f"<Points>\n{self.array('Points', np.asarray(vertices, dtype=np.float64), real)}</Points>\n"
-        content += (self.cells("Polys", faces, index) if faces else "") + (
-            self.cells("Strips", strips) if strips else ""
-        )
-        return (
-            f'<Piece NumberOfPoints="{len(np.asarray(vertices))}" NumberOfPolys="{len(faces)}" '
-            f'NumberOfStrips="{len(strips)}">\n{content}{more}</Piece>\n'
-        )
-
-    def vtp(self, vertices: ArrayLike, faces: Faces, *, real: str = "f4", index: str = "i4") -> bytes:
-        """Return a file of one piece of polygons."""
-        return self.file("PolyData", [self.piece(vertices, faces, real=real, index=index)])
-
-    def vtu(self, vertices: ArrayLike, faces: Faces, kinds: Sequence[int], *, real: str = "f4") -> bytes:
-        """Return a file of an unstructured grid."""
-        points = f"<Points>\n{self.array('Points', np.asarray(vertices, dtype=np.float64), real)}</Points>\n"
-        cells = self.cells("Cells", faces, "i8", kinds)
-        start = f'<Piece NumberOfPoints="{len(np.asarray(vertices))}" NumberOfCells="{len(faces)}">\n'
-        return self.file("UnstructuredGrid", [f"{start}{points}{cells}</Piece>\n"])
-
-
 def freesurfer(
     vertices: ArrayLike,
     triangles: ArrayLike,
@@ -405,7 +255,6 @@ def freesurfer_quads(
 VOLUME = (
     b"\0\0\0\2\0\0\0\0\0\0\0\x14valid = 1  # volume info valid\nfilename = ../mri/filled.mgz\nvolume = 256 256 256\n"
 )
-TRIANGLE_KINDS = [5] * len(BOX_TRIANGLES)
 
 # The end of a file's name, and its bytes.
 Content = tuple[str, bytes]
@@ -433,20 +282,6 @@ BOXES: dict[str, Content] = {
     "gifti gzipped": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))),
     "gifti base64": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_B64BIN")),
     "gifti ascii": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII")),
-    "vtk ascii": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES)),
-    "vtk ascii 5": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, version="5.1", real="double")),
-    "vtk binary": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, real="double")),
-    "vtk binary 5": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1")),
-    "vtk grid": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, kinds=TRIANGLE_KINDS)),
-    "vtk grid binary 5": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1", kinds=TRIANGLE_KINDS)),
-    "vtp ascii": (".vtp", VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES)),
-    "vtp binary": (".vtp", VtkXml("binary").vtp(BOX_VERTICES, BOX_TRIANGLES, real="f8", index="i8")),
-    "vtp binary zlib": (".vtp", VtkXml("binary", "zlib", ">", "u8").vtp(BOX_VERTICES, BOX_TRIANGLES)),
-    "vtp appended lzma": (".vtp", VtkXml("appended", "lzma").vtp(BOX_VERTICES, BOX_TRIANGLES, index="u4")),
-    "vtp raw": (".vtp", VtkXml("raw", order=">").vtp(BOX_VERTICES, BOX_TRIANGLES, real="f8")),
-    "vtp raw zlib": (".vtp", VtkXml("raw", "zlib", header="u8").vtp(BOX_VERTICES, BOX_TRIANGLES)),
-    "vtu ascii": (".vtu", VtkXml().vtu(BOX_VERTICES, BOX_TRIANGLES, TRIANGLE_KINDS)),
-    "vtu appended": (".vtu", VtkXml("appended", "zlib").vtu(BOX_VERTICES, BOX_TRIANGLES, TRIANGLE_KINDS)),
     "freesurfer": ("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, VOLUME)),
     "freesurfer without volume": (".rh.white", freesurfer(BOX_VERTICES, BOX_TRIANGLES)),
     "gifti by columns": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), ordering="F")),

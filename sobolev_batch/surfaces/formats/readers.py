@@ -27,8 +27,7 @@ from sobolev_batch.surfaces.formats.raw_files import (
 )
 from sobolev_batch.surfaces.formats.stl import parse_stl
 from sobolev_batch.surfaces.formats.text_formats import parse_obj, parse_off
-from sobolev_batch.surfaces.formats.vtk.legacy import parse_vtk
-from sobolev_batch.surfaces.formats.vtk.xml import parse_vtk_xml
+from sobolev_batch.surfaces.formats.vtk import parse_vtk
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Raw = tuple[NDArray[Any], NDArray[Any]]
@@ -233,8 +232,8 @@ _PARSERS: dict[str, Callable[[bytes, Path], Raw]] = {
     ".glb": parse_gltf,
     ".gii": parse_gifti,
     ".vtk": parse_vtk,
-    ".vtp": lambda data, _: parse_vtk_xml(data, "PolyData"),
-    ".vtu": lambda data, _: parse_vtk_xml(data, "UnstructuredGrid"),
+    ".vtp": parse_vtk,
+    ".vtu": parse_vtk,
     _FREESURFER: parse_freesurfer,
 }
 

@@ -23,7 +23,6 @@ from tests.support.mesh_files import (
     LITTLE,
     Gltf,
     Read,
-    VtkXml,
     freesurfer,
     freesurfer_quads,
     gifti,
@@ -32,7 +31,6 @@ from tests.support.mesh_files import (
     ply,
     stl_binary,
     stl_text,
-    vtk,
 )
 from tests.support.shapes import (
     AWKWARD_VERTICES,
@@ -87,12 +85,8 @@ def test_a_path_may_be_text(tmp_path: Path) -> None:
         (".ply", ply(AWKWARD_VERTICES, BOX_TRIANGLES, BIG, real="double")),
         (".obj", obj(AWKWARD_VERTICES, BOX_TRIANGLES)),
         (".off", off(AWKWARD_VERTICES, BOX_TRIANGLES)),
-        (".vtk", vtk(AWKWARD_VERTICES, BOX_TRIANGLES, real="double")),
-        (".vtk", vtk(AWKWARD_VERTICES, BOX_TRIANGLES, real="double", binary=True, version="5.1")),
-        (".vtp", VtkXml("ascii").vtp(AWKWARD_VERTICES, BOX_TRIANGLES, real="f8")),
-        (".vtu", VtkXml("raw", "zlib").vtu(AWKWARD_VERTICES, BOX_TRIANGLES, [5] * 12, real="f8")),
     ],
-    ids=["ply ascii", "ply little", "ply big", "obj", "off", "vtk ascii", "vtk binary", "vtp", "vtu"],
+    ids=["ply ascii", "ply little", "ply big", "obj", "off"],
 )
 def test_double_precision_is_kept_to_the_last_bit(read: Read, ending: str, content: bytes) -> None:
     mesh = read(ending, content)
@@ -112,11 +106,9 @@ def test_ascii_stl_keeps_double_precision(read: Read) -> None:
         (".stl", stl_binary(AWKWARD_VERTICES, BOX_TRIANGLES)),
         (".glb", Gltf([[(AWKWARD_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}]).glb()),
         (".gii", gifti(AWKWARD_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))),
-        (".vtk", vtk(AWKWARD_VERTICES, BOX_TRIANGLES, binary=True)),
-        (".vtp", VtkXml("raw", "zlib").vtp(AWKWARD_VERTICES, BOX_TRIANGLES)),
         ("_lh.pial", freesurfer(AWKWARD_VERTICES, BOX_TRIANGLES)),
     ],
-    ids=["ply", "stl", "glb", "gifti", "vtk", "vtp", "freesurfer"],
+    ids=["ply", "stl", "glb", "gifti", "freesurfer"],
 )
 def test_single_precision_is_widened_and_not_touched(read: Read, ending: str, content: bytes) -> None:
     single = AWKWARD_VERTICES.astype(np.float32).astype(np.float64)
@@ -140,11 +132,6 @@ POLYGON_WRITERS: dict[str, tuple[str, Callable[[Any, Any], bytes]]] = {
     "obj with texture": (".obj", lambda v, f: b"vt 0 0\n" + obj(v, f, lambda vertex, _: f"{vertex}/1")),
     "obj with normals": (".obj", lambda v, f: b"vn 0 0 1\n" + obj(v, f, lambda vertex, _: f"{vertex}//1")),
     "off": (".off", off),
-    "vtk": (".vtk", vtk),
-    "vtk binary": (".vtk", lambda v, f: vtk(v, f, binary=True, version="5.1")),
-    "vtk grid": (".vtk", lambda v, f: vtk(v, f, kinds=[{3: 5, 4: 9}.get(len(face), 7) for face in f])),
-    "vtp": (".vtp", lambda v, f: VtkXml("appended").vtp(v, f)),
-    "vtu": (".vtu", lambda v, f: VtkXml().vtu(v, f, [7] * len(f))),
 }
 
 
@@ -392,59 +379,6 @@ def test_degenerate_and_duplicate_faces_are_kept(read: Read, name: str) -> None:
     assert mesh.area == BOX_AREA + 2 * 4
 
 
-# VTK and FreeSurfer.
-
-# The side of the box at x = 0 as a strip, and the rest as quadrilaterals.
-STRIP, SIDES = [0, 1, 2, 3], BOX_QUADS[1:]
-
-
-def test_strips_of_triangles_are_cut_and_keep_their_side(read: Read) -> None:
-    files = [
-        (".vtk", vtk(BOX_VERTICES, [STRIP], section="TRIANGLE_STRIPS") + b"POLYGONS 5 25\n" + vtk_faces(SIDES)),
-        (".vtp", VtkXml().file("PolyData", [VtkXml().piece(BOX_VERTICES, SIDES, [STRIP])])),
-        (".vtu", VtkXml().vtu(BOX_VERTICES, [STRIP, *SIDES], [6, *[9] * 5])),
-    ]
-    for ending, content in files:
-        mesh = read(ending, content)
-        assert (mesh.area, mesh.counts) == (BOX_AREA, CLOSED)
-        # Twice the volume six times over: negative where triangles are turned inwards.
-        assert np.linalg.det(mesh.vertices[mesh.triangles]).sum() == pytest.approx(6 * 8)
-
-
-def vtk_faces(faces: list[list[int]]) -> bytes:
-    return b"".join(b"%d %s\n" % (len(face), " ".join(map(str, face)).encode()) for face in faces)
-
-
-def test_pixels_of_vtk_have_their_corners_in_rows(read: Read) -> None:
-    flat = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)])
-    mesh = read(".vtk", vtk(flat, [[0, 1, 2, 3]], kinds=[8]))
-    assert (mesh.area, mesh.counts.boundary_edges) == (1.0, 4)
-
-
-def test_vtk_files_may_hold_more(read: Read) -> None:
-    plain = vtk(BOX_VERTICES, BOX_TRIANGLES)
-    before = b"FIELD FieldData 2\ntime 1 1 double\n1.5\nMETADATA\nINFORMATION 0\n\nname 2 1 int\n1 2\n"
-    after = b"METADATA\nCOMPONENT_NAMES\nx\n\nCELL_DATA 12\nSCALARS x float\nLOOKUP_TABLE default\n"
-    lines = b"VERTICES 1 2\n1 0\nLINES 1 3\n2 0 7\n"
-    for content in (
-        plain.replace(b"POINTS", before + b"POINTS"),
-        plain + after + b"1.0 " * 12,
-        plain.replace(b"POLYGONS", lines + b"POLYGONS"),
-        plain.replace(b"\n", b"\r\n"),
-        plain.replace(b" ", b"\n", 40).replace(
-            b"#\nvtk\nDataFile\nVersion\n4.2\na\nbox", b"# vtk DataFile Version 4.2\na box"
-        ),
-    ):
-        assert soup(read(".vtk", content)) == soup(box())
-
-
-def test_pieces_of_vtk_are_put_together(read: Read) -> None:
-    xml = VtkXml("raw", "zlib")
-    far = BOX_VERTICES + np.array([9.0, 0.0, 0.0])
-    mesh = read(".vtp", xml.file("PolyData", [xml.piece(BOX_VERTICES, BOX_QUADS), xml.piece(far, BOX_TRIANGLES)]))
-    assert soup(mesh) == sorted(soup(box()) + soup(Mesh(far, BOX_TRIANGLES)))
-
-
 def test_quadrilaterals_of_freesurfer_are_cut(read: Read) -> None:
     for old in (False, True):
         mesh = read(".lh.orig", freesurfer_quads(BOX_VERTICES, BOX_QUADS, old=old))
@@ -477,21 +411,6 @@ def test_files_of_nibabel_are_read(tmp_path: Path) -> None:
     mesh = read_mesh(tmp_path / "lh.white")
     assert (mesh.triangles == ball.triangles).all()
     assert (mesh.vertices == ball.vertices.astype(np.float32)).all()
-
-
-@pytest.mark.parametrize("name", ["ball.vtk", "ball.vtp", "ball.vtu"])
-@pytest.mark.parametrize("binary", [True, False], ids=["binary", "ascii"])
-def test_files_of_vtk_are_read(tmp_path: Path, name: str, binary: bool) -> None:
-    pytest.importorskip("pyvista")
-    ball = icosphere(2)
-    made = ball.to_pyvista()
-    made["height"] = ball.vertices[:, 2]
-    made = made.cast_to_unstructured_grid() if name.endswith("vtu") else made
-    made.save(tmp_path / name, binary=binary)
-    mesh = read_mesh(tmp_path / name)
-    assert (mesh.triangles == ball.triangles).all()
-    # VTK writes eleven digits as text.
-    np.testing.assert_allclose(mesh.vertices, ball.vertices, rtol=0, atol=0 if binary else 1e-10)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from tests.support.mesh_files import (
     BOXES,
     LITTLE,
     Gltf,
-    VtkXml,
     box_scene,
     freesurfer,
     freesurfer_quads,
@@ -30,7 +29,6 @@ from tests.support.mesh_files import (
     ply,
     stl_binary,
     stl_text,
-    vtk,
 )
 from tests.support.shapes import (
     BOX_MIXED,
@@ -73,7 +71,6 @@ STL_TEXT, STL_BINARY = stl_text(BOX_VERTICES, BOX_TRIANGLES), stl_binary(BOX_VER
 GLB_BOX, GLTF_BOX = box_scene().glb(), box_scene().gltf()
 INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
 GII_BOX = gifti(BOX_VERTICES, INT_TRIANGLES)
-VTP_BOX = VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES)
 GII_TEXT = gifti(BOX_VERTICES, INT_TRIANGLES, "GIFTI_ENCODING_ASCII")
 
 
@@ -300,103 +297,6 @@ BAD: dict[str, tuple[str, bytes, str]] = {
     "gifti, NaN": (".gii", gifti(nan_at(3), INT_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
     "gifti, no data": (".gii", b"<GIFTI/>", "found 0 and 0"),
     "gifti, other XML": (".gii", b"<svg><path/></svg>", ""),
-    # VTK.
-    "vtk, a face too many": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(13, 48)), "13 cells"),
-    "vtk, a number too many": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(12, 49)), "announces 49 .*found 48"),
-    "vtk, very many faces": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, counts=(10**15, 4 * 10**15)), "announces 4000"),
-    "vtk binary, a face too many": (
-        ".vtk",
-        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, counts=(13, 52)),
-        "announces",
-    ),
-    "vtk binary, very many faces": (
-        ".vtk",
-        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1", counts=(10**15, 36)),
-        "announces",
-    ),
-    "vtk binary 5, a corner too few": (
-        ".vtk",
-        vtk(BOX_VERTICES, BOX_TRIANGLES, binary=True, version="5.1", counts=(13, 35)),
-        "do not run from 0 up to the 35 corners",
-    ),
-    "vtk, offsets that fall": (
-        ".vtk",
-        changed(vtk(BOX_VERTICES, BOX_TRIANGLES, version="5.1"), b"\n0 3 6 9", b"\n0 9 6 3"),
-        "do not run from 0",
-    ),
-    "vtk, two corners": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1]]), "face 13 has 2 vertices"),
-    "vtk, index -1": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, -1]]), r"#12 = \[0, 1, -1\]"),
-    "vtk, index 8": (".vtk", vtk(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 8]], binary=True), r"#12 = \[0, 1, 8\]"),
-    "vtk, index with a fraction": (
-        ".vtk",
-        changed(vtk(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 0.7"),
-        "integer",
-    ),
-    "vtk, NaN": (".vtk", vtk(nan_at(3), BOX_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
-    "vtk, a strip of two": (".vtk", vtk(BOX_VERTICES, [[0, 1]], section="TRIANGLE_STRIPS"), "face 1 has 2 vertices"),
-    "vtk, lines alone": (".vtk", vtk(BOX_VERTICES, [[0, 1, 2]], section="LINES"), "no faces"),
-    "vtk, points twice": (".vtk", vtk(BOX_VERTICES, []) + b"POINTS 1 float\n0 0 0\n", "'POINTS' is there twice"),
-    "vtk, no points": (".vtk", re.sub(rb"POINTS.*\n.*\n", b"", vtk(BOX_VERTICES, BOX_TRIANGLES)), "no section POINTS"),
-    "vtk, tetrahedra": (".vtk", vtk(BOX_VERTICES, [[0, 1, 2, 4]], kinds=[10]), "VTK's type 10.*extract_surface"),
-    "vtk, a triangle of four corners": (
-        ".vtk",
-        vtk(BOX_VERTICES, BOX_QUADS, kinds=[5] * 6),
-        "4 corners, but .* have 3",
-    ),
-    "vtk, a kind too few": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, kinds=[5] * 11), "12 cells and 11 types"),
-    "vtk, an image": (
-        ".vtk",
-        changed(vtk([], []), b"POLYDATA", b"STRUCTURED_POINTS"),
-        "STRUCTURED_POINTS, no polygons",
-    ),
-    "vtk, a later version": (".vtk", vtk(BOX_VERTICES, BOX_TRIANGLES, version="6.0"), "version 6"),
-    "vtp, NaN": (".vtp", VtkXml().vtp(nan_at(3), BOX_TRIANGLES), r"1 of 8 vertices have NaN .*#3"),
-    "vtp, index -1": (".vtp", VtkXml().vtp(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, -1]]), r"outside 0\.\.7"),
-    "vtp, index of the next piece": (
-        ".vtp",
-        VtkXml().file("PolyData", [VtkXml().piece(BOX_VERTICES, [[0, 1, 8]]), VtkXml().piece(BOX_VERTICES)]),
-        r"1 of 1 triangles of a piece have indices outside 0\.\.7",
-    ),
-    "vtp, a point too many": (".vtp", changed(VTP_BOX, b'Points="8"', b'Points="9"'), "has 24 values, expected 27"),
-    "vtp, a face too many": (
-        ".vtp",
-        changed(VTP_BOX, b'Polys="12"', b'Polys="13"'),
-        "offsets .* 12 values, expected 13",
-    ),
-    "vtp, no faces": (".vtp", changed(VTP_BOX, b'Polys="12"', b'Polys="0"'), "no faces"),
-    "vtp, no piece": (".vtp", VtkXml().file("PolyData", []), "no faces"),
-    "vtp, a grid": (".vtp", VtkXml().vtu(BOX_VERTICES, BOX_TRIANGLES, [5] * 12), "name it after what it holds"),
-    "vtp, real indices": (".vtp", VtkXml().vtp(BOX_VERTICES, BOX_TRIANGLES, index="f4"), "float32, expected integers"),
-    "vtp, ghosts": (
-        ".vtp",
-        VtkXml().file(
-            "PolyData",
-            [
-                VtkXml().piece(
-                    BOX_VERTICES,
-                    BOX_TRIANGLES,
-                    more=f"<CellData>{VtkXml().array('vtkGhostType', [0] * 11 + [1], 'u1')}</CellData>",
-                )
-            ],
-        ),
-        "ghost cells",
-    ),
-    "vtp, LZ4": (
-        ".vtp",
-        changed(VtkXml("binary", "zlib").vtp(BOX_VERTICES, BOX_TRIANGLES), b"ZLib", b"LZ4"),
-        "compressed by vtkLZ4DataCompressor; save it with zlib",
-    ),
-    "vtp, a bad offset": (
-        ".vtp",
-        re.sub(rb'offset="\d+"', b'offset="99999"', VtkXml("raw").vtp(BOX_VERTICES, BOX_TRIANGLES)),
-        "more than the .* there are",
-    ),
-    "vtp, a damaged block": (
-        ".vtp",
-        changed(VtkXml("raw", "zlib").vtp(BOX_VERTICES, BOX_TRIANGLES), b"\x78\x9c", b"\x78\x9d"),
-        "",
-    ),
-    "vtu, tetrahedra": (".vtu", VtkXml().vtu(BOX_VERTICES, [[0, 1, 2, 4]], [10]), "VTK's type 10"),
     # FreeSurfer.
     "freesurfer, a triangle too many": (
         "_lh.pial",
@@ -454,7 +354,7 @@ def test_bad_files_are_refused_by_name_when_zipped(tmp_path: Path, name: str) ->
     assert str(caught.value).startswith(f"{path}: ")
 
 
-FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", ".vtk", ".vtp", ".vtu", "_lh.pial"]
+FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial"]
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -579,12 +479,6 @@ CUTTABLE: dict[str, tuple[str, bytes, int]] = {
     "glb": (".glb", Gltf([[(*TETRAHEDRON, None)]], [{"mesh": 0}]).glb(), 0),
     "gltf": (".gltf", Gltf([[(*TETRAHEDRON, None)]], [{"mesh": 0}]).gltf(), 0),
     "gifti": (".gii", gifti(TETRAHEDRON_VERTICES, np.array(TETRAHEDRON_TRIANGLES, dtype=np.int32)), 0),
-    "vtk ascii": (".vtk", vtk(*TETRAHEDRON), 0),
-    "vtk binary": (".vtk", vtk(*TETRAHEDRON, binary=True), 1),
-    "vtk binary 5": (".vtk", vtk(*TETRAHEDRON, binary=True, version="5.1"), 1),
-    "vtp": (".vtp", VtkXml("binary", "zlib").vtp(*TETRAHEDRON), 1),
-    "vtp raw": (".vtp", VtkXml("raw").vtp(*TETRAHEDRON), 1),
-    "vtu": (".vtu", VtkXml().vtu(*TETRAHEDRON, [5] * 4), 1),
     "freesurfer": ("_lh.pial", freesurfer(*TETRAHEDRON), 0),
     "gzip": (".ply.gz", gzip.compress(ply(*TETRAHEDRON), mtime=0), 0),
 }

@@ -49,13 +49,6 @@ _STARTS: dict[str, tuple[bytes, ...]] = {
     ".gltf": (b"", b"{", b'{"nodes": [{"mesh": 0}], "meshes": '),
     ".glb": (b"", BOXES["glb"][1][:20]),
     ".gii": (b"", b"<GIFTI>", BOXES["gifti ascii"][1].partition(b"<Data>")[0] + b"<Data>"),
-    ".vtk": (
-        b"",
-        b"# vtk DataFile Version 4.2\nt\nASCII\nDATASET POLYDATA\nPOINTS ",
-        BOXES["vtk binary 5"][1].partition(b"POLYGONS")[0],
-    ),
-    ".vtp": (b"", b'<VTKFile type="PolyData">', BOXES["vtp binary zlib"][1][:700], BOXES["vtp raw"][1][:1500]),
-    ".vtu": (b"", b"<VTKFile>", BOXES["vtu ascii"][1][:500]),
     "_lh.pial": (b"", b"\xff\xff\xfe", b"\xff\xff\xff", b"\xff\xff\xfed\n\n\0\0\0\3\0\0\0\1"),
     ".ply.gz": (b"", b"\x1f\x8b", gzip.compress(b"", mtime=0)),
 }
