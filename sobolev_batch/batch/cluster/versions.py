@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 from distributed import Client
 
-from sobolev_batch.batch.cluster.worker_versions import OF_DASK, Versions, differing, installed_versions
+from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.errors import ClusterError
+from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION
 
-_OF_SCHEDULER = ("dask", "distributed")
-_MOST_NAMED = 4
+_OF_DASK = ("dask", "distributed")
+_OF_NUMBERS = (
+    *("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "modepy", "zarr", "xarray"),
+    *("fast-simplification", "trimesh", "nibabel", "plyfile"),
+)
+# Not every study needs these. Processes that have them must have the same.
+_OF_EXTRAS = ("pyacvd", "vtk")
 
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:
@@ -24,38 +29,46 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None
     Raises:
         ClusterError: They differ; the message names the processes and both versions.
     """
-    # Code cannot travel between Python versions, so that Dask itself is asked for those first.
-    answers = client.get_versions()
-    ours = _of_dask(answers["client"])
-    scheduler = {client.scheduler.address: _of_dask(answers["scheduler"])}
-    differences = [*_differences("the scheduler", ours, scheduler, _OF_SCHEDULER)]
+    required = (*_OF_DASK, *_OF_NUMBERS, *libraries)
+    # Dask answers this itself: code of ours would not run where the package is missing.
+    answers = client.get_versions(packages=[*required, *_OF_EXTRAS])
+    ours = _packages(answers["client"])
+    differences = _differences(
+        ours, {f"scheduler {client.scheduler.address}": _packages(answers["scheduler"])}, _OF_DASK
+    )
     # A worker that is just leaving answers nothing.
-    workers = {address: _of_dask(answer) for address, answer in answers["workers"].items() if answer}
-    differences += _differences("the worker", ours, workers, ("python", *OF_DASK))
+    workers = {f"worker {address}": _packages(answer) for address, answer in answers["workers"].items() if answer}
+    differences += _differences(ours, workers, ("python", *required))
+    for name in filter(ours.get, _OF_EXTRAS):
+        differences += _differences(ours, {who: found for who, found in workers.items() if found[name]}, [name])
     if not differences:
-        libraries = tuple(libraries)
-        ours, replies = installed_versions(libraries), client.run(installed_versions, libraries, on_error="return")
-        workers = {address: reply for address, reply in replies.items() if isinstance(reply, dict)}
-        names = dict.fromkeys(name for theirs in workers.values() for name in differing(ours, theirs, libraries))
-        differences += _differences("the worker", ours, workers, names)
+        # One checkout may follow another without a new version.
+        replies = client.run(_checkout, on_error="return")
+        workers = {f"worker {address}": reply for address, reply in replies.items() if isinstance(reply, dict)}
+        differences = _differences(_checkout(), workers, _checkout())
     if differences:
         raise ClusterError(
-            f"versions differ, and results would mix what they compute: {'; '.join(differences)}. "
+            f"versions differ, and results would mix what they compute: {'; '.join(dict.fromkeys(differences))}. "
             "Install the same ones everywhere and start those processes again"
         )
 
 
-def _of_dask(answer: Mapping[str, Any]) -> Versions:
-    """Return the versions in an answer of Dask's own."""
-    versions = {name: str(answer["packages"].get(name) or "") for name in ("python", *OF_DASK)}
+def _packages(answer: Mapping[str, Mapping[str, str | None]]) -> dict[str, str]:
+    versions = {name: version or "" for name, version in answer["packages"].items()}
     return {**versions, "python": ".".join(versions["python"].split(".")[:2])}
 
 
-def _differences(who: str, ours: Versions, theirs: Mapping[str, Versions], names: Iterable[str]) -> Iterator[str]:
+def _checkout() -> dict[str, str]:
+    return {"numerics of sobolev-batch": str(NUMERICS_VERSION), "schema of sobolev-batch": str(SCHEMA_VERSION)}
+
+
+def _differences(ours: Mapping[str, str], theirs: Mapping[str, Mapping[str, str]], names: Iterable[str]) -> list[str]:
     """Describe each version other than ours, and who has it."""
+    described = []
     for name in names:
         for version in sorted({versions[name] for versions in theirs.values()} - {ours[name]}):
-            at = sorted(address for address, versions in theirs.items() if versions[name] == version)
-            more = f" and {len(at) - _MOST_NAMED} more" if len(at) > _MOST_NAMED else ""
+            first, *others = sorted(who for who, versions in theirs.items() if versions[name] == version)
+            more = f" and {len(others)} more" if others else ""
             here = f"{ours[name]} here" if ours[name] else "there is none here"
-            yield f"{name} {version or 'is missing'} at {who} {', '.join(at[:_MOST_NAMED])}{more}, {here}"
+            described.append(f"{name} {version or 'is missing'} at the {first}{more}, {here}")
+    return described

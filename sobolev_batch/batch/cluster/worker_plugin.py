@@ -12,7 +12,6 @@ from distributed.core import Status
 
 from sobolev_batch.batch.cluster.gpus import GpuLock, visible_devices
 from sobolev_batch.batch.cluster.versions import require_same_versions
-from sobolev_batch.batch.cluster.worker_versions import VersionGuard
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, allowed_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
@@ -21,7 +20,6 @@ from sobolev_batch.spectral.transform.durations import slowness
 _log = logging.getLogger(__name__)
 
 _NAME = "sobolev-batch"
-_GUARD = "sobolev-batch-versions"
 _SETUP_SECONDS = 0.05
 
 
@@ -103,7 +101,7 @@ def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
         ClusterError: The cluster has no workers, or their versions differ from those here.
     """
     require_same_versions(client, libraries)
-    client.register_plugin(VersionGuard(BackendPlugin(), _NAME), name=_GUARD)
+    client.register_plugin(BackendPlugin(), name=_NAME)
     answers = client.run(_describe, on_error="return")
     # A worker that is just leaving, or joining, does not count.
     members = tuple(answers[address] for address in sorted(answers) if isinstance(answers[address], WorkerInfo))

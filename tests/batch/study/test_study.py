@@ -202,3 +202,13 @@ def test_memory_is_a_size(memory: str | float) -> None:
     study = asking(rtol=0.1, memory=memory)
     assert study.accuracy is not None
     assert study.accuracy.allowed_bytes == 4e9
+
+
+@pytest.mark.slow
+def test_a_study_knows_what_its_sources_need() -> None:
+    sphere = {"source": "icosphere", "levels": [3]}
+    remeshed = {"source": "remesh", "mesh": sphere, "triangles": [100]}
+    decimated = {"name": "a", "source": "decimate", "mesh": remeshed, "triangles": [50]}
+    assert Study.from_table(small_table()).libraries == ()
+    assert Study.from_table(small_table(family=[decimated])).libraries == ("pyacvd",)
+    assert Study.from_table(small_table(reference=remeshed)).libraries == ("pyacvd",)
