@@ -1,8 +1,15 @@
-"""The memory of this machine, or the part of it that this process may use."""
+"""The part of this machine that this process may use: its memory and its cores.
+
+Containers, batch systems and systemd limit both by control groups, of version 1 or 2. Dask looks at the outermost group
+only, where a job of SLURM has its limits further in.
+"""
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +17,8 @@ import psutil
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import byte_count, format_bytes
+
+_ROOT = Path("/")
 
 
 @dataclass(frozen=True)
@@ -25,24 +34,41 @@ class MachineMemory:
     source: str
 
     @classmethod
-    def found(cls, root: Path = Path("/")) -> MachineMemory:
+    def detect(cls, root: Path = _ROOT) -> MachineMemory:
         """Return the memory of this machine, or the smallest limit of the control groups of this process.
-
-        Containers, batch systems and systemd limit memory by control groups, of version 1 or 2.
 
         Args:
             root: Folder of the file system in which /proc and /sys are looked for.
         """
         memory = cls(psutil.virtual_memory().total, "all of this machine")
-        for path in _limit_files(root):
-            try:
-                limit = int(path.read_text())
-            # "max" is no limit, and another process may remove a group.
-            except (OSError, ValueError):
-                continue
-            if 0 < limit < memory.total_bytes:
-                memory = cls(limit, f"the limit in {path}")
+        for group in _control_groups(root, "memory"):
+            # Beyond the lower limit, memory.high, the kernel takes memory back, and the process all but stands still.
+            for name in ("memory.max", "memory.high", "memory.limit_in_bytes"):
+                # "max" is no limit, and another process may remove a group.
+                with suppress(OSError, ValueError):
+                    limit = int((group / name).read_text())
+                    if 0 < limit < memory.total_bytes:
+                        memory = cls(limit, f"the limit in {group / name}")
         return memory
+
+
+def available_cores(root: Path = _ROOT) -> int:
+    """Return the number of cores that this process may use, by its affinity and the quotas of its control groups.
+
+    Args:
+        root: Folder of the file system in which /proc and /sys are looked for.
+    """
+    try:
+        count = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        count = os.cpu_count() or 1
+    for group in _control_groups(root, "cpu"):
+        for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
+            with suppress(OSError, ValueError):
+                quota, period = map(int, " ".join((group / name).read_text() for name in names).split())
+                if quota > 0:
+                    count = min(count, math.ceil(quota / period))
+    return count
 
 
 def available(memory: float | str) -> int:
@@ -70,7 +96,7 @@ def require_machine_memory(needed_bytes: float, what: str, advice: str = "") -> 
     Raises:
         InputError: There is less, in all.
     """
-    memory = MachineMemory.found()
+    memory = MachineMemory.detect()
     if needed_bytes > memory.total_bytes:
         raise InputError(
             f"{what} of {format_bytes(needed_bytes)} is more than there is: {format_bytes(memory.total_bytes)}, "
@@ -78,22 +104,17 @@ def require_machine_memory(needed_bytes: float, what: str, advice: str = "") -> 
         )
 
 
-def _limit_files(root: Path) -> Iterator[Path]:
-    """Yield the files that may limit the memory of this process: of its control groups and of those around them."""
+def _control_groups(root: Path, controller: str) -> Iterator[Path]:
+    """Yield the folders of the control groups that this process is in, and of those around them."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:  # no Linux
         return
     for line in lines:
         _, controllers, place = line.split(":", 2)
-        if controllers == "":
-            # Beyond the lower limit the kernel takes memory back, and the process all but stands still.
-            top, names = root / "sys/fs/cgroup", ["memory.max", "memory.high"]
-        elif "memory" in controllers.split(","):
-            top, names = root / "sys/fs/cgroup/memory", ["memory.limit_in_bytes"]
-        else:
+        if controllers and controller not in controllers.split(","):
             continue
-        group = top / place.lstrip("/")
+        top = root / "sys/fs/cgroup" / (controller if controllers else "")
         # Within a container, the group has the name that it has outside, and lies at the top.
-        folders = [folder for folder in (group, *group.parents) if folder.is_relative_to(top)]
-        yield from (folder / name for folder in folders for name in names)
+        group = top / place.lstrip("/")
+        yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(top))

@@ -1,4 +1,4 @@
-"""The memory of the machine, with the limits of control groups, which a made-up file system stands in for."""
+"""Memory and cores of the machine, with the limits of control groups, which a made-up file system stands in for."""
 
 from __future__ import annotations
 
@@ -14,77 +14,75 @@ import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import memory_limit
 from sobolev_batch.batch.cluster.workers import Workers, allowed_bytes
 from sobolev_batch.cli import cli
-from sobolev_batch.machine import MachineMemory, require_machine_memory
+from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
+from sobolev_batch.spectral.transform.settings import thread_count
 from tests.support.studies import small_table
 
 TOTAL = psutil.virtual_memory().total
-# Files by path, and the bytes that they leave of 1 TB.
-TREES: dict[str, tuple[dict[str, str], int | None]] = {
-    "no groups": ({}, None),
-    "version 2": ({"proc/self/cgroup": "0::/a/b\n", "sys/fs/cgroup/a/b/memory.max": "3000000\n"}, 3_000_000),
-    "version 2 without a limit": ({"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/memory.max": "max\n"}, None),
-    "a limit of the group around": (
-        {
-            "proc/self/cgroup": "0::/a/b\n",
-            "sys/fs/cgroup/a/b/memory.max": "max\n",
-            "sys/fs/cgroup/a/memory.max": "2000000\n",
-        },
-        2_000_000,
-    ),
-    "limits of three groups, of which the one between is the tightest": (
-        {
-            "proc/self/cgroup": "0::/a/b/c\n",
-            "sys/fs/cgroup/a/b/c/memory.max": "4000000\n",
-            "sys/fs/cgroup/a/b/memory.max": "2500000\n",
-            "sys/fs/cgroup/a/memory.max": "3000000\n",
-        },
+V1 = "5:cpu,cpuacct:/x\n4:hugetlb,memory:/jobs/7\n0::/\n"
+# Files below /sys/fs/cgroup beside the groups of this process, and the bytes that they leave.
+MEMORY: dict[str, tuple[str | None, dict[str, str], int | None]] = {
+    "no groups": (None, {}, None),
+    "version 2": ("0::/a/b\n", {"a/b/memory.max": "3000000"}, 3_000_000),
+    "version 2 without a limit": ("0::/a\n", {"a/memory.max": "max"}, None),
+    "the group between three is the tightest": (
+        "0::/a/b/c\n",
+        {"a/b/c/memory.max": "4000000", "a/b/memory.max": "2500000", "a/memory.max": "3000000"},
         2_500_000,
     ),
-    "the lower limit of version 2": (
+    "the lower limit": ("0::/a\n", {"a/memory.max": "4000000", "a/memory.high": "3500000"}, 3_500_000),
+    "a container, at whose top the group lies": ("0::/outside\n", {"memory.max": "5000000"}, 5_000_000),
+    "version 1": (V1, {"memory/jobs/7/memory.limit_in_bytes": "4000000"}, 4_000_000),
+    "version 1, around": (
+        V1,
         {
-            "proc/self/cgroup": "0::/a\n",
-            "sys/fs/cgroup/a/memory.max": "4000000\n",
-            "sys/fs/cgroup/a/memory.high": "3500000\n",
-        },
-        3_500_000,
-    ),
-    "a limit of the group around, in version 1": (
-        {
-            "proc/self/cgroup": "4:memory:/jobs/7\n",
-            "sys/fs/cgroup/memory/jobs/7/memory.limit_in_bytes": "9223372036854771712\n",
-            "sys/fs/cgroup/memory/jobs/memory.limit_in_bytes": "4500000\n",
+            "memory/jobs/7/memory.limit_in_bytes": "9223372036854771712",
+            "memory/jobs/memory.limit_in_bytes": "4500000",
         },
         4_500_000,
-    ),
-    "a container, at whose top the group lies": (
-        {"proc/self/cgroup": "0::/outside/name\n", "sys/fs/cgroup/memory.max": "5000000\n"},
-        5_000_000,
-    ),
-    "version 1": (
-        {
-            "proc/self/cgroup": "5:cpu:/x\n4:hugetlb,memory:/job\n0::/\n",
-            "sys/fs/cgroup/memory/job/memory.limit_in_bytes": "4000000\n",
-        },
-        4_000_000,
-    ),
-    "version 1 without a limit": (
-        {
-            "proc/self/cgroup": "4:memory:/job\n",
-            "sys/fs/cgroup/memory/job/memory.limit_in_bytes": "9223372036854771712\n",
-        },
-        None,
     ),
 }
 
 
-@pytest.mark.parametrize(("files", "limit"), TREES.values(), ids=TREES.keys())
-def test_limits_of_control_groups_count(files: dict[str, str], limit: int | None, tmp_path: Path) -> None:
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    memory = MachineMemory.found(tmp_path)
+def make_root(root: Path, groups: str | None, files: dict[str, str]) -> Path:
+    """A file system with control groups."""
+    paths = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
+    if groups is not None:
+        paths["proc/self/cgroup"] = groups
+    for name, text in paths.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root
+
+
+@pytest.mark.parametrize(("groups", "files", "limit"), MEMORY.values(), ids=MEMORY.keys())
+def test_limits_of_memory_count(groups: str | None, files: dict[str, str], limit: int | None, tmp_path: Path) -> None:
+    memory = MachineMemory.detect(make_root(tmp_path, groups, files))
     assert memory.total_bytes == (TOTAL if limit is None else limit)
     assert ("memory." in memory.source) == (limit is not None)
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "cores"),
+    [
+        (None, {}, 8),
+        ("0::/a\n", {"a/cpu.max": "max 100000"}, 8),
+        ("0::/a/b\n", {"a/b/cpu.max": "max 100000", "a/cpu.max": "250000 100000"}, 3),
+        ("0::/outside\n", {"cpu.max": "50000 100000"}, 1),
+        (V1, {"cpu/x/cpu.cfs_quota_us": "200000", "cpu/x/cpu.cfs_period_us": "100000"}, 2),
+        (V1, {"cpu/x/cpu.cfs_quota_us": "-1", "cpu/x/cpu.cfs_period_us": "100000"}, 8),
+    ],
+)
+def test_quotas_and_affinity_limit_cores(
+    groups: str | None, files: dict[str, str], cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: set(range(8)), raising=False)
+    assert available_cores(make_root(tmp_path, groups, files)) == cores
+
+
+def test_transforms_take_no_more_threads_than_there_are_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {0}, raising=False)
+    assert thread_count(None) == 1
 
 
 def test_more_than_there_is_is_refused_with_both_numbers() -> None:

@@ -15,7 +15,7 @@ from distributed import Client
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
-from sobolev_batch.batch.cluster.clients import available_cores, local_client, memory_limit, thread_client
+from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster
 from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_store_access
@@ -36,7 +36,7 @@ from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.html import reasons, table_html
-from sobolev_batch.machine import require_machine_memory
+from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.errors.budget import NormEstimate
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from sobolev_batch.batch.cluster.clients import available_cores
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
@@ -21,6 +20,7 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.html import reasons, table_html
+from sobolev_batch.machine import available_cores
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from distributed import Client
 
-from sobolev_batch.batch.cluster.clients import available_cores
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.sizing import TaskSizes, size_rows
@@ -22,6 +21,7 @@ from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.html import table_html
+from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.results.forecast import Forecast
 from sobolev_batch.spectral.lattice import Lattice

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Literal
 
 from sobolev_batch.html import table_html
-from sobolev_batch.machine import available
+from sobolev_batch.machine import available, available_cores
 from sobolev_batch.results.tables.formatting import Digits, rounded_outwards
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -141,7 +140,7 @@ def same_surface(
     area_change = surface.area / reference.area - 1
     similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
     pair = similarity.apply(surface), similarity.apply(reference)
-    found = relative_distance(*pair, checked_order, rtol, accuracy, os.cpu_count() or 1, seed)
+    found = relative_distance(*pair, checked_order, rtol, accuracy, available_cores(), seed)
     lower, upper = found.bounds.lower, found.bounds.upper
     outcome: Outcome = "same" if upper <= rtol else "different" if lower > rtol else "undecided"
     return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, found.method)

@@ -15,7 +15,7 @@ from distributed import Client, LocalCluster
 from sobolev_batch.batch.cluster import worker_preload
 from sobolev_batch.batch.cluster.connection import Address, check_connection
 from sobolev_batch.errors import ClusterError, InputError
-from sobolev_batch.machine import MachineMemory, require_machine_memory
+from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
 from sobolev_batch.parameters import byte_count, format_bytes
 
 # In less, a worker with all its libraries has no memory left for any transform.
@@ -42,7 +42,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.
-    limit = MachineMemory.found().total_bytes // count if memory is None else memory_limit(memory, count)
+    limit = MachineMemory.detect().total_bytes // count if memory is None else memory_limit(memory, count)
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
         _shielded_from_interrupts() as unshield,
@@ -197,11 +197,3 @@ def memory_limit(memory: float | str, workers: int) -> int:
     require_machine_memory(limit, "the memory of a worker")
     require_machine_memory(workers * limit, f"the memory of {workers} workers", "for each, or take fewer")
     return limit
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may run on."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
-        return os.cpu_count() or 1

@@ -48,7 +48,7 @@ def allowed_bytes(limit: float | None) -> float:
     Args:
         limit: Memory limit of the worker; without one, the machine's memory, which no limit can exceed.
     """
-    total = MachineMemory.found().total_bytes
+    total = MachineMemory.detect().total_bytes
     return _ALLOWED_FRACTION * min(limit or total, total) - _IDLE_BYTES
 
 
@@ -61,7 +61,7 @@ class Workers:
     @classmethod
     def of_this_machine(cls, count: int) -> Workers:
         """Return the workers of a cluster that a run without a scheduler would start here."""
-        allowed = allowed_bytes(MachineMemory.found().total_bytes / count)
+        allowed = allowed_bytes(MachineMemory.detect().total_bytes / count)
         return cls((WorkerInfo("this machine", 1, allowed, "cpu", ""),) * count)
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,6 +15,7 @@ from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.pilots import Members, Pilots
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import AccuracyError, StudyError
+from sobolev_batch.machine import available_cores
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
@@ -86,7 +86,7 @@ def choose_lattice(
             strict,
             Support(np.array(surface.area + reference.area), widths, reach),
             label,
-            os.cpu_count() or 1,
+            available_cores(),
         )
         for label, surface in pilots.surfaces.items()
     }

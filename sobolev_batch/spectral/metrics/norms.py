@@ -7,7 +7,6 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.machine import available
+from sobolev_batch.machine import available, available_cores
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.reference import Reference
@@ -270,7 +269,7 @@ def to_accuracy(
     if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     check_seed(seed)
-    problem = Problem.of(surfaces, orders, accuracy, f"the {name}", os.cpu_count() or 1)
+    problem = Problem.of(surfaces, orders, accuracy, f"the {name}", available_cores())
     solution = solve(problem, seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     reference = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import cast
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import LatticeError, MeshError
+from sobolev_batch.machine import available_cores
 from sobolev_batch.spectral.adaptive.frequencies import Frequencies
 from sobolev_batch.spectral.adaptive.problem import support_of
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
@@ -214,7 +214,7 @@ class _Curve:
 
 
 def _execution() -> Execution:
-    return Execution(threads=os.cpu_count() or 1)
+    return Execution(threads=available_cores())
 
 
 def _gap(found: float, wanted: float) -> float:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import get_args
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.dtypes import ComplexDtype
@@ -78,7 +78,7 @@ def thread_count(threads: int | None) -> int:
         InputError: It is no whole number from 1 to 1,024.
     """
     if threads is None:
-        return os.cpu_count() or 1
+        return available_cores()
     if not is_whole_number(threads) or not 1 <= threads <= _MOST_THREADS:
         raise InputError(f"threads must be a whole number from 1 to {_MOST_THREADS:,}, found {threads!r}")
     return int(threads)

@@ -69,7 +69,7 @@ def require_memory_to_read(needed_bytes: float) -> None:
     Raises:
         MeshError: It does; the message does not name the file.
     """
-    memory = MachineMemory.found()
+    memory = MachineMemory.detect()
     if needed_bytes > _MEMORY_PART * memory.total_bytes:
         raise MeshError(
             f"takes up to {format_bytes(needed_bytes)} of memory to read, and may take {_MEMORY_PART:.0%} of "

@@ -13,6 +13,7 @@ from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY
+from sobolev_batch.machine import MachineMemory
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
 
@@ -58,7 +59,9 @@ def test_workers_declare_their_memory(client: Client) -> None:
         declared = workers[member.address]["resources"]
         assert declared == {MEMORY: member.allowed_bytes}
         assert GPU not in declared
-        assert 0.5 < member.allowed_bytes / workers[member.address]["memory_limit"] < 0.85
+        limit = workers[member.address]["memory_limit"]
+        assert limit == MachineMemory.detect().total_bytes // len(workers)
+        assert 0.5 < member.allowed_bytes / limit < 0.85
 
 
 @pytest.mark.all
