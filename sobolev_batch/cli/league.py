@@ -34,8 +34,7 @@ def league_command(
 
     With --against, compare each method with itself in an earlier study instead.
     """
-    from sobolev_batch.results.league.changes import compare_studies
-    from sobolev_batch.results.league.league import league
+    from sobolev_batch.results.league.league import compare_studies, league
     from sobolev_batch.results.league.text import format_changes, format_league
 
     if against is not None:

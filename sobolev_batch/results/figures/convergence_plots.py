@@ -21,7 +21,6 @@ from sobolev_batch.results.figures.style import (
     shortened,
     style_of,
 )
-from sobolev_batch.results.league.curves import Curve
 from sobolev_batch.results.league.league import League
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
@@ -30,8 +29,6 @@ from sobolev_batch.results.tables.sizes import is_sequence, label_of, sizes_of
 
 _HEIGHT_INCHES = 3.6
 _MOST_NAMED = 3
-# Of a logarithm; a bar beyond it would leave no room for the distances.
-_LARGEST_ERROR = 3.0
 
 
 @dataclass(frozen=True)
@@ -157,9 +154,8 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     """Draw the mean relative distance of each method of a league against the mean size of its meshes."""
     set_log_scale(axes, "xy")
     for number, method in enumerate(league.scores.methods):
-        mean = mean_curve(league, method)
-        places, values = np.exp(mean.sizes), np.exp(mean.values)
-        draw_curve(axes, places, values, bars_of(mean), style_of(number), shortened(method))
+        mean = league.scores.mean_curve(method)
+        draw_curve(axes, np.exp(mean.sizes), np.exp(mean.values), mean.bars, style_of(number), shortened(method))
     count = len(league.scores.objects)
     set_title(axes, f"order {league.order:g}, mean of {count} object{'s' if count > 1 else ''}")
     axes.set_xlabel(escaped(label_of(league.x)))
@@ -169,17 +165,3 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
 LEAGUE = Plot[Sequence[League]](
     draw_league, lambda leagues: leagues, _HEIGHT_INCHES, "Mean relative distance by method"
 )
-
-
-def mean_curve(league: League, method: str) -> Curve:
-    """Return the mean of a method's curves over the objects, point by point, as far as all of them go."""
-    curves = [league.curves[name][method] for name in league.scores.objects]
-    count = min(len(curve.sizes) for curve in curves)
-    columns = ([getattr(curve, name)[:count] for curve in curves] for name in ("sizes", "values", "errors"))
-    return Curve(*(np.mean(column, axis=0) for column in columns))
-
-
-def bars_of(curve: Curve) -> Reals:
-    """Return the errors (n,) of a curve's distances; where nothing bounds one, it is as large as the distance."""
-    factors = np.where(np.isfinite(curve.errors), np.expm1(np.minimum(curve.errors, _LARGEST_ERROR)), 1.0)
-    return np.exp(curve.values) * factors

@@ -323,8 +323,8 @@ def plot_transform(store: AnyStore, family: Families = None, ax: Axes | None = N
 def plot_league(league: League, ax: Axes | None = None) -> Axes:
     """Plot the mean relative distance of each method of a league against the mean size of its meshes.
 
-    The points are geometric means over the objects: of the coarsest meshes, of the next ones, and so on. Bars show the
-    errors of the distances. Both axes are logarithmic.
+    The points are geometric means over the objects, at the sizes at which the table compares the methods. Bars show
+    the errors of the distances. Both axes are logarithmic.
 
     Args:
         league: League at one order, see `league`.

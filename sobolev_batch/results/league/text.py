@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pandas as pd
 
-from sobolev_batch.results.league.intervals import least_objects
 from sobolev_batch.results.league.league import League
+from sobolev_batch.results.league.statistics import least_objects
 from sobolev_batch.results.tables.defaults import Format
 from sobolev_batch.results.tables.text import machine_table, printed_table, prose
 

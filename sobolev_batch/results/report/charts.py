@@ -11,11 +11,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.results.figures.convergence_plots import bars_of, mean_curve
 from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
 from sobolev_batch.results.figures.selection import Spectra
-from sobolev_batch.results.league.curves import Curve
-from sobolev_batch.results.league.league import League
+from sobolev_batch.results.league.league import League, Scores
 from sobolev_batch.results.meshes.views import MeshView, Views
 from sobolev_batch.results.report.limits import ReportLimits
 from sobolev_batch.results.tables.convergence import table
@@ -55,16 +53,17 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "orders": list(orders),
         "families": list(leagues[0].scores.methods) if leagues else [],
         "size": label_of(leagues[0].x) if leagues else "",
-        "league": [[_method(method, mean_curve(one, method)) for method in one.scores.methods] for one in leagues],
+        "league": [[_method(method, league.scores) for method in league.scores.methods] for league in leagues],
     }
 
 
-def _method(method: str, curve: Curve) -> Json:
+def _method(method: str, scores: Scores) -> Json:
+    curve = scores.mean_curve(method)
     return {
         "family": method,
         "sizes": _numbers(np.exp(curve.sizes)),
         "values": _numbers(np.exp(curve.values)),
-        "errors": _numbers(bars_of(curve), digits=2),
+        "errors": _numbers(curve.bars, digits=2),
     }
 
 

@@ -12,8 +12,8 @@ import pytest
 from scipy import stats
 
 import sobolev_batch as sb
-from sobolev_batch.results.league.intervals import Interval, adjusted, sign_flip_test, within_objects
 from sobolev_batch.results.league.league import League, leagues_of
+from sobolev_batch.results.league.statistics import Interval, adjusted, sign_flip_test, within_objects
 from sobolev_batch.results.league.text import format_league
 
 SIZES = (100, 400, 1600)
@@ -82,6 +82,17 @@ def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
     assert made.pairs["ratio"].item() == pytest.approx(1.0)
     # The middle of the common range, 100 to 1600, on a logarithmic axis.
     np.testing.assert_allclose(made.table["relative"], 1 / 400)
+
+
+def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes(ranked: Ranked) -> None:
+    # The k-th meshes of the objects differ in size: a mean of these would put b below a.
+    plain = frame({"a": {n: 1.0 / n for n in (100, 400, 1600)}, "b": {n: 2.0 / n for n in (400, 1600, 6400)}})
+    made = ranked({"x": plain, "y": frame({"a": {n: 3.0 / n for n in SIZES}, "b": {n: 6.0 / n for n in SIZES}})})
+    lines = {line.get_label(): line for line in sb.plot_league(made).lines}
+    for method, relative in made.table.set_index("method")["relative"].items():
+        places, values = np.asarray(lines[str(method)].get_xydata()).T
+        assert np.exp(np.log(values).mean()) == pytest.approx(relative, rel=1e-12)
+        assert (np.diff(places) > 0).all()
 
 
 def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
@@ -186,7 +197,7 @@ def test_one_object_has_no_intervals_and_no_ranks(ranked: Ranked) -> None:
 def test_intervals_are_those_of_student() -> None:
     values = np.random.default_rng(1).normal(2.0, 0.3, 12)
     known = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    made = Interval.of(values, np.full(12, 0.05))
+    made = Interval.from_values(values, np.full(12, 0.05))
     assert made.low == pytest.approx(known.low - 0.05)
     assert made.high == pytest.approx(known.high + 0.05)
 

@@ -67,7 +67,7 @@ def test_the_page_opens_with_the_league(reader: Browser, page: Path, store: str)
     assert shown == league.table["method"].tolist()
     assert reader.tell("document.querySelector('main table').id") == "table-league"
     drawn = reader.tell("document.getElementById('chart-league').data.map(line => line.y.length)")
-    assert drawn == [2, 2]
+    assert drawn == [5, 5]
     assert reader.texts("#failed tbody th") == ["gone"]
     assert reader.texts("#table-objects tbody:not([hidden]) th.label") == ["ball", "large"]
 

@@ -1,22 +1,108 @@
-"""Means over objects, with intervals, and tests whether two methods differ."""
+"""Curves of distances over sizes, means over objects with their intervals, and tests whether two methods differ."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Self
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from sobolev_batch.results.tables.sizes import sizes_of
+from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
+
 Reals = NDArray[np.float64]
 
+# Sizes at which curves are compared, evenly spaced on a logarithmic axis.
+_SIZES = 5
+# Curves whose ranges miss each other by less than this are compared between their ends.
+_LARGEST_GAP = 1.2
+# Meshes whose sizes differ by a smaller factor tell no rate.
+_SMALLEST_RANGE = 1.1
+# Of a logarithm; the bar of a larger error would leave no room for the distances.
+_LARGEST_ERROR = 3.0
 CONFIDENCE = 0.95
 # A p-value below it counts as a difference.
 SIGNIFICANCE = 0.05
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The distances of the meshes of one method from one object.
+
+    Attributes:
+        sizes: Logarithms of the sizes (n,), ascending.
+        values: Logarithms of the relative distances (n,).
+        errors: Bounds on the errors of these logarithms (n,), infinite where a distance is not larger than its error.
+    """
+
+    sizes: Reals
+    values: Reals
+    errors: Reals
+
+    @classmethod
+    def from_rows(cls, rows: pd.DataFrame, x: str) -> Self | None:
+        """Return the curve of some rows of `table`, of one order and family; None where no mesh has a distance."""
+        sizes, relative = sizes_of(rows, x), rows["relative"].to_numpy()
+        known = np.isfinite(sizes) & np.isfinite(relative)
+        if not known.any():
+            return None
+        order = np.argsort(sizes[known], kind="stable")
+        relative = relative[known][order]
+        relative_errors = rows["relative_error"].to_numpy()[known][order]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.fmin(relative_errors / relative, 1.0)
+            return cls(np.log(sizes[known][order]), np.log(relative), -np.log1p(-shares))
+
+    @property
+    def bars(self) -> Reals:
+        """Errors (n,) of the distances themselves; where nothing bounds one, it is as large as the distance."""
+        factors = np.where(np.isfinite(self.errors), np.expm1(np.minimum(self.errors, _LARGEST_ERROR)), 1.0)
+        return np.exp(self.values) * factors
+
+    @property
+    def is_exact(self) -> bool:
+        """True if a mesh is next to equal to the object, so that its distance tells of rounding alone."""
+        return bool(np.any(self.values < np.log(NEXT_TO_EQUAL)))
+
+    def at(self, sizes: Reals) -> tuple[Reals, Reals]:
+        """Return the logarithms of the distances at some sizes, on straight lines between the meshes, with errors.
+
+        Beyond the ends the distance is that of the last mesh: a line through two of about one size could lead anywhere.
+        """
+        own, index, counts = np.unique(self.sizes, return_inverse=True, return_counts=True)
+        # Of meshes of one size, the geometric mean.
+        values, errors = (np.bincount(index, numbers) / counts for numbers in (self.values, self.errors))
+        left = np.clip(np.searchsorted(own, sizes, side="right") - 1, 0, len(own) - 1)
+        right = np.minimum(left + 1, len(own) - 1)
+        # The larger of both errors, since an infinite one has no weight that one could take.
+        return np.interp(sizes, own, values), np.maximum(errors[left], errors[right])
+
+    def slope(self) -> tuple[float, float]:
+        """Return the slope of the least-squares line and a bound on its error; NaN where sizes hardly differ."""
+        if np.ptp(self.sizes) < np.log(_SMALLEST_RANGE):
+            return np.nan, np.nan
+        centred = self.sizes - self.sizes.mean()
+        square = float(centred @ centred)
+        weights = centred / square
+        with np.errstate(invalid="ignore"):
+            error = float(np.abs(weights) @ self.errors)
+        return float(weights @ self.values), np.inf if np.isnan(error) else error
+
+
+def common_sizes(curves: Sequence[Curve]) -> Reals | None:
+    """Return sizes (5,) in the range that all curves have, all alike between their ends where these nearly meet."""
+    low, high = max(curve.sizes[0] for curve in curves), min(curve.sizes[-1] for curve in curves)
+    if low <= high:
+        return np.linspace(low, high, _SIZES)
+    return np.full(_SIZES, (low + high) / 2) if low - high <= np.log(_LARGEST_GAP) else None
 
 
 @dataclass(frozen=True)
@@ -34,7 +120,7 @@ class Interval:
     high: float
 
     @classmethod
-    def of(cls, values: Reals, errors: Reals, spread: float | None = None) -> Interval:
+    def from_values(cls, values: Reals, errors: Reals, spread: float | None = None) -> Interval:
         """Return the interval of the mean by Student's t.
 
         Args:
