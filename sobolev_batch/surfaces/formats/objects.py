@@ -1,20 +1,22 @@
-"""Meshes of other libraries, paths and pairs of arrays, wherever a mesh is expected.
+"""Meshes of other libraries, paths and pairs of arrays, wherever a mesh is expected; and meshes written to files.
 
-Libraries are told by the names of their classes, and none is imported.
+Libraries are known by the names of their classes, and none is imported.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.surfaces.formats.readers import read_mesh
+from sobolev_batch.surfaces.formats.readers import WRITERS, read_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -130,6 +132,72 @@ def as_surface(surface: SurfaceLike) -> Surface:
     if isinstance(surface, Sphere | Smooth):
         return surface
     return _converted(surface, f"{_EXPECTED}, {_SURFACES} or a Fourier field")
+
+
+def write_mesh(mesh: MeshLike, path: str | Path) -> None:
+    """Write a mesh to a file in the format of its suffix: .ply, .obj, .stl or .off.
+
+    Coordinates keep all digits, except in STL, which has single precision and no shared vertices.
+
+    Args:
+        mesh: Mesh to write, or what `as_mesh` makes one of.
+        path: File to write; it replaces one of the same name once it is whole.
+
+    Raises:
+        InputError: The suffix is none of these, or the path is a folder or a device.
+        MeshError: The file cannot be written; or see `as_mesh`.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import sobolev_batch as sb
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sb.write_mesh(sb.icosphere(1), Path(folder) / "ball.obj")
+    ...     sb.read_mesh(Path(folder) / "ball.obj")
+    Mesh(42 vertices, 80 triangles)
+    """
+    path = require_writable(path)
+    data = WRITERS[path.suffix.lower()](as_mesh(mesh))
+    # The old file stays until the new one is whole: a disk may be full.
+    with _new_file_beside(path) as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+        os.replace(file.name, os.path.realpath(path))
+
+
+def require_writable(path: str | Path) -> Path:
+    """Return a path whose suffix names a format that can be written, in a folder that files can be made in.
+
+    Raises:
+        InputError: It is none, or something else than a file is there.
+        MeshError: No file can be made in its folder.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        raise InputError(f"{path}: meshes are written as {', '.join(WRITERS)}; found the suffix {path.suffix!r}")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
+    with _new_file_beside(path):
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: something that is no file is there already; name another file")
+    return path
+
+
+@contextmanager
+def _new_file_beside(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file that may take the place of another one; it is gone at the end unless it has.
+
+    Raises:
+        MeshError: It cannot be made or written.
+    """
+    place = path.parent / f".{uuid4().hex}{path.suffix}"
+    try:
+        with place.open("xb") as file:
+            yield file
+    except OSError as error:
+        raise MeshError(f"{path}: the mesh cannot be written there: {error.strerror or error}") from error
+    finally:
+        place.unlink(missing_ok=True)
 
 
 def _converted(found: Any, expected: str) -> Mesh:

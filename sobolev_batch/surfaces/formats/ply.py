@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
 
@@ -18,9 +17,9 @@ from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.polygons import triangle_fans_of_lists
+from sobolev_batch.surfaces.formats.raw_files import Raw
 from sobolev_batch.surfaces.formats.text_formats import LONGEST_LINE
-
-Raw = tuple[NDArray[np.floating], NDArray[np.int64]]
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # A header ends within so many bytes: room for a thousand lines, and quick to look through.
 HEADER_BYTES = 1 << 16
@@ -35,12 +34,8 @@ _TYPE_BYTES = dict.fromkeys(_SHORT, 2) | dict.fromkeys(_LONG, 4) | dict.fromkeys
 _TEXT_BYTES = 2
 
 
-def parse_ply(data: bytes, path: Path) -> Raw:
+def parse_ply(data: bytes) -> Raw:
     """Return the vertices and triangles of a PLY file, in its own precision.
-
-    Args:
-        data: Contents of the file.
-        path: Path of the file; unused, since a PLY file refers to no others.
 
     Raises:
         MeshError: There are no vertices or faces, or the counts do not fit the contents.
@@ -51,6 +46,19 @@ def parse_ply(data: bytes, path: Path) -> Raw:
         ply = _read_checked(source, header)
     vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
     return vertices, _triangles(ply["face"])
+
+
+def write_ply(mesh: Mesh) -> bytes:
+    """Return a binary PLY file, all digits kept."""
+    vertices = np.empty(len(mesh.vertices), dtype=[(axis, "<f8") for axis in "xyz"])
+    for axis, column in zip("xyz", mesh.vertices.T, strict=True):
+        vertices[axis] = column
+    faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    file = io.BytesIO()
+    PlyData(elements, text=False, byte_order="<").write(file)
+    return file.getvalue()
 
 
 def _checked_header(data: bytes) -> _Header:

@@ -11,12 +11,17 @@ import zlib
 from collections.abc import Callable
 from io import BufferedReader
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 from xml.parsers import expat
+
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.machine import MachineMemory
 from sobolev_batch.parameters import format_bytes
+
+# What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
+Raw = tuple[NDArray[Any], NDArray[Any]]
 
 # No larger file is read; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
@@ -25,10 +30,11 @@ _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
 _CHUNK_BYTES = 1 << 20
 # Part of the machine's memory that reading a file may take; others use it too.
 _MEMORY_PART = 0.75
-# XML that parsers would hold in memory many times over: one tag with its attributes, comment or instruction, elements
-# within each other, and elements in all. Those of surfaces are a few hundred bytes, five deep and a few hundred.
-_LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 20, 100, 100_000
-_XML_BYTES = 1 << 16
+# XML that parsers would go through again and again, or hold in memory many times over: one tag with its attributes,
+# comment or instruction, elements within each other, and elements in all. Those of surfaces are a few hundred bytes,
+# five deep and a few hundred.
+_LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
+_XML_BYTES = 1 << 14
 
 
 def open_regular(path: Path) -> BufferedReader:

@@ -1,7 +1,6 @@
-"""Vertices and faces of OBJ and OFF files.
+"""OBJ, OFF and STL files, read with every line and every announced count checked, and written.
 
-Both are read here because the libraries at hand silently lose or change faces where a line is not what
-they expect. This reader checks every line and every announced count.
+The libraries at hand silently lose or change faces where a line is not what they expect.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import triangle_fans
-
-Raw = tuple[NDArray[np.float64], NDArray[np.int64]]
+from sobolev_batch.surfaces.formats.polygons import merge_coincident, triangle_fans
+from sobolev_batch.surfaces.formats.raw_files import Raw
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
@@ -29,6 +28,10 @@ _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 _MOST_DIGITS = 18
 # Characters of a line: a polygon of a hundred thousand corners.
 LONGEST_LINE = 1 << 20
+# Seventeen digits give every double back.
+_DIGITS = "%.17g"
+_STL_HEADER_BYTES = 84
+_STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def parse_obj(data: bytes) -> Raw:
@@ -92,6 +95,51 @@ def parse_off(data: bytes) -> Raw:
         corners.extend(polygon)
         sizes.append(len(polygon))
     return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
+
+
+def parse_stl(data: bytes) -> Raw:
+    """Return the vertices and triangles of an STL file; corners that coincide exactly are merged.
+
+    Raises:
+        MeshError: The size does not fit the announced count, or the text is malformed.
+    """
+    announced = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
+    if len(data) >= _STL_HEADER_BYTES and len(data) == _STL_HEADER_BYTES + _STL_RECORD.itemsize * announced:
+        corners = np.frombuffer(data, _STL_RECORD, offset=_STL_HEADER_BYTES)["corners"].reshape(-1, 3)
+    elif data.lstrip()[:5].lower() == b"solid":
+        corners = _stl_text_corners(data)
+    else:
+        count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
+        raise MeshError(
+            f"a binary STL file of {len(data)} bytes holds {count:.2f} triangles, but its header announces {announced}"
+        )
+    if not len(corners):
+        raise MeshError("the file has no faces")
+    return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+def write_obj(mesh: Mesh) -> bytes:
+    """Return an OBJ file, all digits kept."""
+    file = io.BytesIO()
+    np.savetxt(file, mesh.vertices, fmt=f"v {_DIGITS} {_DIGITS} {_DIGITS}")
+    np.savetxt(file, mesh.triangles + 1, fmt="f %d %d %d")
+    return file.getvalue()
+
+
+def write_off(mesh: Mesh) -> bytes:
+    """Return an OFF file, all digits kept."""
+    file = io.BytesIO()
+    file.write(f"OFF\n{len(mesh.vertices)} {len(mesh.triangles)} 0\n".encode())
+    np.savetxt(file, mesh.vertices, fmt=_DIGITS)
+    np.savetxt(file, mesh.triangles, fmt="3 %d %d %d")
+    return file.getvalue()
+
+
+def write_stl(mesh: Mesh) -> bytes:
+    """Return a binary STL file, which has single precision and no shared vertices."""
+    import trimesh
+
+    return bytes(trimesh.exchange.stl.export_stl(mesh.to_trimesh()))
 
 
 def text_lines(data: bytes, errors: str = "replace") -> Iterator[str]:
@@ -196,3 +244,33 @@ def _off_polygon(words: list[str], number: int) -> list[int]:
 
 def _complete_face(words: list[str]) -> bool:
     return _is_count(words[0]) and len(words) - 1 - int(words[0]) in _OFF_FACE_EXTRAS
+
+
+def _stl_text_corners(data: bytes) -> NDArray[np.float64]:
+    corners = array("d")
+    facet, facet_corners, in_solid = 0, 0, False
+    for line in text_lines(data):
+        words = line.split()
+        match words[0].lower() if words else "":
+            case "":
+                continue
+            case "solid" | "endsolid" as word:
+                in_solid = word == "solid"
+            case "facet":
+                facet, facet_corners = facet + 1, 0
+            case "vertex":
+                if len(words) != 4:
+                    raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
+                corners.extend(parsed_numbers(words[1:], f"facet {facet}"))
+                facet_corners += 1
+            case "endfacet":
+                if facet_corners != 3:
+                    raise MeshError(f"facet {facet} has {facet_corners} vertices, expected three")
+                facet_corners = 0
+            case "outer" | "endloop":
+                continue
+            case other:
+                raise MeshError(f"after facet {facet}: {other[:40]!r} is no word of an STL file")
+    if in_solid or facet_corners:
+        raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
+    return np.array(corners).reshape(-1, 3)

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.polygons import triangle_fans, triangle_strips
-from sobolev_batch.surfaces.formats.raw_files import parse_xml
+from sobolev_batch.surfaces.formats.raw_files import Raw, parse_xml
 
-Raw = tuple[NDArray[Any], NDArray[np.int64]]
 Indices = NDArray[np.int64]
 
 _POLYGON, _STRIP, _PIXEL = 7, 6, 8

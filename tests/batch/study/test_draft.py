@@ -204,13 +204,11 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     write(tmp_path / "in" / "scan_1.ply", 1)
     write(tmp_path / "in" / "scan_2.ply", 1)
     (tmp_path / "in" / "scan_3.ply").write_text("nothing")
-    (tmp_path / "in" / "cad.step").write_text("nothing")
     (tmp_path / "in" / "notes.txt").write_text("nothing")
     write(tmp_path / "in" / "{object}.ply", 1)
     write(tmp_path / "in" / "old.zarr" / "mesh.ply", 4)
     draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
-    assert sorted(draft.left_out) == ["cad.step", "scan_3.ply", "{object}.ply"]
-    assert "convert it" in draft.left_out["cad.step"]
+    assert sorted(draft.left_out) == ["scan_3.ply", "{object}.ply"]
     assert "left out: scan_3.ply: " in str(draft)
     text = draft.path.read_text(encoding="utf-8")
     assert 'paths = ["in/scan_1.ply", "in/scan_2.ply"]' in text

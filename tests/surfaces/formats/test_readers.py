@@ -394,6 +394,7 @@ def test_quadrilaterals_of_freesurfer_are_cut(read: Read) -> None:
         ("inner_skull.surf", "freesurfer", "inner_skull.surf"),
         ("lh.pial.surf.gii", ".gii", "lh.pial.surf"),
         ("lh.aparc.annot", ".annot", "lh.aparc"),
+        ("lh.asc", "freesurfer", "lh.asc"),
         ("scan.VTP.GZ", ".vtp.gz", "scan"),
         ("alh.pial", ".pial", "alh"),
     ],

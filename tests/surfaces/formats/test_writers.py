@@ -44,7 +44,7 @@ def test_other_programs_read_them(suffix: str, tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(
-        sb.InputError, match=re.escape("are written as .ply, .obj, .off, .stl; found the suffix '.xyz'")
+        sb.InputError, match=re.escape("are written as .ply, .obj, .stl, .off; found the suffix '.xyz'")
     ):
         sb.write_mesh(MESH, tmp_path / "mesh.xyz")
     with pytest.raises(sb.InputError, match="there is no folder"):
