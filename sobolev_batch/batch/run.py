@@ -335,7 +335,6 @@ def carry_out(
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend)
             cluster.workers.require_accuracy(study.accuracy)
-            workspace.store.scratch.discard()
             return _Run(cluster, heartbeat).carry_out(workspace)
 
 

@@ -11,7 +11,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.fields.sizing import TaskSizes, size_rows
+from sobolev_batch.batch.fields.memory import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
@@ -210,9 +210,6 @@ class StudyPlan:
         )
         chunks = len(self._plan.blocks)
         yield "tasks", f"{self.task_count} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}"
-        for label, size in self._sizes.items():
-            if size.batches > 1:
-                yield "split", f"{label} into {size.batches} batches of triangles"
         if self._sizes:
             largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
             yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"

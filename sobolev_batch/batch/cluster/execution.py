@@ -26,7 +26,6 @@ class Task:
         arguments: Arguments of the call. Results take the place of tasks among them, also within a list.
         projected_bytes: Memory that the call takes at most.
         needs_gpu: True where the call has to run on a worker with a GPU.
-        priority: Tasks of higher priority run first.
         row: Row of the store that the task works for, for the caller.
         label: Label of the mesh that it works for, for people.
     """
@@ -35,7 +34,6 @@ class Task:
     arguments: tuple[Any, ...]
     projected_bytes: float = 0.0
     needs_gpu: bool = False
-    priority: int = 0
     row: int = -1
     label: str = ""
 
@@ -64,16 +62,13 @@ class Cluster:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
         return cls(client, prepare_workers(client, libraries), notify)
 
-    def run(
-        self, tasks: Iterable[Task], projected_bytes: float = 0.0, in_flight: int | None = None
-    ) -> Iterator[tuple[Task, Any]]:
+    def run(self, tasks: Iterable[Task], projected_bytes: float = 0.0) -> Iterator[tuple[Task, Any]]:
         """Have tasks done. Those whose workers died are tried again alone, after all others.
 
         Args:
             tasks: Tasks, read as they are handed out.
             projected_bytes: Most memory that any of them takes. Where as many tasks as a worker has threads fit
                 beside each other, none has to claim its memory, and the scheduler is free to place them.
-            in_flight: Number of tasks that the scheduler may know of at a time.
 
         Yields:
             Each task with its result, or with the exception that ended it: a `ClusterError` where no worker has
@@ -84,7 +79,7 @@ class Cluster:
             ClusterError: The scheduler was lost.
         """
         claims_memory = projected_bytes > self.workers.allowed_bytes_per_task
-        most = in_flight or max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
+        most = max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
         suspects: list[Task] = []
         for task, outcome in self._run_once(tasks, claims_memory, most):
             # It need not be what killed them: another task beside it may have been. Alone, it shows.
@@ -154,7 +149,6 @@ class Cluster:
                 *map(submitted, task.arguments),
                 # A worker that stays silent is told with the meshes that it has.
                 key=(f"{task.function.__name__}-{uuid4().hex}", label),
-                priority=task.priority,
                 resources=resources or None,
             )
         return futures[id(task)]

@@ -7,9 +7,15 @@ from collections.abc import Iterator, Sequence
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
-from sobolev_batch.batch.fields.graph import field_task
-from sobolev_batch.batch.fields.sizing import reference_in_tasks, size_rows
-from sobolev_batch.batch.fields.tasks import FieldSettings, Job
+from sobolev_batch.batch.fields.memory import TaskSizes, reference_in_tasks, size_rows
+from sobolev_batch.batch.fields.tasks import (
+    FieldSettings,
+    Job,
+    compute_blocks,
+    compute_mesh,
+    compute_octaves,
+    finish_mesh,
+)
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.workspace import Workspace
@@ -45,22 +51,28 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
     settings, reference = FieldSettings.of(plan), reference_in_tasks(plan)
 
     def tasks() -> Iterator[Task]:
-        for rank, i in enumerate(i for i in pending if rows[i].label in sizes):
+        for i in pending:
             row = rows[i]
-            allowed_bytes = sizes[row.label].allowed_bytes
-            job = Job(store, i, row, settings, plan.distance_target(row), allowed_bytes, reference)
-            yield field_task(job, sizes[row.label], rank)
+            if row.label in sizes:
+                allowed_bytes = sizes[row.label].allowed_bytes
+                job = Job(store, i, row, settings, plan.distance_target(row), allowed_bytes, reference)
+                yield _field_task(job, sizes[row.label])
 
-    # A mesh in batches occupies all workers by itself, and its batches the scratch space.
-    is_split = any(size.batches > 1 for size in sizes.values())
     projected_bytes = max((size.projected_bytes for size in sizes.values()), default=0.0)
-    in_flight = cluster.workers.threads + 1 if is_split else None
-    for task, outcome in cluster.run(tasks(), projected_bytes, in_flight):
-        if sizes[rows[task.row].label].batches > 1:
-            store.scratch.discard(task.row)
+    for task, outcome in cluster.run(tasks(), projected_bytes):
         if isinstance(outcome, Record):
             take(task.row, outcome)
         else:
             give_up(task.row, describe_failure(outcome))
-    if is_split:
-        store.scratch.discard()
+
+
+def _field_task(job: Job, sizes: TaskSizes) -> Task:
+    """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
+    needs_gpu = job.settings.backend == "gpu"
+    if len(sizes.block_groups) == 1:
+        (blocks,) = sizes.block_groups
+        return Task(compute_mesh, (job, blocks), sizes.projected_bytes, needs_gpu, job.index, job.row.label)
+    groups = [Task(compute_blocks, (job, blocks), sizes.projected_bytes, needs_gpu) for blocks in sizes.block_groups]
+    if job.settings.tail is not None:
+        groups.append(Task(compute_octaves, (job,), sizes.projected_bytes, needs_gpu))
+    return Task(finish_mesh, (job, groups), row=job.index, label=job.row.label)

@@ -23,7 +23,7 @@ from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
+from sobolev_batch.spectral.errors.a_priori import choose_settings
 from sobolev_batch.spectral.errors.probe import Probe, join
 from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.errors.samples import draws_for, probe_block
@@ -31,7 +31,7 @@ from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.spectral.octaves.values import OctaveValues, Settings, octave_values, settings_for
+from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -125,15 +125,17 @@ class Job:
             surface, self.settings.lattice, self.distance_target.error_target(surface), self.settings.transform
         )
 
-    def octave_target(self, surface: Surface) -> ErrorTarget | None:
-        """Return the largest error of a surface's values in each octave, if an accuracy is asked for."""
-        target = self.distance_target
-        return None if target is None else target.error_target(surface).tightened(_OCTAVES_SHARE)
-
-    def octave_settings(self, target: ErrorTarget | None) -> Settings:
-        """Return a function that gives the settings of transforms in octaves, for an `octave_target`."""
+    def octave_settings(self, surface: Surface) -> Settings:
+        """Return a function that gives the settings of a surface's transforms in octaves."""
         transform = self.settings.transform
-        return settings_for(target, transform.dtype) if target is not None else lambda surface, lattice: transform
+        if self.distance_target is None:
+            return lambda surface, lattice: transform
+        return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE), transform.dtype)
+
+    def stored_record(self) -> Record | None:
+        """Return the completion record of the field if it is there: Dask repeats tasks whose worker was lost."""
+        record = self.store.read_record(self.index)
+        return record if record is not None and record.completes(self.row.key) else None
 
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
@@ -161,36 +163,39 @@ class StoredBlocks:
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
-    """Compute and store the whole field of a mesh, then its completion record, unless that is there."""
-    # Dask has a task done again whose worker was lost with the result.
-    record = job.store.read_record(job.index)
-    if record is not None and record.completes(job.row.key):
-        return record
+    """Compute and store the whole field of a mesh, then its completion record, unless that is there.
 
-    def compute(surface: Surface) -> list[StoredBlocks]:
-        field = _store_some(job, surface, blocks)
-        return [field] if job.settings.tail is None else [field, store_octaves(job, surface)]
-
-    return finish_mesh(job, _of_loaded(job, compute))
-
-
-def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks:
-    """Compute and store some blocks of a mesh's field; see `compute_octaves`."""
-    (stored,) = _of_loaded(job, lambda surface: [_store_some(job, surface, blocks)])
-    return stored
-
-
-def compute_octaves(job: Job) -> StoredBlocks:
-    """Compute and store a mesh's values in octaves.
-
-    A mesh that cannot be loaded or transformed does not raise: the reason is part of the outcome, so
-    that one bad mesh stops nothing else.
+    A mesh that cannot be loaded or transformed does not raise: the reason goes into its record, so that one bad mesh
+    stops nothing else.
 
     Raises:
         StoreError: The store cannot be written, which is not the mesh's fault.
     """
-    (stored,) = _of_loaded(job, lambda surface: [store_octaves(job, surface)])
-    return stored
+
+    def compute(surface: Surface) -> list[StoredBlocks]:
+        field = _store_some(job, surface, blocks)
+        return [field] if job.settings.tail is None else [field, _store_octaves(job, surface)]
+
+    return job.stored_record() or _finished(job, _of_loaded(job, compute))
+
+
+def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks | Record:
+    """Compute and store some blocks of a mesh's field; see `compute_octaves`."""
+    return job.stored_record() or _of_loaded(job, lambda surface: [_store_some(job, surface, blocks)])[0]
+
+
+def compute_octaves(job: Job) -> StoredBlocks | Record:
+    """Compute and store a mesh's values in octaves, unless its completion record is there; then return that.
+
+    See `compute_mesh` for failures.
+    """
+    return job.stored_record() or _of_loaded(job, lambda surface: [_store_octaves(job, surface)])[0]
+
+
+def finish_mesh(job: Job, parts: Sequence[StoredBlocks | Record]) -> Record:
+    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it is there."""
+    record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
+    return record or _finished(job, [part for part in parts if isinstance(part, StoredBlocks)])
 
 
 def _of_loaded(job: Job, compute: Callable[[Surface], list[StoredBlocks]]) -> list[StoredBlocks]:
@@ -208,41 +213,26 @@ def _of_loaded(job: Job, compute: Callable[[Surface], list[StoredBlocks]]) -> li
 def _store_some(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
     is_whole = tuple(blocks) == (job.settings.lattice.half,)
     stored = _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
-    return replace(stored, facts=facts_of(surface, stored.facts.points))
+    return replace(stored, facts=_facts_of(surface, stored.facts.points))
 
 
-def store_octaves(job: Job, surface: Surface) -> StoredBlocks:
+def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     """Compute and store a surface's values at all samples of octaves."""
     tail = job.settings.tail
     if tail is None:
         raise ValueError("the study has no octaves")
-    settings = job.octave_settings(job.octave_target(surface))
+    settings = job.octave_settings(surface)
     values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
     own, reference = EnergyLimit.of([surface], [1]), job.load_reference()
     difference = None if reference is None else EnergyLimit.of([surface, reference], [1, -1])
-    return finish_octaves(job, Quality.from_surface(surface, Probe()), values, own, difference)
-
-
-def finish_octaves(
-    job: Job, quality: Quality, values: Sequence[OctaveValues], own: EnergyLimit, difference: EnergyLimit | None
-) -> StoredBlocks:
-    """Store values in octaves, and return what errors follow from.
-
-    Args:
-        job: The row.
-        quality: Quality of the surface with an empty probe.
-        values: Values in each octave.
-        own: Limit of the surface's energy.
-        difference: Limit of the energy of its difference from the reference, if known.
-    """
-    checksum = job.store.write_octaves(job.index, np.concatenate([one.values for one in values]))
-    tail = TailQuality(
-        tuple(float(radius) for one in values for radius in one.checks.radii),
-        tuple(float(square) for one in values for square in one.checks.squares),
+    quality = TailQuality(
+        tuple(float(radius) for octave in values for radius in octave.checks.radii),
+        tuple(float(square) for octave in values for square in octave.checks.squares),
         (own.value, own.deviation),
         None if difference is None else (difference.value, difference.deviation),
     )
-    return StoredBlocks(Facts(), 0.0, "", replace(quality, tail=tail), (checksum,))
+    checksum = job.store.write_octaves(job.index, np.concatenate([octave.values for octave in values]))
+    return StoredBlocks(Facts(), 0.0, "", replace(Quality.from_surface(surface, Probe()), tail=quality), (checksum,))
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
@@ -274,8 +264,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
     return StoredBlocks(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
 
 
-def finish_mesh(job: Job, stored: Sequence[StoredBlocks]) -> Record:
-    """Write the completion record of a mesh whose blocks are all stored, or that failed."""
+def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
     errors = [blocks.error for blocks in stored if blocks.error]
     backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
     record = Record(
@@ -301,7 +290,7 @@ def _joined_quality(stored: Sequence[StoredBlocks]) -> Quality:
     return replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
 
 
-def facts_of(surface: Surface, points: int) -> Facts:
+def _facts_of(surface: Surface, points: int) -> Facts:
     """Return what is recorded of a surface and its quadrature points."""
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area, points=points)

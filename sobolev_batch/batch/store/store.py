@@ -20,7 +20,6 @@ from zarr.buffer.cpu import NDBuffer
 
 from sobolev_batch.batch.storage.checked import CHANGED, RecordedChunks, checksum_of, document_digest
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.scratch import Scratch
 from sobolev_batch.batch.store.hierarchy import (
     DIGEST,
     FIELD,
@@ -121,11 +120,6 @@ class Store(Hierarchy):
                 array = self.array(name)
                 found.append(RecordedChunks(name, RECORD, array.shape, array.chunks, array.dtype.str, first))
         return tuple(found)
-
-    @property
-    def scratch(self) -> Scratch:
-        """Scratch space for parts of meshes, which no reader needs."""
-        return Scratch(self.location)
 
     def labels(self) -> tuple[str, ...]:
         """Return the label of each row. If they are damaged, take those of the octaves or of the table of meshes.

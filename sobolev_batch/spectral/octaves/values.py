@@ -82,12 +82,6 @@ class OctaveValues:
     values: NDArray[np.complexfloating]
     checks: Checks
 
-    def __add__(self, other: OctaveValues) -> OctaveValues:
-        """Return the values of two parts of one surface together."""
-        own = self.checks
-        checks = Checks(own.radii, own.scales, own.differences + other.checks.differences)
-        return OctaveValues(self.octave, self.values + other.values, checks)
-
     def error_norms(self, orders: Sequence[float]) -> Reals:
         """Return the norm of the values' own error for each order (orders,), raised for the small sample."""
         return norms_of_checks(self.checks.radii, self.checks.squares, orders)
@@ -113,7 +107,6 @@ def octave_values(
     execution: Execution = ON_CPU,
     *,
     known: OctaveValues | None = None,
-    checks: int | None = None,
 ) -> OctaveValues:
     """Return the transform of a surface at the samples of an octave.
 
@@ -126,8 +119,6 @@ def octave_values(
         execution: Backend, threads and memory.
         known: Values at some of the samples: on the first lattices, and maybe at the same drawn frequencies. They are
             not computed again.
-        checks: Number of comparisons with exact values on each lattice; by default as many as the surface allows. Parts
-            of one surface need the same.
 
     Raises:
         InputError: The quadrature of a parametrised surface does not converge.
@@ -150,8 +141,7 @@ def octave_values(
         else:
             values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
     joined = np.concatenate(values)
-    count = check_count(surface) if checks is None else checks
-    return OctaveValues(octave, joined, _compared(surface, quadrature, joined, orders, count))
+    return OctaveValues(octave, joined, _compared(surface, quadrature, joined, orders, check_count(surface)))
 
 
 def check_count(surface: Surface) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,10 @@ def test_each_task_comes_back_with_its_outcome(cluster: Cluster) -> None:
         list(cluster.results([Task(divmod, (7, 0))]))
 
 
+def few_at_a_time(cluster: Cluster, count: int) -> Cluster:
+    return replace(cluster, in_flight=count, in_flight_per_thread=0)
+
+
 def _append(path: Path) -> int:
     with path.open("a") as file:
         file.write("called\n")
@@ -56,7 +61,7 @@ def test_a_task_among_the_arguments_of_others_is_done_once(cluster: Cluster, tmp
 
 def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path: Path) -> None:
     large = [Task(_append, (tmp_path / "calls",), 3e9) for _ in range(5)]
-    outcomes = [outcome for _, outcome in cluster.run([*large, Task(abs, (-4,), 1e6)], 3e9, in_flight=1)]
+    outcomes = [outcome for _, outcome in few_at_a_time(cluster, 1).run([*large, Task(abs, (-4,), 1e6)], 3e9)]
     assert outcomes.pop() == 4
     assert all(isinstance(outcome, ClusterError) for outcome in outcomes)
     assert describe_failure(outcomes[0]).startswith(
@@ -75,7 +80,7 @@ def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
             yield Task(abs, (-k,))
 
     done = 0
-    for _ in cluster.run(tasks(), in_flight=2):
+    for _ in few_at_a_time(cluster, 2).run(tasks()):
         done += 1
         assert len(read) <= done + 1
     assert (done, read) == (9, list(range(9)))

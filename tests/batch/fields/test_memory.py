@@ -1,57 +1,75 @@
-"""Peak memory of a worker's task on a huge mesh, in a process of its own."""
+"""How rows become tasks that fit into workers."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-pytestmark = pytest.mark.all
+from sobolev_batch import ClusterError, Lattice
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
+from sobolev_batch.batch.fields.memory import size_tasks
+from sobolev_batch.spectral.backends.costs import CPU_COSTS, NufftSpec
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import projected_bytes
+from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
-# The mesh is cut from a square so that making it costs little beside what is measured.
-TASK = """
-import resource, sys
-import numpy as np
-import sobolev_batch as sb
-from sobolev_batch.batch.study.plan import Row, make_plan
-from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.fields.tasks import FieldSettings, Job, compute_mesh
-from sobolev_batch.surfaces.sources.registry import Member
-
-
-class Sheet(Member):
-    def load(self):
-        side = np.linspace(-0.7, 0.7, 1583)
-        x, y = np.meshgrid(side, side, indexing="ij")
-        corner = (np.arange(1582)[:, None] * 1583 + np.arange(1582)).ravel()
-        triangles = np.concatenate([corner[:, None] + [0, 1, 1583], corner[:, None] + [1, 1584, 1583]])
-        return sb.Mesh(np.stack([x.ravel(), y.ravel(), 0.2 * (x * y).ravel()], axis=1), triangles)
-
-    def fingerprint(self):
-        return {}
+ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
+LARGE = Lattice(5.0, 512).split(1 << 24)
+TRANSFORM = TransformSettings()
 
 
-table = {
-    "study": {"name": "sheet"},
-    "lattice": {"xi_max": 5.0, "M": 128},
-    "norm": {"orders": [-10.0]},
-    "reference": {"source": "sphere"},
-    "family": [{"name": "a", "source": "icosphere", "levels": [0]}],
-}
-plan = make_plan(sb.Study.from_table(table))
-store = prepare_store(sys.argv[1], plan)
-job = Job(store, 0, Row("a/0", "a", Sheet("sheet", 0), "", "key"), FieldSettings.of(plan))
-record = compute_mesh(job, plan.blocks)
-assert record.status == "complete", record.reason
-print(record.facts.triangles, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
+def workers_with(*gigabytes: float, threads: int = 1) -> Workers:
+    return Workers(
+        tuple(
+            WorkerInfo(f"tcp://{number}", threads, 1e9 * allowed, "cpu", "") for number, allowed in enumerate(gigabytes)
+        )
+    )
 
 
-def test_five_million_triangles_stay_below_two_gigabytes(store_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", TASK, str(store_path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    triangles, peak_kilobytes = map(int, done.stdout.split())
-    assert triangles > 5_000_000
-    assert peak_kilobytes * 1024 < 2e9
+def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
+    sizes = size_tasks(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000, 1e7), workers_with(8, 8), rows=100)
+    assert (sizes.task_count, sizes.block_groups) == (1, (ONE_CHUNK,))
+    # It claims what it is going to use, and may use what there is.
+    assert sizes.allowed_bytes == pytest.approx(8e9, rel=0.01)
+    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < sizes.projected_bytes < 0.4e9
+
+
+def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() -> None:
+    tight = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(1.5), rows=10)
+    assert tight.allowed_bytes < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
+    assert tight.projected_bytes == pytest.approx(1.5e9)
+    # Four at once would leave nothing to each: such tasks run beside fewer others.
+    crowded = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(2.25, threads=4), rows=10)
+    assert crowded.allowed_bytes == pytest.approx(256e6, rel=1e-2)
+    assert 2.25e9 / 4 < crowded.projected_bytes <= 2.25e9
+
+
+@pytest.mark.parametrize("triangles", [2_500_000, 3_000_000, 20_000_000])
+@pytest.mark.parametrize("blocks", [ONE_CHUNK, LARGE])
+@pytest.mark.parametrize("threads", [4, 8])
+def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
+    sizes = size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers_with(5, threads=threads), rows=1)
+    workload = Workload(triangles * 3, triangles * 12, triangles)
+    fastest_batching(Batching(NufftSpec(blocks[0].shape, 1e-9)), workload, CPU_COSTS, sizes.allowed_bytes)
+    assert sizes.projected_bytes <= 5e9
+
+
+@pytest.mark.parametrize(("rows", "groups"), [(1, 4), (2, 2), (4, 1), (1000, 1)])
+def test_blocks_of_a_few_meshes_are_spread_over_threads_those_of_many_stay_together(rows: int, groups: int) -> None:
+    found = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(8, 8), rows).block_groups
+    assert len(found) == min(groups, len(LARGE))
+    assert tuple(block for group in found for block in group) == LARGE
+
+
+@pytest.mark.parametrize(
+    ("size", "needed"), [(ExpectedSize(1000, 9e9), r"9\.0GB"), (ExpectedSize(60_000_000, 0), r"12\.3GB")]
+)
+def test_what_fits_into_no_worker_is_refused_with_both_numbers(size: ExpectedSize, needed: str) -> None:
+    with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than 3\.1GB"):
+        size_tasks(ONE_CHUNK, TRANSFORM, size, workers_with(3.1, 2.0), rows=1)
+
+
+def test_a_block_that_fits_into_no_worker_is_refused() -> None:
+    with pytest.raises(ClusterError, match=r"690\.5MB in one task, and no worker has more than 400\.0MB"):
+        size_tasks(LARGE, TRANSFORM, ExpectedSize(), workers_with(0.4), rows=1)

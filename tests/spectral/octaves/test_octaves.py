@@ -156,18 +156,6 @@ def test_known_values_are_not_computed_again() -> None:
     assert len(found.checks.radii) == 2 * len(known.checks.radii)
 
 
-def test_parts_of_a_surface_add_up_to_it() -> None:
-    ball = icosphere(3)
-    sampling, cut = sampling_of(ball, 0), len(ball.triangles) // 2
-    halves = [Mesh(ball.vertices, ball.triangles[:cut]), Mesh(ball.vertices, ball.triangles[cut:])]
-    octave, settings = SampledOctave.of(sampling), settings_for(TARGET)
-    first, second = (octave_values(half, octave, ORDERS, settings, checks=8) for half in halves)
-    together, whole = first + second, values_of(ball, sampling)
-    assert np.abs(together.values - whole.values).max() < 1e-4 * ball.area
-    assert (together.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
-    assert (together.error_norms(ORDERS) > 0).all()
-
-
 def test_a_sampling_is_the_same_after_it_was_stored() -> None:
     sampling = sampling_of(BOX, 5)
     table = json.loads(json.dumps(sampling.to_table()))

@@ -1,0 +1,83 @@
+"""Tasks of one row: batches of points, blocks of the lattice, and records that are there already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sobolev_batch import Study
+from sobolev_batch.batch.fields.tasks import (
+    FieldSettings,
+    Job,
+    compute_blocks,
+    compute_mesh,
+    compute_octaves,
+    finish_mesh,
+)
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
+from sobolev_batch.spectral.transform.nufft import transform_points
+from tests.support.studies import small_table
+
+FINE = small_table(family=[{"name": "ico", "source": "icosphere", "levels": [0, 5]}])
+
+
+def job_of(plan: Plan, store_path: Path, label: str = "ico/5", allowed_bytes: float | None = None) -> Job:
+    row = next(row for row in plan.rows if row.label == label)
+    return Job(prepare_store(store_path, plan), 0, row, FieldSettings.of(plan), allowed_bytes=allowed_bytes)
+
+
+def test_a_mesh_is_one_task_that_adds_up_batches_as_large_as_the_memory_allows(
+    store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: list[int] = []
+
+    def counted(batches: Iterable[WeightedPoints], *arguments: Any) -> Any:
+        def each() -> Iterator[WeightedPoints]:
+            for batch in batches:
+                sizes.append(len(batch.weights))
+                yield batch
+
+        return transform_points(each(), *arguments)
+
+    monkeypatch.setattr("sobolev_batch.spectral.transform.transform.transform_points", counted)
+    plan = make_plan(Study.from_table(FINE))
+    whole = compute_mesh(job_of(plan, store_path), plan.blocks)
+    job = replace(job_of(plan, store_path, allowed_bytes=1.25e7), index=1)
+    record = compute_mesh(job, plan.blocks)
+    assert record.status == "complete", record.reason
+    first, *others = sizes
+    assert first == whole.facts.points
+    assert len(others) > 4
+    assert max(others) < 10_000 < first
+    assert record.facts == replace(whole.facts, points=sum(others))
+    expected, values = job.store.read_fields([0, 1], plan.lattice.place(plan.lattice.half))
+    assert np.abs(values - expected).max() < 2e-9 * whole.facts.area
+
+
+def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lattice = {"xi_max": 3.0, "M": 16, "octaves": 1}
+    plan = make_plan(Study.from_table(small_table(lattice=lattice, norm={"orders": [-2.0]})))
+    blocks = plan.lattice.split(1000)
+    plan = replace(plan, blocks=blocks)
+    job = job_of(plan, store_path, "ico/1")
+    parts = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
+    record = finish_mesh(job, parts)
+    assert (record.status, len(record.checksums)) == ("complete", len(blocks) + 1)
+
+    def refuse(*arguments: Any) -> None:
+        raise AssertionError("it is written again")
+
+    for name in ("write_field", "write_octaves", "write_record"):
+        monkeypatch.setattr(type(job.store), name, refuse)
+    again = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
+    # Those whose worker was lost are done again; the results of others may be there still.
+    for mixture in (parts, again, [*parts[:2], *again[2:]]):
+        assert finish_mesh(job, mixture) == record
+    assert compute_mesh(job, blocks) == record
