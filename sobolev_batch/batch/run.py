@@ -21,13 +21,12 @@ from sobolev_batch.batch.cluster.progress import Notify, Progress
 from sobolev_batch.batch.cluster.store_access import require_store_access
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.collection_store import CollectionStore
-from sobolev_batch.batch.fields.compute import compute_fields
-from sobolev_batch.batch.reuse import first_choice, take_over
+from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import Plan, make_plan
@@ -310,14 +309,14 @@ def carry_out(
         give_up_after: Seconds after which what is silent is given up.
         others: Other stores, whose fields are taken over.
     """
-    plan = make_plan(study, first_choice([location, *others]))
+    plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
     # Planning may take minutes.
     lock.require(location)
     workspace = Workspace.prepared(location.fenced(lock.fence), plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
         if others:
-            workspace.withdraw_results_of(take_over(workspace, others))
+            workspace.withdraw_results_of(copy_fields(workspace, others))
         if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
             return Summary._of(workspace, set())
         with clients as client, Watch(client, study.backend == "gpu", give_up_after).kept() as watch:

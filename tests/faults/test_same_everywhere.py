@@ -49,7 +49,7 @@ sys.stdin.readline()
 for i, row in Workspace.of(store, plan).rows.items():
     if row.label == "reference":
         continue
-    job = Job(store, i, row, FieldSettings.of(plan))
+    job = Job(store, i, row, FieldSettings.for_plan(plan))
     for _ in range(5):
         store.write_record(i, None)
         assert compute_mesh(job, plan.blocks).status == "complete"

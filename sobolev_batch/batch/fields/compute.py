@@ -1,9 +1,10 @@
-"""The fields that a store lacks: handed to the cluster as tasks, and their records taken back."""
+"""The fields that a store lacks: copied from other stores, or computed as tasks of the cluster."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.progress import Steps
@@ -16,11 +17,62 @@ from sobolev_batch.batch.fields.tasks import (
     compute_octaves,
     finish_mesh,
 )
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.workspace import Workspace, complete_records
+from sobolev_batch.errors import DamageError, StoreError
 
 _log = logging.getLogger(__name__)
+
+# Most of the time of a copy is spent waiting for disks or object storage.
+_THREADS = 4
+
+
+def copy_fields(workspace: Workspace, others: Sequence[Location]) -> list[int]:
+    """Copy the fields that a workspace lacks from other stores that have them, and return their rows.
+
+    The key of a field is a digest of all that it depends on. So it is the same field, whatever the other study calls
+    the mesh. Each is checked as it is read.
+
+    Raises:
+        StoreError: A location has no store of a study, or cannot be read or written.
+    """
+    return [i for location in others for i in _copy_from(Store.open(location), workspace)]
+
+
+def _copy_from(other: Store, workspace: Workspace) -> list[int]:
+    stored = {record.key: (row, record) for row, record in complete_records(other.records()).items()}
+    matches = {i: stored[key] for i in workspace.pending if (key := workspace.rows[i].key) in stored}
+    with ThreadPoolExecutor(_THREADS) as pool:
+        outcomes = pool.map(lambda i: _copy_field(other, *matches[i], workspace.store, i), matches)
+        copied = [i for i, is_copied in zip(matches, outcomes, strict=True) if is_copied]
+    for i in copied:
+        _, workspace.records[i] = matches[i]
+    _log.info("%s: %d fields copied from %s", workspace.store.path, len(copied), other.path)
+    return copied
+
+
+def _copy_field(source: Store, row: int, record: Record, store: Store, target_row: int) -> bool:
+    """Copy a field with its record into a row of another store; return False where the field is damaged."""
+    places, checksums = source.block_slices(), list(record.checksums)
+    if places != store.block_slices() or len(checksums) != len(places) + source.has_octaves:
+        raise StoreError(
+            f"{source.path}: it cuts fields into other blocks than {store.path}; run the study without it, or make "
+            "both stores by one version of this program"
+        )
+    try:
+        if source.has_octaves:
+            # Behind those of the field.
+            store.write_octaves(target_row, source.read_octaves([row], [checksums.pop()])[0])
+        for place, checksum in zip(places, checksums, strict=True):
+            store.write_field(target_row, place, source.read_fields([row], place, [checksum])[0])
+    except DamageError as error:
+        _log.warning("%s; it is computed here", error)
+        return False
+    store.write_record(target_row, record)
+    return True
 
 
 def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:
@@ -48,7 +100,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
     for i in pending:
         if rows[i].label in refused:
             give_up(i, refused[rows[i].label])
-    settings, reference = FieldSettings.of(plan), reference_in_tasks(plan)
+    settings, reference = FieldSettings.for_plan(plan), reference_in_tasks(plan)
 
     def tasks() -> Iterator[Task]:
         for i in pending:

@@ -57,7 +57,7 @@ class FieldSettings:
     tail: TailSampling | None = None
 
     @classmethod
-    def of(cls, plan: Plan) -> Self:
+    def for_plan(cls, plan: Plan) -> Self:
         """Return the settings of a plan."""
         return cls(plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail)
 
