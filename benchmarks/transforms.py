@@ -13,7 +13,7 @@ from benchmarks.direct import direct_transform, frequencies_of
 from benchmarks.paper import Complexes, faster_upsampling, relative_distance, whole_transform
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings

@@ -59,10 +59,10 @@ from .results.tables.matrix import matrix as matrix
 from .results.tables.smallest import smallest_below as smallest_below
 from .spectral.fields import fourier_transform as fourier_transform
 from .spectral.lattice import Lattice as Lattice
-from .spectral.metrics.decomposition import proportion as proportion
 from .spectral.metrics.norms import distance as distance
 from .spectral.metrics.norms import inner_product as inner_product
 from .spectral.metrics.norms import norm as norm
+from .spectral.metrics.norms import proportion as proportion
 from .spectral.metrics.spectrum import spectrum as spectrum
 from .spectral.metrics.witness import witness as witness
 from .spectral.metrics.yardsticks import yardsticks as yardsticks

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.metrics.decomposition import proportion
 from sobolev_batch.spectral.metrics.inputs import OperandLike, pair_of
-from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
+from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm, proportion
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.spectral.shells import Orders, check_orders

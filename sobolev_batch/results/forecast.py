@@ -14,7 +14,7 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.results.tables.formatting import duration
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
-from sobolev_batch.spectral.transform.durations import field_seconds, slowness
+from sobolev_batch.spectral.transform.transform import field_seconds, slowness
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6

@@ -9,12 +9,11 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
 from sobolev_batch.spectral.backends.backends import backend_named
-from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
-from sobolev_batch.spectral.errors.probe import Probe, measure
+from sobolev_batch.spectral.errors.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe, probe_block
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders

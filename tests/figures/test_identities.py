@@ -10,7 +10,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import members_of
-from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.backends.backends import NufftSpec
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan

@@ -15,9 +15,8 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.results import forecast as forecasts
 from sobolev_batch.results.forecast import Forecast
-from sobolev_batch.spectral.transform.durations import expected_points, field_seconds
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.spectral.transform.transform import expected_points, field_seconds, transform_block
 from tests.support.studies import small_table
 
 

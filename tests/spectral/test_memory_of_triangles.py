@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh, Similarity, icosphere
-from sobolev_batch.spectral.errors.samples import exact_transform_of
+from sobolev_batch.spectral.errors.probe import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles

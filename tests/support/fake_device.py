@@ -21,8 +21,7 @@ import finufft
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sobolev_batch.spectral.backends.backends import Gpu
-from sobolev_batch.spectral.backends.costs import GPU_COSTS
+from sobolev_batch.spectral.backends.backends import GPU_COSTS, Gpu
 from sobolev_batch.spectral.backends.cuda import Cuda
 
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:

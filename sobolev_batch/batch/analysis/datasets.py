@@ -15,9 +15,8 @@ from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.metrics.datasets import describe
-from sobolev_batch.spectral.metrics.decomposition import Proportion
-from sobolev_batch.spectral.metrics.rates import observed_rates
+from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
+from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.surfaces.sources.registry import Metadata
 
 Reals = NDArray[np.float64]

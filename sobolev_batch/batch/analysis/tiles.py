@@ -20,8 +20,8 @@ from sobolev_batch.spectral.errors.budget import (
     sums_of_shells,
 )
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.metrics.decomposition import Proportion
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
+from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 

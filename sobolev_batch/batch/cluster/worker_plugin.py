@@ -15,7 +15,7 @@ from sobolev_batch.batch.cluster.versions import require_same_versions
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, WorkerInfo, Workers, allowed_bytes
 from sobolev_batch.errors import BackendError, ClusterError
 from sobolev_batch.spectral.backends.backends import CPU, Backend, gpu_backend
-from sobolev_batch.spectral.transform.durations import slowness
+from sobolev_batch.spectral.transform.transform import slowness
 
 _log = logging.getLogger(__name__)
 

@@ -24,9 +24,8 @@ from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.a_priori import choose_settings
-from sobolev_batch.spectral.errors.probe import Probe, join
+from sobolev_batch.spectral.errors.probe import Probe, draws_for, join, probe_block
 from sobolev_batch.spectral.errors.quality import Quality, TailQuality
-from sobolev_batch.spectral.errors.samples import draws_for, probe_block
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.limit import EnergyLimit

@@ -16,7 +16,7 @@ from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, good_intervals, lattice_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling

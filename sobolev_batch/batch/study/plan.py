@@ -16,7 +16,7 @@ from sobolev_batch.batch.study.pilots import Members
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
-from sobolev_batch.spectral.errors.samples import Sample, draws_for
+from sobolev_batch.spectral.errors.probe import Sample, draws_for
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES

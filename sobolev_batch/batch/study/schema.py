@@ -16,7 +16,7 @@ from sobolev_batch.batch.study.refusals import dotted_key
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders

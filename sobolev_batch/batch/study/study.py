@@ -27,7 +27,7 @@ from sobolev_batch.batch.study.suggestions import similar_name
 from sobolev_batch.batch.study.toml import read_toml
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.fitting.derivative.objective import factors_of
 from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh
+from sobolev_batch.spectral.backends.arrays import Complexes
 from sobolev_batch.spectral.backends.backends import backend_named
-from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.fields import fourier_transform

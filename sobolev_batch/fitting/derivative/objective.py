@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.derivative.transform import MeshTransform, PlacedMesh
+from sobolev_batch.spectral.backends.arrays import Complexes
 from sobolev_batch.spectral.backends.backends import backend_named
-from sobolev_batch.spectral.dtypes import Complexes
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import OperandLike, common_lattice, field_of, field_values
 from sobolev_batch.spectral.shells import SobolevWeights, single_order

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.backends import Backend
-from sobolev_batch.spectral.backends.costs import NufftSpec
-from sobolev_batch.spectral.dtypes import Complexes
+from sobolev_batch.spectral.backends.arrays import Complexes
+from sobolev_batch.spectral.backends.backends import Backend, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import RuleAssignment, TriangleBatch, WeightedPoints
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule

@@ -14,11 +14,11 @@ from sobolev_batch.fitting.derivative.objective import SquaredDistance, factors_
 from sobolev_batch.fitting.derivative.transform import MeshTransform
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.dtypes import Complexes
+from sobolev_batch.spectral.backends.arrays import Complexes
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.errors.probe import Sample, draws_for, estimate
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate
 from sobolev_batch.spectral.fields import USUAL_DEGREE, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import field_values, quality_of

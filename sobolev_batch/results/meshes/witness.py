@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.results.tables.groups import reference_of
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 

@@ -16,7 +16,7 @@ from sobolev_batch.results.tables.groups import finished_group, metadata_of, ref
 from sobolev_batch.results.tables.sizes import is_sequence
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.metrics.decomposition import Proportion
+from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.registry import Metadata
 

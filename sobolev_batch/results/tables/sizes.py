@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.metrics.rates import observed_rates
+from sobolev_batch.spectral.metrics.datasets import observed_rates
 from sobolev_batch.surfaces.sources.names import quoted
 
 Reals = NDArray[np.float64]

@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_of
 from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, Support, aliased, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.reference import ReferenceEstimate, product_rounding
+from sobolev_batch.spectral.errors.budget import (
+    NormEstimate,
+    ReferenceEstimate,
+    Sums,
+    Support,
+    aliased,
+    estimate_norms,
+    product_rounding,
+    sums_of_shells,
+)
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.limit import EnergyLimit

@@ -13,7 +13,7 @@ from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, cor
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.errors.budget import aliased, change_of_root, sums_of_shells
-from sobolev_batch.spectral.errors.samples import estimate
+from sobolev_batch.spectral.errors.probe import estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
 from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, SurfaceSize

@@ -16,10 +16,10 @@ from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.samples import Sample, estimate, exact_transform_of
+from sobolev_batch.spectral.errors.probe import Sample, estimate, exact_transform_of
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals

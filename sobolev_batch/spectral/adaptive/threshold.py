@@ -16,7 +16,7 @@ from sobolev_batch.spectral.adaptive.problem import Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import difference_on, solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
-from sobolev_batch.spectral.errors.samples import Sample, draws_for, needs_probe
+from sobolev_batch.spectral.errors.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes

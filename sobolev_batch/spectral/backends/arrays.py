@@ -1,4 +1,4 @@
-"""Array operations for which NumPy's own functions are not the best choice on every backend.
+"""The dtypes of fields, and array operations for which NumPy's own functions are not the best choice on every backend.
 
 Arrays on the processor are NumPy's, arrays on a GPU are CuPy's. NumPy's functions dispatch on their arguments,
 or on ``like=`` where they create an array, so the same expressions run on both. The exceptions are here.
@@ -6,10 +6,14 @@ or on ``like=`` where they create an array, so the same expressions run on both.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+ComplexDtype = Literal["complex128", "complex64"]
+Complexes = NDArray[np.complexfloating[Any, Any]]
+
 
 # NumPy's or CuPy's; CuPy has no types.
 Array = Any

@@ -7,6 +7,10 @@ The transform of a triangle of area A is 2A times the second divided difference 
 corners p_j (Hermite-Genocchi; C. de Boor, "Divided differences", 2005, arXiv:math/0502036). The explicit quotient of
 exponentials cancels if two nodes are close, the usual case on a fine mesh. Hence two branches: a power series about
 the centroid if all three are close, else the difference quotient of first differences across the widest gap.
+
+Where digits would be lost, sums and products carry their rounding errors: T. J. Dekker, "A floating-point technique for
+extending the available precision" (1971), doi:10.1007/BF01397083; T. Ogita, S. M. Rump, S. Oishi, "Accurate sum and dot
+product" (2005), doi:10.1137/030601818. That is valid without over- and underflow.
 """
 
 from __future__ import annotations
@@ -17,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends.arrays import cosine_and_sine
-from sobolev_batch.spectral.exact import double_double
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+# A number as a rounded value and what it lacks.
+Pair = tuple[Reals, Reals]
 
 # Gaps below this (radians) go through the series, which then needs at most 19 terms and a fraction of the time of the
 # quotient.
@@ -34,6 +39,8 @@ _FLATNESS = 1e-2
 _BATCH = 1 << 13
 # Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy take longer than their work.
 _PAIRS = 1 << 11
+# Splits a double into halves of 26 bits each.
+_SPLITTER = 2.0**27 + 1
 
 
 def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
@@ -107,11 +114,11 @@ def doubled_areas(corners: Corners) -> Reals:
 
 def _doubled_areas_of_flat(corners: Corners) -> Reals:
     a, b, c = corners
-    p = [double_double.two_sum(b[i], -a[i]) for i in range(3)]
-    q = [double_double.two_sum(c[i], -a[i]) for i in range(3)]
+    p = [_two_sum(b[i], -a[i]) for i in range(3)]
+    q = [_two_sum(c[i], -a[i]) for i in range(3)]
     normal = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
-        high, low = double_double.subtract(double_double.multiply(p[i], q[j]), double_double.multiply(p[j], q[i]))
+        high, low = _subtract(_multiply(p[i], q[j]), _multiply(p[j], q[i]))
         normal.append(high + low)
     return np.asarray(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
 
@@ -186,11 +193,11 @@ def _phases(points: Reals, frequency: Reals, plain: bool) -> Reals:
     """Return -2π ξ·p at points (3, k), in radians; unless ``plain``, whole cycles are subtracted before rounding."""
     if plain:
         return _dots(-2 * np.pi * frequency, points)
-    cycles: double_double.Pair = (np.zeros(points.shape[1]), np.zeros(points.shape[1]))
+    cycles: Pair = (np.zeros(points.shape[1]), np.zeros(points.shape[1]))
     for axis in range(3):
-        high, low = double_double.two_product(points[axis], np.broadcast_to(frequency[axis], points.shape[1]))
+        high, low = _two_product(points[axis], np.broadcast_to(frequency[axis], points.shape[1]))
         high -= np.rint(high)  # exact, and whole cycles do not change the exponential
-        total, error = double_double.two_sum(cycles[0], high)
+        total, error = _two_sum(cycles[0], high)
         cycles = total, cycles[1] + (error + low)
     return np.asarray(-2 * np.pi * (cycles[0] + cycles[1]))
 
@@ -237,3 +244,36 @@ def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
 def _exponential(phases: Reals) -> Complexes:
     cosines, sines = cosine_and_sine(phases)
     return np.asarray(cosines + 1j * sines)
+
+
+def _two_sum(a: Reals, b: Reals) -> Pair:
+    """Return the rounded sum and its rounding error: a + b = high + low exactly."""
+    high = a + b
+    shadow = high - a
+    return high, (a - (high - shadow)) + (b - shadow)
+
+
+def _two_product(a: Reals, b: Reals) -> Pair:
+    """Return the rounded product and its rounding error: a * b = high + low exactly."""
+    high = a * b
+    a_high, a_low = _halves(a)
+    b_high, b_low = _halves(b)
+    return high, a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+def _multiply(a: Pair, b: Pair) -> Pair:
+    """Return the product of two double-double numbers, to about twice double precision."""
+    high, low = _two_product(a[0], b[0])
+    return _two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
+
+
+def _subtract(a: Pair, b: Pair) -> Pair:
+    """Return the difference of two double-double numbers, to about twice double precision of the larger one."""
+    high, low = _two_sum(a[0], -b[0])
+    return _two_sum(high, low + (a[1] - b[1]))
+
+
+def _halves(a: Reals) -> Pair:
+    shifted = _SPLITTER * a
+    high = shifted - (shifted - a)
+    return high, a - high

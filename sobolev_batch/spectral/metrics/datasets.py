@@ -1,4 +1,4 @@
-"""Datasets of metrics, with units, long names, and the lattice and kernel that they belong to."""
+"""Datasets of metrics, with units, long names, and the lattice and kernel that they belong to; observed rates."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.reference import ReferenceEstimate
+from sobolev_batch.spectral.errors.budget import NormEstimate, ReferenceEstimate
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.shells import Orders, Reals
 
@@ -142,3 +141,40 @@ def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any
     """Return the attributes of a dataset that was computed from fields on a lattice."""
     dtypes = dict.fromkeys(str(field.dtype) for field in fields)
     return {"xi_max": lattice.xi_max, "M": lattice.M, "dtype": ", ".join(dtypes)}
+
+
+# Of the sizes of two meshes between which a rate is formed.
+_LEAST_RATIO = 1.1
+
+
+def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
+    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
+
+    The coarser one is the next whose size is larger by a tenth at least: between nearly equal sizes chance decides.
+
+    Args:
+        distances: Distances to the reference (n,), NaN where missing.
+        errors: Errors of the distances (n,).
+        sizes: Mean edge lengths (n,), in units of length, NaN where missing.
+
+    Returns:
+        log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each, in the order of the arguments. NaN for the
+        coarsest meshes, for meshes without a distance or size, and for distances below their error.
+
+    >>> sizes = np.array([0.4, 0.2, 0.1])
+    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
+    array([nan,  2.,  2.])
+    """
+    rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
+    usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
+    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
+    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
+    for fine, count in zip(by_size, coarser_counts, strict=True):
+        if count:
+            coarse = by_size[count - 1]
+            span = np.log(sizes[coarse] / sizes[fine])
+            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
+            # The widest that both distances allow.
+            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
+            uncertainties[fine] = widest / span
+    return rates, uncertainties

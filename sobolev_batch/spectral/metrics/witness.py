@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available
-from sobolev_batch.spectral.backends.backends import CPU
-from sobolev_batch.spectral.backends.costs import NufftSpec
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends.backends import CPU, NufftSpec
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import KERNEL, LENGTH, described, lattice_attributes, order_axis
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, OperandLike, pair_of, point_array, read_blocks

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
-from sobolev_batch.spectral.errors.probe import norms_of_checks
-from sobolev_batch.spectral.errors.samples import exact_transform_of, term_count
+from sobolev_batch.spectral.errors.probe import exact_transform_of, norms_of_checks, term_count
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.arrays import Array, combine
+from sobolev_batch.spectral.backends.arrays import Array, combine, sums_of_runs
 from sobolev_batch.spectral.backends.backends import Backend
 from sobolev_batch.spectral.quadrature.rules import (
     HIGHEST_DEGREE,
@@ -21,7 +21,6 @@ from sobolev_batch.spectral.quadrature.rules import (
     rule_ranges,
     symmetric_rule,
 )
-from sobolev_batch.spectral.quadrature.shared_nodes import merged_corners, merged_midpoints
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
@@ -29,6 +28,8 @@ _Corners = tuple[Array, Array, Array]
 
 # Triangles at a time: keeps the temporaries with a mid-sized rule near 50 MB.
 _TRIANGLES = 1 << 17
+# An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
+_BITS = 63
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,13 @@ class RuleAssignment:
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """The arrays of a mesh on a backend: see `shared_nodes.Faces`."""
+    """The arrays of a mesh on a backend.
+
+    Attributes:
+        vertices: float64 (n, 3), in units of length.
+        triangles: int64 (m, 3).
+        areas: float64 (m,), in squared units of length.
+    """
 
     vertices: Array
     triangles: Array
@@ -250,3 +257,53 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+
+
+def merged_corners(mesh: Faces | Mesh, members: Array) -> tuple[Array, Array]:
+    """Return the corners of some triangles, each with a third of the areas that meet there.
+
+    Returns:
+        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
+    """
+    thirds = np.repeat(mesh.areas[members] / 3, 3)
+    weights = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
+    corners = np.flatnonzero(weights)
+    return np.ascontiguousarray(mesh.vertices[corners].T, like=weights), weights[corners]
+
+
+def merged_midpoints(mesh: Faces | Mesh, members: Array) -> tuple[Array, Array]:
+    """Return the edge midpoints of some triangles, each with a third of the areas that meet there.
+
+    Returns:
+        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
+    """
+    triangles, vertices = mesh.triangles[members], mesh.vertices
+    triangle_bits = len(triangles).bit_length()
+    if 2 * len(vertices).bit_length() + triangle_bits > _BITS:
+        used, triangles = np.unique(triangles, return_inverse=True)
+        vertices, triangles = vertices[used], triangles.reshape(-1, 3)
+    bits = len(vertices).bit_length()
+    numbers = np.arange(len(triangles), like=triangles)
+    edges = np.empty((3, len(triangles)), dtype=np.int64, like=triangles)
+    for row, (i, j) in zip(edges, ((0, 1), (1, 2), (2, 0)), strict=True):
+        first, second = triangles[:, i], triangles[:, j]
+        np.left_shift(np.minimum(first, second), bits, out=row)
+        row |= np.maximum(first, second)
+        row <<= triangle_bits
+        row |= numbers
+    ordered = edges.ravel()
+    ordered.sort()
+    thirds = (mesh.areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
+    ordered >>= triangle_bits
+    is_first = np.empty(len(ordered), dtype=bool, like=ordered)
+    is_first[:1] = True
+    np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
+    starts = np.flatnonzero(is_first)
+    weights = sums_of_runs(thirds, starts)
+    ends = ordered[starts]
+    coordinates = np.empty((3, len(starts)), like=thirds)
+    low, high = ends >> bits, ends & ((1 << bits) - 1)
+    for axis in range(3):
+        column = np.ascontiguousarray(vertices[:, axis], like=vertices)
+        np.multiply(column[low] + column[high], 0.5, out=coordinates[axis])
+    return coordinates, weights

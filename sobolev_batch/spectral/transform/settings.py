@@ -8,8 +8,8 @@ from typing import get_args
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, Backend
-from sobolev_batch.spectral.dtypes import ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan

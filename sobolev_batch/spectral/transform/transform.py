@@ -1,26 +1,28 @@
-"""The Fourier transform of a surface on a block of the lattice: a closed form, or quadrature and NUFFT."""
+"""The Fourier transform of a surface on a block of the lattice, by a closed form or by a NUFFT, and its time."""
 
 from __future__ import annotations
 
 import logging
 import math
+import time
 from dataclasses import dataclass, replace
-from functools import singledispatch
+from functools import lru_cache, singledispatch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError, one_line
-from sobolev_batch.spectral.backends.backends import CPU, Backend, Gpu
-from sobolev_batch.spectral.backends.costs import NufftSpec
-from sobolev_batch.spectral.dtypes import ComplexDtype, Complexes
+from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
+from sobolev_batch.spectral.backends.backends import CPU, CPU_COSTS, Backend, Gpu, NufftSpec
 from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan, unknown_surface
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.icosphere import icosphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
@@ -256,3 +258,59 @@ def _require_reach(reach: float, lattice: Lattice, subject: str, pronoun: str) -
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
             f"take M >= {intervals}, a smaller xi_max, or scale {pronoun} down"
         )
+
+
+# Triangles of a mesh differ in size, which their rules follow; those of this sphere stand for them.
+_STAND_IN_LEVEL = 2
+# A sphere, transformed in a fraction of a second, of which spreading its points takes most.
+_TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
+_NANO = 1e-9
+
+
+def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    """Return the predicted processor time of a field.
+
+    Args:
+        triangles: Number of triangles of the mesh; 0 for a closed form.
+        area: Area, in squared units of length.
+        lattice: Lattice of the field.
+        settings: Accuracy and dtype.
+    """
+    spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
+    workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
+    return _NANO * Batching(spec).projected_nanoseconds(spec.shape, workload, CPU_COSTS)
+
+
+@lru_cache(maxsize=4)
+def slowness(backend: Backend = CPU) -> float:
+    """Return how many times as long as predicted a field takes on this machine, in processor time of one thread.
+
+    Args:
+        backend: Backend to try. The time of a GPU is that of the whole computation.
+    """
+    mesh, settings = icosphere(_TRIAL_LEVEL), TransformSettings()
+    clock = time.thread_time if backend is CPU else time.perf_counter
+    predicted = field_seconds(len(mesh.triangles), mesh.area, _TRIAL_LATTICE, settings)
+    times = []
+    # The first time includes what is loaded and tabulated once.
+    for _ in range(2):
+        started = clock()
+        transform_block(mesh, _TRIAL_LATTICE, _TRIAL_LATTICE.half, settings, Execution(backend))
+        times.append(clock() - started)
+    return min(times) / predicted
+
+
+def expected_points(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    """Return the number of quadrature points of a mesh, as if all its triangles were alike; see `field_seconds`."""
+    if not triangles:
+        return 0.0
+    # Of many sizes a few stand for all.
+    return triangles * _points_of_triangle(float(f"{area / triangles:.1e}"), lattice, settings)
+
+
+@lru_cache(maxsize=1 << 10)
+def _points_of_triangle(area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    sphere = icosphere(_STAND_IN_LEVEL)
+    count = len(sphere.triangles)
+    alike = Similarity(math.sqrt(area * count / sphere.area)).apply(sphere)
+    return settings.plan(alike, lattice).size.expected / count

@@ -16,9 +16,8 @@ import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.backends import backends, cuda
-from sobolev_batch.spectral.backends.backends import CPU, Gpu, backend_named, gpu_backend, try_out
-from sobolev_batch.spectral.backends.costs import GPU_COSTS
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, OctaveLattice
@@ -438,7 +437,7 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     code = """
 from sobolev_batch.spectral.backends import cuda
 from sobolev_batch.spectral.backends.backends import Gpu
-from sobolev_batch.spectral.backends.costs import GPU_COSTS, NufftSpec
+from sobolev_batch.spectral.backends.backends import GPU_COSTS, NufftSpec
 cuda._require_device = lambda cupy: None
 backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
 try:

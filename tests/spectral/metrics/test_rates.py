@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sobolev_batch.spectral.metrics.rates import observed_rates
+from sobolev_batch.spectral.metrics.datasets import observed_rates
 
 
 def test_rates_follow_the_sizes_not_the_order_of_the_meshes() -> None:

@@ -22,7 +22,7 @@ from sobolev_batch import (
     icosphere,
     witness,
 )
-from sobolev_batch.spectral.backends.costs import NufftSpec
+from sobolev_batch.spectral.backends.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.quadrature.plan import QuadraturePlan

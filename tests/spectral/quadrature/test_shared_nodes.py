@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, icosphere
-from sobolev_batch.spectral.quadrature import shared_nodes
+from sobolev_batch.spectral.quadrature import meshes
+from sobolev_batch.spectral.quadrature.meshes import merged_corners, merged_midpoints
 from sobolev_batch.spectral.quadrature.rules import TriangleRule, corner_rule, midpoint_rule
-from sobolev_batch.spectral.quadrature.shared_nodes import merged_corners, merged_midpoints
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -41,7 +41,7 @@ def unmerged(mesh: Mesh, rule: TriangleRule) -> dict[tuple[float, ...], float]:
 def test_each_place_gets_the_weights_of_all_its_triangles(
     merge: Merge, rule: TriangleRule, mesh: Mesh, bits: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shared_nodes, "_BITS", bits)  # few bits: vertices are numbered anew
+    monkeypatch.setattr(meshes, "_BITS", bits)  # few bits: vertices are numbered anew
     coordinates, weights = merge(mesh, np.arange(len(mesh.triangles)))
     expected = unmerged(mesh, rule)
     found = {tuple(np.round(place, 12) + 0.0): weight for place, weight in zip(coordinates.T, weights, strict=True)}

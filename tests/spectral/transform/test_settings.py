@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.transform.settings import TransformSettings
 
 

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends.costs import NufftSpec
-from sobolev_batch.spectral.dtypes import ComplexDtype
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends.backends import NufftSpec
 from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints

@@ -18,8 +18,7 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
-from sobolev_batch.spectral.errors.probe import draw, measure
-from sobolev_batch.spectral.errors.samples import Sample, draws_for, estimate, needs_probe
+from sobolev_batch.spectral.errors.probe import Sample, draw, draws_for, estimate, measure, needs_probe
 from sobolev_batch.spectral.fields import PROBED_ORDERS
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
