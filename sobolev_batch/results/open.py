@@ -15,7 +15,6 @@ from sobolev_batch.batch.store.hierarchy import DIGEST, DIGESTS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.errors import DamageError, InputError, StoreError
-from sobolev_batch.spectral.metrics.datasets import describe
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
@@ -60,9 +59,6 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     tree.encoding = {**tree.encoding, _SOURCE: str(store), _STATE: document_digest(opened.digests)}
     for name in (DIGEST, DIGESTS):
         tree.attrs.pop(name, None)
-    for node in tree.subtree:
-        # Older stores describe fewer variables.
-        describe(node.dataset)
     return tree
 
 

@@ -110,7 +110,8 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(
     before = {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
     for use in (open_store, Status.of, lambda place: run(study_of(folder), place, client)):
         with pytest.raises(
-            StoreError, match=f"its schema has version {version}, this program reads {SCHEMA_VERSION}; name another"
+            StoreError,
+            match=f"its schema has version {version}, this program reads {SCHEMA_VERSION}; run the study",
         ):
             use(store_path)
     assert before == {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}

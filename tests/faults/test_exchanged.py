@@ -214,16 +214,6 @@ def test_the_record_of_a_run_that_was_altered_is_noticed(store: Path) -> None:
     assert verify(store).is_sound
 
 
-def test_stores_without_digests_are_read_and_get_some(store: Path, study: Study, client: Client) -> None:
-    root = json.loads((store / "zarr.json").read_text())
-    for name in ("digest", "digests"):
-        del root["attributes"][name]
-    (store / "zarr.json").write_text(json.dumps(root))
-    assert verify(store).is_sound
-    assert run(study, store, client).computed == ()
-    assert json.loads((store / "zarr.json").read_text())["attributes"]["digest"]
-
-
 def test_digests_are_no_attributes_of_a_tree(store: Path) -> None:
     assert {"digest", "digests"}.isdisjoint(open_store(store).attrs)
     with xr.open_datatree(store, engine="zarr") as tree:

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.surfaces.shapes.icosphere import icosphere
+
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
+QUALITY = Quality(4 * np.pi, icosphere(0).extent, Probe()).to_json()
 
 
 @pytest.fixture
@@ -37,6 +42,8 @@ def tree() -> xr.DataTree:
             "family": ("mesh", ["f_1", "f_1", "f_1", "reference"]),
             "name": ("mesh", ["0", "1", "2", "reference"]),
             "level": ("mesh", [0, 1, 2, -1]),
+            "ordered_by": ("mesh", ["level"] * 4),
+            "row": ("mesh", [0, 1, 2, 3]),
             "status": ("mesh", ["complete", "complete", "failed", "complete"]),
             "reason": ("mesh", ["", "", "no 50% of it | is <there>", ""]),
             "triangles": ("mesh", [20, 1280, 0, 0]),
@@ -49,7 +56,7 @@ def tree() -> xr.DataTree:
     values = np.arange(4 * 5 * 5 * 3).reshape(4, 5, 5, 3) + 0j
     fourier = xr.Dataset(
         {"fourier": (("mesh", "xi_x", "xi_y", "xi_z"), values)},
-        coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:]},
+        coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:], "quality": ("mesh", [QUALITY] * 4)},
     )
     return xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
 

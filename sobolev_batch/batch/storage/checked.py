@@ -78,8 +78,7 @@ class RecordedChunks:
         checksums = table.get("checksums", ())
         if not checksums:
             return True
-        # Older versions did not write the row.
-        if table.get("row", place[0]) != place[0]:
+        if table.get("row") != place[0]:
             return False
         counts = [-(-length // step) for length, step in zip(self.shape[1:], self.chunks[1:], strict=True)]
         number = self.first + int(np.ravel_multi_index(place[1:], counts))
@@ -148,7 +147,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
         row = int(key.rpartition("/")[2])
         values, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
         is_whole = google_crc32c.value(values).to_bytes(_CHECKSUM_BYTES, "little") == checksum
-        if not is_whole or _table_of(content).get("row", row) != row:
+        if not is_whole or _table_of(content).get("row") != row:
             raise DamageError(
                 f"{self._name}: row {row} of {_array_of(key)} is damaged ({CHANGED}); sobolev-batch verify names the "
                 "mesh, and run computes it again",

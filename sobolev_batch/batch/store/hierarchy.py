@@ -273,7 +273,7 @@ def sealed(root: Document) -> Document:
 
 
 def require_intact(path: str, root: Document) -> None:
-    """Take the digest off the metadata of a root; those that an older version wrote have none.
+    """Take the digest off the metadata of a root.
 
     Raises:
         DamageError: They are not those that were written.
@@ -283,7 +283,7 @@ def require_intact(path: str, root: Document) -> None:
     digest = attributes.pop(DIGEST, None)
     # Another schema is refused, with its own message, and may make digests in another way.
     is_readable = attributes.get("schema_version") == SCHEMA_VERSION
-    if is_readable and digest is not None and digest != document_digest(root):
+    if is_readable and digest != document_digest(root):
         raise DamageError(
             f"{path}: {ROOT}, the metadata at the root, is damaged ({CHANGED}); run the study again", CHANGED
         )

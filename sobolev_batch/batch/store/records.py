@@ -49,8 +49,7 @@ class JsonRecord:
             return None
         try:
             table = dict(json.loads(text))
-            # Older versions did not write it.
-            stored_row = table.pop(_ROW, row)
+            stored_row = table.pop(_ROW, None)
             record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
         except ValidationError as error:
             problem = _first_problem(error)

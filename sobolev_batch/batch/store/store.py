@@ -275,9 +275,7 @@ class Store(Hierarchy):
         table = (self._read_document(RECORDS) or {}).get("attributes", {}).get(_RUN)
         if table is None:
             return None
-        # Older versions wrote none.
-        digest = table.pop(DIGEST, None)
-        if digest is not None and digest != document_digest(table):
+        if table.pop(DIGEST, None) != document_digest(table):
             raise DamageError(f"{self.path}: the record of the latest run is damaged ({CHANGED}): {table}", CHANGED)
         return RunRecord.from_table(table)
 

@@ -141,12 +141,7 @@ def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, A
     if study.accuracy is None:
         return ""
     data = {
-        # A float in stores written before, too.
-        "accuracy": [
-            study.accuracy.rtol,
-            float(study.accuracy.allowed_bytes),
-            *(["best effort"] if study.accuracy.best_effort else []),
-        ],
+        "accuracy": [study.accuracy.rtol, float(study.accuracy.allowed_bytes), study.accuracy.best_effort],
         "orders": study.orders,
         "dtype": study.dtype,
         "similarity": [similarity.scale, *similarity.origin],

@@ -150,7 +150,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length
         - resolved (the distance exceeds its error) and within (the error is as small as the study asks for);
         - where the study asks for [proximity]: hausdorff, chamfer and chamfer_error.
 
-        Numbers of a mesh that failed are NaN; so are those that an old store lacks. The frame's ``attrs`` have the
+        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the
         reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
         ``computed`` the orders that were computed from the fields.
 
@@ -183,7 +183,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = convergence.sel(order=s)
-        numbers = {key: row[key].values[others] if key in row else math.nan for key in _NUMBERS}
+        numbers = {key: row[key].values[others] for key in _NUMBERS}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
     frame = pd.concat(frames, ignore_index=True)
     kept = ("reference", "rtol", "computed")

@@ -12,8 +12,7 @@ from sobolev_batch.surfaces.shapes.placement import placement_doubt
 def doubts_of(tree: xr.DataTree) -> dict[str, str]:
     """Return why one doubts that a mesh can be compared with the reference, by the label of the mesh."""
     complete, reference = complete_meshes(tree), reference_of(tree)
-    # Stores of earlier versions lack the extents.
-    if reference not in complete or "quality" not in tree["fourier"]:
+    if reference not in complete:
         return {}
     texts = tree["fourier"]["quality"].sel(mesh=complete).load()
     extents = {label: Quality.from_json(str(texts.sel(mesh=label).item())).extent for label in complete}

@@ -106,8 +106,8 @@ def matrix(
     tree = as_tree(store)
     (order,) = check_orders(order)
     distances = distances_at(tree, order)
-    if values not in _columns_of(distances):
-        raise InputError(f"values must be one of {', '.join(_columns_of(distances))}, found {values!r}")
+    if values not in _COLUMNS:
+        raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
     frame: pd.DataFrame = distances[values].sel(order=order).transpose("mesh", "other").to_pandas()
     frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
     return frame
@@ -122,15 +122,10 @@ def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
         distances: Table of the distances of an open store.
         order: One of its orders.
     """
-    columns = _columns_of(distances)
+    columns = list(_COLUMNS)
     chosen = distances[columns].sel(order=order).load()
     frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
     return frame[["order", "mesh", "other", *columns]]
-
-
-def _columns_of(distances: xr.Dataset) -> list[str]:
-    """Return the columns that a store has; those of earlier versions lack some."""
-    return [name for name in _COLUMNS if name in distances]
 
 
 def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:

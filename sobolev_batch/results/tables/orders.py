@@ -54,7 +54,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     if not others:
         return stored.sel(order=chosen)
     fields, meshes, rows = stored_fields(tree), finished_group(tree, "meshes"), _rows(tree)
-    results, numbers = fields.results(others, every_pair=False), _numbers(meshes)
+    results, numbers = fields.results(others, every_pair=False), meshes["row"].values.tolist()
     require_unchanged(tree)
     to_reference = DistancesToReference(
         reference_of(tree),
@@ -82,7 +82,7 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     if not others:
         return stored.sel(order=chosen)
     fields, every_pair = stored_fields(tree), stored.sizes["other"] == stored.sizes["mesh"]
-    rows, numbers = _rows(tree), _numbers(finished_group(tree, "meshes"))
+    rows, numbers = _rows(tree), finished_group(tree, "meshes")["row"].values.tolist()
     distances = fields.results(others, every_pair=every_pair).distances[..., numbers, :]
     require_unchanged(tree)
     to_rows = rows if every_pair else [row for row in rows if row.label == reference_of(tree)]
@@ -123,10 +123,10 @@ def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tup
 
 
 def _joined(stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
-    """Return the chosen orders of two tables; columns that an old store lacks are left out."""
-    names = [name for name in computed.data_vars if name in stored]
+    """Return the chosen orders of two tables."""
+    names = list(computed.data_vars)
     both = xr.concat(
-        [stored[names].load(), computed[names]], "order", data_vars="minimal", coords="minimal", compat="override",
+        [stored[names].load(), computed], "order", data_vars="minimal", coords="minimal", compat="override",
         join="exact", combine_attrs="override",
     )  # fmt: skip
     table = both.sel(order=chosen)
@@ -145,13 +145,7 @@ def _rows(tree: xr.DataTree) -> list[_StoredRow]:
     ]
 
 
-def _numbers(meshes: xr.Dataset) -> list[int]:
-    """Return the number of each mesh among the fields; stores that were written before have both in one order."""
-    return meshes["row"].values.tolist() if "row" in meshes else list(range(meshes.sizes["mesh"]))
-
-
 def _sequences(meshes: xr.Dataset) -> list[list[int]]:
     """Return the places of the meshes of each family that goes from coarse to fine."""
-    names = ("family", "level", "ordered_by") if "ordered_by" in meshes else ("family", "level")
-    frame = pd.DataFrame({name: meshes[name].values for name in names})
+    frame = pd.DataFrame({name: meshes[name].values for name in ("family", "ordered_by")})
     return [rows.index.tolist() for _, rows in frame.groupby("family", sort=False) if is_sequence(rows)]

@@ -52,10 +52,7 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
 
 def is_sequence(rows: pd.DataFrame) -> bool:
     """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
-    if "ordered_by" in rows:
-        return bool(rows["ordered_by"].isin(_FROM_COARSE_TO_FINE).all())
-    # Of a store that was written before.
-    return bool((rows["level"] >= 0).all())
+    return bool(rows["ordered_by"].isin(_FROM_COARSE_TO_FINE).all())
 
 
 def with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:

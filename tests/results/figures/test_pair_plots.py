@@ -10,6 +10,8 @@ from scipy.spatial.distance import cdist
 import sobolev_batch as sb
 from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
 
+DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+
 
 def store_of(points: np.ndarray) -> xr.DataTree:
     """A store whose meshes are points, in ten families; the first is the reference."""
@@ -23,7 +25,7 @@ def store_of(points: np.ndarray) -> xr.DataTree:
     )
     distances = cdist(points, points)[..., None]
     pairs = xr.Dataset(
-        dict.fromkeys(("distance", "error"), (("mesh", "other", "order"), distances)),
+        dict.fromkeys(DISTANCES, (("mesh", "other", "order"), distances)),
         coords={"mesh": labels, "other": labels, "order": [-2.0]},
     )
     convergence = xr.Dataset(coords={"mesh": labels, "order": [-2.0]}, attrs={"reference": "reference"})

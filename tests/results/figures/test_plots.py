@@ -19,6 +19,8 @@ from sobolev_batch.results.figures.plots import write_plots
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import Output, Plot, parse_size, set_log_scale, style_of
 
+DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+
 
 def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
     axes = sb.plot_transform(tree)
@@ -38,7 +40,7 @@ def pairs(tree: xr.DataTree) -> xr.DataTree:
     distance = np.abs(places[:, None] - places)[..., None] * np.array([1.0, 2.0])
     tree["distances"] = xr.DataTree(
         xr.Dataset(
-            dict.fromkeys(("distance", "error"), (("mesh", "other", "order"), distance)),
+            dict.fromkeys(DISTANCES, (("mesh", "other", "order"), distance)),
             coords={"mesh": labels, "other": labels, "order": [-10.0, -2.5]},
         )
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 
-import numpy as np
 import pytest
 import xarray as xr
 
@@ -37,7 +36,8 @@ def test_lines_stay_readable(tree: xr.DataTree, near: xr.DataTree) -> None:
         tree["convergence"].to_dataset().assign_coords(mesh=[f"f_1/{'x' * 60}/{i}" for i in range(3)] + ["reference"])
     )
     meshes = tree["meshes"].to_dataset().assign_coords(mesh=long["mesh"])
-    renamed = xr.DataTree.from_dict({**tree.to_dict(), "/convergence": long, "/meshes": meshes})
+    fourier = tree["fourier"].to_dataset().assign_coords(mesh=long["mesh"])
+    renamed = xr.DataTree.from_dict({"/convergence": long, "/meshes": meshes, "/fourier": fourier})
     text = format_table(renamed, "text", [-10.0])
     assert max(map(len, text.split("Nearest")[0].splitlines())) <= 100
     assert re.search(r"^f_1/x+…x+/0 +20 ", text, re.MULTILINE)
@@ -49,12 +49,6 @@ def test_small_numbers_are_formulas_of_latex(tree: xr.DataTree) -> None:
     tree["convergence"]["relative"] *= 1e-7
     tree["convergence"]["relative_error"] *= 1e-7
     assert r"(2.500 ± 0.003) $\times 10^{-7}$ \%" in format_table(tree, "latex", [-10.0])
-
-
-def test_tables_made_before_there_were_parts(tree: xr.DataTree) -> None:
-    tree["convergence"] = xr.DataTree(tree["convergence"].to_dataset().drop_vars(["area_part", "shape_part"]))
-    assert np.isnan(table(tree)["area_part"]).all()
-    assert "36 %" not in format_table(tree, "text", [-10.0])
 
 
 def test_every_order_gets_a_table(tree: xr.DataTree) -> None:

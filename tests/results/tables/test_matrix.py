@@ -26,7 +26,7 @@ def made(count: int, failed: int = 1, others: str = "all") -> xr.DataTree:
     chosen = labels if others == "all" else ["reference"]
     there = places if others == "all" else places[-1:]
     distance = np.abs(places[:, None] - there)[..., None] * np.array([1.0, 10.0])
-    names = ("error", "truncation", "aliasing", "discretisation")
+    names = ("error", "truncation", "aliasing", "discretisation", "statistical")
     distances = xr.Dataset(
         {
             "distance": (("mesh", "other", "order"), distance),
@@ -88,16 +88,16 @@ def test_people_get_per_cents_of_the_reference(style: Format) -> None:
 
 def test_programs_get_lines_of_pairs() -> None:
     lines = format_matrix(made(3), "csv").splitlines()
-    assert lines[0] == "order,mesh,other,distance,error,truncation,aliasing,discretisation"
+    assert lines[0] == "order,mesh,other,distance,error,truncation,aliasing,discretisation,statistical"
     assert len(lines) == 1 + 2 * 4 * 4
-    assert "-4.0,f/0,f/1,,,,," in lines
+    assert "-4.0,f/0,f/1,,,,,," in lines
     records = json.loads(format_matrix(made(3), "json", [-4.0]))
     assert records[2] == {
         "order": -4.0,
         "mesh": "f/0",
         "other": "f/2",
         "distance": 2.0,
-        **dict.fromkeys(("error", "truncation", "aliasing", "discretisation"), 0.02),
+        **dict.fromkeys(("error", "truncation", "aliasing", "discretisation", "statistical"), 0.02),
     }
     assert records[1]["distance"] is None
 
@@ -132,14 +132,6 @@ def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
     assert cut is not None
     assert cut.labels == ("f/0", "f/2", "reference")
     assert cut.values[0, 2] == 1.0
-
-
-def test_stores_of_earlier_versions_lack_a_column() -> None:
-    frame = matrix_frame(distances_at(made(3), -4.0), -4.0)
-    assert "discretisation" in frame
-    assert "statistical" not in frame
-    with pytest.raises(InputError, match="values must be one of distance, error, truncation"):
-        matrix(made(3), -4.0, values="statistical")
 
 
 def test_unknown_orders_and_unfinished_stores() -> None:
