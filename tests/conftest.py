@@ -31,7 +31,6 @@ _SIGNS = {
     "process": {
         *("client", "cluster", "driving", "finished_store", "mixed", "s3_client"),
         *("local_client", "started", "tcp_cluster"),
-        *("served", "server", "serving", "storage"),
     },
     "all": {"browser", "reader"},
 }

@@ -16,8 +16,7 @@ from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
 from tests.soak.havoc import Havoc, HavocPlan
 from tests.soak.meshes import write_study
-from tests.support.failing_storage import HEALTHY, FailingStorage, Kind, Rule, failing
-from tests.support.object_storage import BUCKET, serving, taken_for_s3
+from tests.support.object_storage import BUCKET, HEALTHY, Kind, Rule, Server, serving, taken_for_s3
 
 _WORKERS = 2
 # Workers and drivers that are killed leave much to say to those that go on.
@@ -56,7 +55,7 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
     # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
     # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
     plan = HavocPlan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)
-    with serving() as server, failing(server, seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
+    with serving(seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
         with local_client(_WORKERS) as client:
             started = time.monotonic()
             run(Study.from_toml(path), clean, client)
@@ -68,7 +67,7 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
                 lambda: [nanny.pid or 0 for nanny in nannies.values()],
                 lambda: len(client.cluster.scheduler.workers),
             )
-            storage.call(havoc.on_request)
+            storage.listener = havoc.on_request
             storage.rule = Rule(rate)
             started = time.monotonic()
             _drive(path, soaked, client.scheduler.address, havoc)
@@ -106,7 +105,7 @@ def _drive(study: Path, store: Location, scheduler: str, havoc: Havoc) -> None:
             raise RuntimeError(f"the run has ended with status {driver.returncode}:\n{errors[-4000:]}")
 
 
-def _stored_again(storage: FailingStorage) -> int:
+def _stored_again(storage: Server) -> int:
     stored = [
         request.path
         for request in storage.requests()

@@ -1,40 +1,141 @@
-"""A local server that speaks the S3 protocol, in a process of its own."""
+"""Object storage in threads of this process, which speaks S3 and fails as real ones do."""
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
+import random
+import socket
+import struct
 import threading
 import time
-import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from io import BytesIO
+from typing import Any, Literal
 
 import fsspec
 import pytest
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
-# Fewer attempts of the driver, for tests in which all of them fail.
+# Fewer attempts of the driver, for processes in which all of them fail.
 IMPATIENT = {"AWS_MAX_ATTEMPTS": "2"}
-_REQUEST = re.compile(r'"(?:\x1b\[\d+m)*([A-Z]+) (\S+) HTTP')
+
+Kind = Literal["kept", "truncated", "error", "slow down", "reset before", "reset after"]
+# Kinds that few requests can meet come first and are drawn first. After "reset after", the request was carried out
+# without its sender knowing.
+KINDS: tuple[Kind, ...] = ("kept", "truncated", "error", "slow down", "reset before", "reset after")
+
+_ANSWERS: dict[str, tuple[str, bytes]] = {
+    "error": ("500 -", b"<Error><Code>InternalError</Code><Message>InternalError by a test</Message></Error>"),
+    "slow down": ("503 -", b"<Error><Code>SlowDown</Code><Message>SlowDown by a test</Message></Error>"),
+    "kept": ("200 -", b"<DeleteResult><Error><Key>one</Key><Code>InternalError</Code></Error></DeleteResult>"),
+}
 
 
-@dataclass
-class Server:
-    """A running server.
+@dataclass(frozen=True)
+class Rule:
+    """Rule by which requests fail.
 
     Attributes:
-        url: Endpoint of the server.
+        rate: Probability of a failure.
+        kinds: Kinds of failures, the rarest first. Only answers to GET can be truncated, and only keys that are to be
+            removed can be kept, in an otherwise good answer.
+        methods: Methods that may fail; all if empty.
+        most: Number of failures after which nothing fails any more.
+        part: Text in the path and query of requests that may fail.
     """
 
-    url: str
-    process: subprocess.Popen[str]
-    _log: list[str] = field(default_factory=list)
+    rate: float
+    kinds: tuple[Kind, ...] = KINDS
+    methods: frozenset[str] = frozenset()
+    most: int | None = None
+    part: str = ""
+
+
+HEALTHY = Rule(0.0)
+GONE = Rule(1.0, ("error",))
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Change of the rule, at the given number of requests with a method and a text in their path."""
+
+    method: str
+    part: str
+    number: int
+    rule: Rule
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request, its time, and its failure, if any."""
+
+    method: str
+    path: str
+    seconds: float
+    failure: Kind | None
+
+
+class Server:
+    """A server whose requests fail by a rule that may change at any time; healthy at first.
+
+    Args:
+        seed: Seed of the failures.
+
+    Attributes:
+        url: Endpoint.
+        listener: Function that is called at each request, before it is handled.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        # Imported late, as below: they take a second each.
+        from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+        from werkzeug.serving import make_server
+
+        self.listener: Callable[[], None] = lambda: None
+        self._moto = DomainDispatcherApplication(create_backend_app)
+        self._random = random.Random(seed)
+        self._rule = HEALTHY
+        self._turn: Turn | None = None
+        self._failed: Counter[Kind] = Counter()
+        self._requests: list[Request] = []
+        self._lock, self._conditional = threading.Lock(), threading.Lock()
+        self._http = make_server("127.0.0.1", 0, self._answer, threaded=True, request_handler=_handler())
+        self.url = f"http://127.0.0.1:{self._http.server_port}"
+        threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        self.client().create_bucket(Bucket=BUCKET)
+
+    def stop(self) -> None:
+        """Answer no more."""
+        self._http.shutdown()
+        self._http.server_close()
+
+    @property
+    def rule(self) -> Rule:
+        """Rule by which requests fail from now on."""
+        return self._rule
+
+    @rule.setter
+    def rule(self, rule: Rule) -> None:
+        with self._lock:
+            self._rule, self._failed = rule, Counter()
+
+    def await_turn(self, turn: Turn) -> None:
+        """Replace the rule at a request to come."""
+        with self._lock:
+            self._turn = turn
+
+    def requests(self) -> tuple[Request, ...]:
+        """Return all requests so far, in order."""
+        with self._lock:
+            return tuple(self._requests)
+
+    def failures(self) -> Counter[Kind]:
+        """Return the number of failures so far, by kind."""
+        return Counter(request.failure for request in self.requests() if request.failure)
 
     def environment(self, key: str = "tester", secret: str = SECRET) -> dict[str, str]:
         """Return the environment of a process that uses the server."""
@@ -51,7 +152,6 @@ class Server:
 
     def client(self, service: str = "s3") -> Any:
         """Return a client of the server that shares nothing with the code under test."""
-        # Imported late: it takes a second.
         import boto3
         from botocore.config import Config
 
@@ -76,23 +176,72 @@ class Server:
         request = urllib.request.Request(f"{self.url}/moto-api/reset-auth", data, {"Content-Type": "text/plain"})
         urllib.request.urlopen(request).close()
 
-    def requests(self) -> list[tuple[str, str]]:
-        """Return method and path of every request since the last call."""
-        marker = f"/marker-{time.monotonic_ns()}"
-        # The bucket does not exist, but once this request is in the log, all earlier ones are.
-        with suppress(urllib.error.HTTPError):
-            urllib.request.urlopen(self.url + marker).close()
-        while not any(marker in line for line in list(self._log)):
-            time.sleep(0.01)
-        lines, self._log = self._log, []
-        matches = [match.groups() for line in lines if (match := _REQUEST.search(line)) and "/marker-" not in line]
-        return [(method, path) for method, path in matches]
+    def _answer(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        body = environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
+        kind = self._draw(environ["REQUEST_METHOD"], environ["REQUEST_URI"])
+        if kind == "reset before":
+            environ["handler"].reset()
+        if kind in _ANSWERS:
+            status, document = _ANSWERS[kind]
+            start_response(status, [("Content-Type", "application/xml"), ("Content-Length", str(len(document)))])
+            return [document]
+        # Moto looks for the key and writes it in two steps, and two writers at once might both find nothing there.
+        with self._conditional if "HTTP_IF_NONE_MATCH" in environ else nullcontext():
+            head: list[Any] = []
+            answer = b"".join(
+                self._moto({**environ, "wsgi.input": BytesIO(body)}, lambda *arguments: head.extend(arguments))
+            )
+        if kind == "reset after":
+            environ["handler"].reset()
+        start_response(*head)
+        return [answer[: len(answer) // 2] if kind == "truncated" else answer]
 
-    def listen(self) -> None:
-        """Collect the server's log, so that it never waits for a reader."""
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self._log.append(line)
+    def _draw(self, method: str, path: str) -> Kind | None:
+        """Return the kind of failure of a new request, if it is to fail."""
+        self.listener()
+        with self._lock:
+            turn = self._turn
+            if turn and turn.method == method and turn.part in path:
+                self._turn = replace(turn, number=turn.number - 1) if turn.number > 1 else None
+                if self._turn is None:
+                    self._rule, self._failed = turn.rule, Counter()
+            kind = self._drawn(method, path)
+            self._requests.append(Request(method, path, time.monotonic(), kind))
+            return kind
+
+    def _drawn(self, method: str, path: str) -> Kind | None:
+        rule = self._rule
+        possible = {"truncated": method == "GET", "kept": method == "POST" and path.endswith("?delete")}
+        kinds = [kind for kind in rule.kinds if possible.get(kind, True)]
+        concerned = (not rule.methods or method in rule.methods) and rule.part in path
+        if not kinds or not concerned or self._failed.total() == rule.most or self._random.random() >= rule.rate:
+            return None
+        kind = min(kinds, key=self._failed.__getitem__)
+        self._failed[kind] += 1
+        return kind
+
+
+def _handler() -> Any:
+    """Return the class that handles requests."""
+    from moto.moto_server.werkzeug_app import MotoRequestHandler
+
+    class Handler(MotoRequestHandler):
+        def log(self, *arguments: object) -> None:
+            """Do nothing: requests are recorded."""
+
+        def make_environ(self) -> dict[str, Any]:
+            return {**super().make_environ(), "handler": self}
+
+        def reset(self) -> None:
+            """Reset the connection, and leave the application."""
+            self.close_connection = True
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            # The base class would flush and say goodbye first.
+            self.connection.close()
+            self.rfile.close()
+            raise ConnectionResetError
+
+    return Handler
 
 
 def forget_drivers() -> None:
@@ -102,28 +251,21 @@ def forget_drivers() -> None:
 
 @contextmanager
 def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
-    """Make this process, and all that it starts meanwhile, use a server as S3."""
+    """Make this process, and all that it starts meanwhile, use a server as S3; here without a pause before retries."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
+        patch.setattr("botocore.retryhandler.delay_exponential", lambda base, growth_factor, attempts: 0.0)
         forget_drivers()
         yield
         forget_drivers()
 
 
 @contextmanager
-def serving() -> Iterator[Server]:
+def serving(seed: int = 0) -> Iterator[Server]:
     """Run a server with one empty bucket, on a free port."""
-    command = [sys.executable, "-u", "-m", "tests.support.s3_server"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            url = next(found[0] for line in process.stderr if (found := re.search(r"http://127\.0\.0\.1:\d+", line)))
-            server = Server(url, process)
-            listener = threading.Thread(target=server.listen)
-            listener.start()
-            server.client().create_bucket(Bucket=BUCKET)
-            yield server
-        finally:
-            process.kill()
-            listener.join()
+    server = Server(seed)
+    try:
+        yield server
+    finally:
+        server.stop()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import resource
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -63,3 +65,20 @@ assert tree["fourier"]["fourier"].dims == ("mesh", "xi_x", "xi_y", "xi_z")
 assert str(tree["convergence"]["distance"].sel(mesh="ico/2", order=-3.0).dims) == "()"
 print(float(tree["convergence"]["relative"].sel(mesh="ico/3", order=-10.0)))
 """
+
+
+@contextmanager
+def full_disk(most_bytes: int | None = None) -> Iterator[Callable[[int], None]]:
+    """Let this process write no larger files, from now on or once the yielded function is called with a size."""
+    before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(size_bytes: int) -> None:
+        # Python ignores the signal, so that writing fails.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, most))
+
+    try:
+        if most_bytes is not None:
+            fill(most_bytes)
+        yield fill
+    finally:
+        fill(before)

@@ -101,10 +101,6 @@ class Folder:
             # Unlike opening a new file, a link never shows the key without its content.
             os.link(partial, path)
 
-    def exists(self) -> bool:
-        """Return whether the folder exists."""
-        return Path(self._path).is_dir()
-
     def delete(self, key: str) -> None:
         """Remove a file."""
         path_in(self._path, key).unlink()
@@ -112,11 +108,6 @@ class Folder:
     def delete_all(self, prefix: str) -> None:
         """Remove a folder below."""
         shutil.rmtree(path_in(self._path, prefix))
-
-    def delete_if_empty(self) -> None:
-        """Remove the folder if nothing is in it."""
-        with suppress(OSError):  # it holds a store
-            Path(self._path).rmdir()
 
     def delete_partial_files(self) -> None:
         """Remove files that were not written to their end."""
@@ -149,14 +140,6 @@ class Folder:
         parent = path.absolute().parent
         if not parent.is_dir():
             raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
-
-    def is_absent(self, error: OSError) -> bool:
-        """Return true: a missing file is always a missing key."""
-        return True
-
-    def explain(self, error: Exception, text: str) -> str:
-        """Return the message as it is."""
-        return text
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -140,7 +140,7 @@ class Location:
 
     def is_folder(self) -> bool:
         """Return whether the location is a local folder that exists."""
-        return self._storage.exists()
+        return not self.scheme and Path(self.name).is_dir()
 
     def discard(self, key: str) -> None:
         """Remove a key if it exists."""
@@ -154,12 +154,15 @@ class Location:
 
     def remove_empty_folder(self) -> None:
         """Remove the local folder if nothing is in it."""
-        self._storage.delete_if_empty()
+        if not self.scheme:
+            with suppress(OSError):  # it holds a store
+                Path(self.name).rmdir()
 
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
         with self.access("written"):
-            self._storage.delete_partial_files()
+            if isinstance(self._storage, Folder):
+                self._storage.delete_partial_files()
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """Return the number of bytes of every key below a prefix."""
@@ -180,7 +183,8 @@ class Location:
         Raises:
             StoreError: The location holds something else, cannot be read, or has no parent folder.
         """
-        self._storage.require_usable()
+        if isinstance(self._storage, Folder):
+            self._storage.require_usable()
         # A driver that was killed while it wrote the first key leaves a partial file.
         if any(name not in besides and not PARTIAL_FILE.search(name) for name in self.names()):
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
@@ -201,20 +205,20 @@ class Location:
             yield
         except SobolevBatchError:
             raise
-        except Exception as error:
-            if not isinstance(error, self._storage.failures):
-                raise
+        except self._storage.failures as error:
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
-            # The address of a server may contain a password.
-            reason = self._storage.explain(error, re.sub(r"//[^/\s]*@", "//", text))
-            raise StoreError(f"{self}: the store cannot be {verb}: {reason}") from error
+            if isinstance(self._storage, ObjectStorage):
+                # The address of a server may contain a password.
+                text = self._storage.explain(error, re.sub(r"//[^/\s]*@", "//", text))
+            raise StoreError(f"{self}: the store cannot be {verb}: {text}") from error
 
     @contextmanager
     def _absence_ignored(self) -> Iterator[None]:
         try:
             yield
         except (FileNotFoundError, NotADirectoryError) as error:
-            if not self._storage.is_absent(error):
+            # A missing file is always a missing key.
+            if isinstance(self._storage, ObjectStorage) and not self._storage.is_absent(error):
                 raise
 
     @property

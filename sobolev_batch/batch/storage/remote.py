@@ -5,23 +5,65 @@ Credentials are never part of a URL. The drivers take them from the environment 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from typing import Any, TypeVar, cast
 
-from fsspec import AbstractFileSystem
-from fsspec.asyn import sync
+from fsspec.asyn import AsyncFileSystem, sync
 from fsspec.core import url_to_fs
+from fsspec.implementations.asyn_wrapper import AsyncFileSystemWrapper
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import FsspecStore
 
-from sobolev_batch.batch.storage.retry import RetryingStore, put_all, remove_all
 from sobolev_batch.errors import StoreError
 
+T = TypeVar("T")
+
 BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
-# Drivers repeat failing requests for minutes. That helps a run, but a question should be answered sooner.
-_ANSWER_SECONDS = 20
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+# A run that cannot go on should say so within a minute, and a question is to be answered sooner.
+LONGEST_SECONDS, _ANSWER_SECONDS = 40.0, 20
+_SLOWEST_BYTES_PER_SECOND = 500_000
 # s3fs asks for the size of every key first, to read ranges of 50 MB of larger ones at once.
-_SIZED_SCHEMES = ("s3", "s3a")
 _RANGE_BYTES = 50 << 20
+# Another attempt would not change these answers.
+_FINAL = (PermissionError, FileNotFoundError, NotADirectoryError)
+
+
+async def _twice(attempt: Callable[[], Awaitable[T]], size_bytes: int = 0, final: Any = _FINAL) -> T:
+    """Make a request of the driver, and once more if it fails; then, or after a minute, raise the first failure.
+
+    The drivers repeat most requests several times, but not a range whose transfer breaks off, nor an upload whose last
+    answer was lost. Keys are written whole, so writing one again is safe.
+    """
+    failure: Exception = OSError("nothing answers there")  # fsspec would drop the message of a TimeoutError
+    try:
+        async with asyncio.timeout(LONGEST_SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND):
+            try:
+                return await attempt()
+            except final:
+                raise
+            except Exception as error:
+                failure = error
+                return await attempt()
+    except TimeoutError:
+        raise failure from None
+
+
+class RemoteStore(FsspecStore):
+    """zarr's store behind a driver of fsspec."""
+
+    largest_bytes = 0
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Return the bytes of a key or of a range of it, or None if it does not exist."""
+        return await _twice(partial(super().get, key, prototype, byte_range), self.largest_bytes)
+
+    async def set(self, key: str, value: Buffer, byte_range: tuple[int, int] | None = None) -> None:
+        """Replace a key."""
+        await _twice(partial(super().set, key, value, byte_range), len(value), PermissionError)
 
 
 class ObjectStorage:
@@ -33,70 +75,63 @@ class ObjectStorage:
     def __init__(self, url: str, scheme: str) -> None:
         self._url, self._scheme = url, scheme
 
-    def zarr_store(self, largest_bytes: int) -> RetryingStore:
+    def zarr_store(self, largest_bytes: int) -> RemoteStore:
         """Return zarr's store below the URL."""
-        self._filesystem()
-        return RetryingStore.at(self._url, self._options(largest_bytes), largest_bytes)
+        self._driver()
+        store = RemoteStore.from_url(self._url, storage_options=self._options(largest_bytes))
+        cast(RemoteStore, store).largest_bytes = largest_bytes
+        return cast(RemoteStore, store)
 
     def read(self, key: str, most_bytes: int | None) -> bytes:
         """Return the content of a key, of any size."""
-        files, root = self._filesystem()
-        content: bytes = files.cat_file(f"{root}/{key}", **_timeout(files))
-        return content
+        return cast(bytes, self._ask("cat_file", key))
 
     def write(self, documents: Mapping[str, bytes]) -> None:
         """Write keys, all at once."""
-        files, root = self._filesystem()
-        by_path = {f"{root}/{key}": document for key, document in documents.items()}
-        if files.async_impl:
-            sync(files.loop, put_all, files, by_path)
-        else:
-            files.pipe(by_path)
+        files, root = self._driver()
+
+        async def put_all() -> None:
+            puts = (
+                _twice(partial(files._pipe_file, f"{root}/{key}", document), len(document), PermissionError)
+                for key, document in documents.items()
+            )
+            # All are awaited, since asyncio logs failures that nobody retrieved.
+            for outcome in await asyncio.gather(*puts, return_exceptions=True):
+                if isinstance(outcome, BaseException):
+                    raise outcome
+
+        sync(files.loop, put_all)
 
     def create(self, key: str, document: bytes) -> None:
         """Write a key by a conditional request."""
-        files, root = self._filesystem()
-        files.pipe_file(f"{root}/{key}", document, mode="create", **_timeout(files))
-
-    def exists(self) -> bool:
-        """Return false: object storage has no folders."""
-        return False
+        self._ask("pipe_file", key, document, mode="create")
 
     def delete(self, key: str) -> None:
         """Remove a key."""
-        files, root = self._filesystem()
-        files.rm_file(f"{root}/{key}")
+        self._ask("rm_file", key)
 
     def delete_all(self, prefix: str) -> None:
         """Remove all keys below a prefix."""
-        files, root = self._filesystem()
-        if files.async_impl:
-            sync(files.loop, remove_all, files, f"{root}/{prefix}")
-        else:
-            files.rm(f"{root}/{prefix}", recursive=True)
+        files, root = self._driver()
 
-    def delete_if_empty(self) -> None:
-        """Do nothing: object storage has no folders."""
+        async def remove() -> None:
+            await files._rm(f"{root}/{prefix}", recursive=True)
+            # A server may remove some of them only; s3fs does not check.
+            if remaining := await files._find(f"{root}/{prefix}"):
+                raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
 
-    def delete_partial_files(self) -> None:
-        """Do nothing: object storage shows a key once it is complete."""
+        sync(files.loop, _twice, remove)
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """Return the sizes of all keys below a prefix."""
-        files, root = self._filesystem()
-        entries = files.find(f"{root}/{prefix}", detail=True, **_timeout(files))
-        return {path.removeprefix(f"{root}/"): entry["size"] for path, entry in entries.items()}
+        entries = self._ask("find", prefix, detail=True)
+        return {path.removeprefix(f"{self._driver()[1]}/"): entry["size"] for path, entry in entries.items()}
 
     def names(self) -> set[str]:
         """Return the names of keys at the first level."""
-        files, root = self._filesystem()
         # The name alone may stand for a folder that was emptied; only existing keys are listed.
-        if not files.exists(root, **_timeout(files)):
-            return set()
-        return {path.rstrip("/").rpartition("/")[2] for path in files.ls(root, detail=False, **_timeout(files))}
-
-    def require_usable(self) -> None:
-        """Do nothing: only a request can tell."""
+        paths = self._ask("ls", "", detail=False) if self._ask("exists", "") else ()
+        return {path.rstrip("/").rpartition("/")[2] for path in paths}
 
     def is_absent(self, error: OSError) -> bool:
         """Return whether the key is missing, and not its bucket."""
@@ -114,16 +149,19 @@ class ObjectStorage:
             return f"access is denied ({text}); check the credentials in the environment and what they allow"
         return text
 
-    def _options(self, largest_bytes: int) -> dict[str, Any]:
-        # fsspec remembers listings, but other processes write to the same store.
-        options: dict[str, Any] = {"use_listings_cache": False}
-        if self._scheme in _SIZED_SCHEMES and largest_bytes <= _RANGE_BYTES:
-            options["max_concurrency"] = 1
-        return options
+    def _ask(self, method: str, key: str, *arguments: Any, **options: Any) -> Any:
+        """Call a method of the driver with a path, and wait for a while only."""
+        files, root = self._driver()
+        return getattr(files, method)(f"{root}/{key}".rstrip("/"), *arguments, **options, timeout=_ANSWER_SECONDS)
 
-    def _filesystem(self) -> tuple[AbstractFileSystem, str]:
+    def _options(self, largest_bytes: int = 0) -> dict[str, Any]:
+        # fsspec remembers listings, but other processes write to the same store.
+        one_request = {"max_concurrency": 1} if self._scheme in ("s3", "s3a") and largest_bytes <= _RANGE_BYTES else {}
+        return {"use_listings_cache": False, **one_request}
+
+    def _driver(self) -> tuple[AsyncFileSystem, str]:
         try:
-            files, root = url_to_fs(self._url, **self._options(0))
+            files, root = url_to_fs(self._url, **self._options())
         except ImportError as error:
             extra = _EXTRAS.get(self._scheme)
             remedy = f"pip install 'sobolev-batch[{extra}]'" if extra else "install it"
@@ -132,11 +170,8 @@ class ObjectStorage:
             ) from error
         except ValueError as error:
             raise StoreError(f"{self._url}: no store can lie there ({error}); name a folder or an s3:// URL") from error
-        return files, str(root)
-
-
-def _timeout(files: AbstractFileSystem) -> dict[str, Any]:
-    return {"timeout": _ANSWER_SECONDS} if files.async_impl else {}
+        # The driver of memory:// is the only common one that is not asynchronous.
+        return files if files.async_impl else AsyncFileSystemWrapper(files, asynchronous=False), str(root)
 
 
 def _lacks_bucket(error: Exception) -> bool:

@@ -6,7 +6,6 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -33,11 +32,13 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import LockError
 from tests.support.commands import STUDY, call, command
-from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, forget_drivers, serving, taken_for_s3
+from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, serving, taken_for_s3
 from tests.support.stores import READER, assert_same
 from tests.support.studies import small_table, variable
 
 pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +48,6 @@ def server() -> Iterator[Server]:
         yield server
 
 
-@pytest.fixture(scope="module")
-def s3_client(server: Server) -> Iterator[Client]:
-    """Two worker processes that know the server."""
-    with local_client(2) as client:
-        yield client
-
-
 @pytest.fixture
 def url(request: pytest.FixtureRequest) -> str:
     """A place that no other test uses."""
@@ -61,48 +55,51 @@ def url(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def stored(server: Server, s3_client: Client) -> str:
+def stored(server: Server, threads: Client) -> str:
     """The small study's store after a run; not to be changed."""
     url = f"s3://{BUCKET}/finished/results.zarr"
-    assert len(run(Study.from_table(small_table()), url, s3_client).computed) == 5
+    assert len(run(Study.from_table(small_table()), url, threads).computed) == 5
     return url
 
 
 @pytest.mark.all
-def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, stored: str, finished_store: Path) -> None:
-    tree = open_store(stored)
+def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, url: str, finished_store: Path) -> None:
+    with local_client(2) as client:
+        assert len(run(Study.from_table(small_table()), url, client).computed) == 5
+    tree = open_store(url)
     assert_same(tree, open_store(finished_store))
     assert len(set(variable(tree, "meshes", "worker").values.tolist())) == 2
     # What is written is what a folder holds, key for key.
-    assert {key.split("results.zarr/")[1] for key in server.keys("finished/")} == {
+    keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
+    assert {key.split("results.zarr/")[1] for key in keys} == {
         str(path.relative_to(finished_store)) for path in finished_store.rglob("*") if path.is_file()
     }
 
 
-def test_a_second_run_reuses_and_writes_no_field(server: Server, s3_client: Client, url: str) -> None:
+def test_a_second_run_reuses_and_writes_no_field(server: Server, threads: Client, url: str) -> None:
     study = Study.from_table(small_table())
-    first = run(study, url, s3_client)
-    server.requests()
+    first = run(study, url, threads)
+    before = len(server.requests())
     steps: list[Progress] = []
-    second = run(study, url, s3_client, on_progress=steps.append)
+    second = run(study, url, threads, on_progress=steps.append)
     assert (second.computed, second.reused) == ((), first.computed)
     assert steps == []
-    made = server.requests()
+    requests = server.requests()[before:]
     root = url.replace("s3:/", "")
-    written = {path for method, path in made if method not in ("GET", "HEAD")}
+    written = {request.path for request in requests if request.method not in ("GET", "HEAD")}
     assert written == {f"{root}/zarr.json", f"{root}/records/zarr.json", f"{root}/claim.json"}
     # Each write is preceded by a look at the lock.
-    assert len(made) < 42
+    assert len(requests) < 42
 
 
-def test_requests_grow_by_eight_for_a_mesh(server: Server, s3_client: Client, url: str) -> None:
+def test_requests_grow_by_eight_for_a_mesh(server: Server, threads: Client, url: str) -> None:
     counts = []
     for meshes in (4, 14):
         family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(meshes)]
         study = Study.from_table(small_table(family=family))
-        server.requests()
-        run(study, url.replace("results", str(meshes)), s3_client)
-        counts.append(len(server.requests()))
+        before = len(server.requests())
+        run(study, url.replace("results", str(meshes)), threads)
+        counts.append(len(server.requests()) - before)
     # The field and its record written, each after a look at the lock; looks for an older record by driver and task;
     # the field read for norms and for pairs.
     assert counts[1] - counts[0] <= 8 * 10 + 4
@@ -110,36 +107,34 @@ def test_requests_grow_by_eight_for_a_mesh(server: Server, s3_client: Client, ur
 
 
 @pytest.mark.all
-def test_an_interrupted_run_goes_on_from_what_is_stored(
-    server: Server, s3_client: Client, url: str, stored: str
-) -> None:
+def test_an_interrupted_run_goes_on_from_what_is_stored(server: Server, threads: Client, url: str, stored: str) -> None:
     def interrupt(progress: Progress) -> None:
         if progress.stage == "fields" and progress.done == 2:
             raise KeyboardInterrupt
 
     study = Study.from_table(small_table())
     with pytest.raises(KeyboardInterrupt):
-        run(study, url, s3_client, on_progress=interrupt)
-    again = run(study, url, s3_client)
+        run(study, url, threads, on_progress=interrupt)
+    again = run(study, url, threads)
     assert len(again.reused) >= 2
     assert len(again.computed) + len(again.reused) == 5
     assert_same(open_store(url), open_store(stored))
 
 
 @pytest.mark.all
-def test_proximities_are_those_of_a_folder(server: Server, s3_client: Client, url: str, tmp_path: Path) -> None:
+def test_proximities_are_those_of_a_folder(server: Server, threads: Client, url: str, tmp_path: Path) -> None:
     table = small_table(reference={"source": "icosphere", "levels": [4]}, proximity={"points": 100})
     fewer = {**table, "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}]}
     folder = tmp_path / "results.zarr"
     for place in (url, str(folder)):
-        run(Study.from_table(fewer), place, s3_client)
-        assert not run(Study.from_table(table), place, s3_client).not_compared
+        run(Study.from_table(fewer), place, threads)
+        assert not run(Study.from_table(table), place, threads).not_compared
     for name in ("hausdorff", "chamfer"):
         ours, theirs = (variable(open_store(place), "proximity", name).load() for place in (url, str(folder)))
         assert np.isfinite(ours.isel(mesh=slice(0, 4))).sum() == np.isfinite(theirs.isel(mesh=slice(0, 4))).sum() > 0
         xr.testing.assert_allclose(ours, theirs, rtol=1e-9)
     assert verify(url).is_sound
-    run(Study.from_table(small_table(reference=table["reference"])), url, s3_client)
+    run(Study.from_table(small_table(reference=table["reference"])), url, threads)
     prefix = url.removeprefix(f"s3://{BUCKET}/")
     assert not [key for key in server.keys(prefix) if "/proximity/" in key]
 
@@ -165,6 +160,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     assert Store.open(url).labels() == store.labels()
 
 
+@pytest.mark.all
 def test_a_process_with_xarray_alone_reads_everything(stored: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", READER, stored], capture_output=True, text=True, cwd=tmp_path, check=False
@@ -225,15 +221,16 @@ def test_zeros_are_stored_and_a_flipped_bit_is_found(server: Server, url: str) -
         store.read_fields([1, 3], place)
 
 
+@pytest.mark.all
 def test_large_chunks_travel_in_parts(server: Server, url: str) -> None:
     plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 240})))
     store = prepare_store(url, plan)
     place = plan.lattice.place(plan.blocks[0])
     values = np.arange(plan.lattice.half.size, dtype=complex).reshape(plan.lattice.shape)
     assert values.nbytes > 100 << 20
-    server.requests()
+    before = len(server.requests())
     store.write_field(0, place, values)
-    assert sum("partNumber=" in path for _, path in server.requests()) > 1
+    assert sum("partNumber=" in request.path for request in server.requests()[before:]) > 1
     assert np.array_equal(store.read_fields([0], place)[0], values)
     # Small keys are read without a look at their size, large ones in parts at once.
     readers = [store.location.zarr_store(size) for size in (1 << 20, 100 << 20)]
@@ -274,7 +271,6 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
         (("table", there), unknown, "no credentials (Unable to locate credentials); set those of s3://"),
     ]
     for arguments, environment, message in cases:
-        started = time.monotonic()
         with taken_for_s3(environment):
             done = call(*arguments, folder=tmp_path)
         assert done.returncode == 2, done.stderr
@@ -283,7 +279,6 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
         assert done.stderr.count("\n") == 1
         assert SECRET not in done.stderr
         assert done.stdout == ""
-        assert time.monotonic() - started < 90
     assert server.keys("nothing.zarr") == []
 
 
@@ -343,22 +338,17 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
 
 
 @pytest.mark.all
-def test_a_server_that_goes_away_ends_the_run(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_goes_away_ends_the_run(study: Study) -> None:
     def kill(progress: Progress) -> None:
         if progress.stage == "fields" and progress.done == 1:
-            brief.process.kill()
+            brief.stop()
 
-    with serving() as brief:
-        for name, value in {**brief.environment(), **IMPATIENT}.items():
-            monkeypatch.setenv(name, value)
-        forget_drivers()
-        try:
-            with pytest.raises(
-                StoreError, match=rf"s3://{BUCKET}/x.zarr: the store cannot be (read|written): .*connect"
-            ):
-                run(study, f"s3://{BUCKET}/x.zarr", workers=1, on_progress=kill)
-        finally:
-            forget_drivers()
+    with (
+        serving() as brief,
+        taken_for_s3({**brief.environment(), **IMPATIENT}),
+        pytest.raises(StoreError, match=rf"s3://{BUCKET}/x.zarr: the store cannot be (read|written): .*connect"),
+    ):
+        run(study, f"s3://{BUCKET}/x.zarr", workers=1, on_progress=kill)
 
 
 @pytest.mark.all
@@ -447,18 +437,17 @@ def test_of_many_drivers_at_once_one_has_the_store(server: Server, url: str) -> 
 
 
 @pytest.mark.all
-@pytest.mark.parametrize("damage", ["cut", "flipped", "gone"])
-def test_damage_is_found_and_repaired(server: Server, s3_client: Client, url: str, damage: str, stored: str) -> None:
+@pytest.mark.parametrize("damage", ["cut", "gone"])
+def test_damage_is_found_and_repaired(server: Server, threads: Client, url: str, damage: str, stored: str) -> None:
     study, there = Study.from_table(small_table()), server.client()
-    run(study, url, s3_client)
+    run(study, url, threads)
     key = url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c/2/0/0/0"
-    data = bytearray(there.get_object(Bucket=BUCKET, Key=key)["Body"].read())
+    data = there.get_object(Bucket=BUCKET, Key=key)["Body"].read()
     if damage == "gone":
         there.delete_object(Bucket=BUCKET, Key=key)
     else:
-        data[100] ^= damage == "flipped"
-        there.put_object(Bucket=BUCKET, Key=key, Body=bytes(data[: -10 if damage == "cut" else None]))
+        there.put_object(Bucket=BUCKET, Key=key, Body=data[:-10])
     assert list(verify(url).fields) == ["ico/2"]
-    assert run(study, url, s3_client).computed == ("ico/2",)
+    assert run(study, url, threads).computed == ("ico/2",)
     assert verify(url).is_sound
     assert_same(open_store(url), open_store(stored))
