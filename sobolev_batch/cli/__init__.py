@@ -19,7 +19,6 @@ from sobolev_batch.cli.interruption import (
     Terminated,
     end_process,
     ignore_requests,
-    raise_when_asked,
 )
 from sobolev_batch.cli.output import echo, echo_lines, show_usage_error
 from sobolev_batch.errors import InputError, SobolevBatchError
@@ -39,7 +38,7 @@ def main() -> None:
     command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
     # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
     deadline = Deadline(_REMARKS.get(command, ""), _SECONDS_WITH_LOCK.get(command, SECONDS_TO_END))
-    raise_when_asked(deadline)
+    deadline.start()
     make_messages_visible()
     try:
         status = cli.main(standalone_mode=False)

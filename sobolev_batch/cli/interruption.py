@@ -1,4 +1,4 @@
-"""Requests to end (Ctrl-C, or the SIGTERM of a job at its time limit) as exceptions that cannot get lost."""
+"""Requests to end, Ctrl-C or the SIGTERM of a job at its time limit, which end a command within seconds."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, ClassVar, NoReturn
+from typing import ClassVar, NoReturn
 
-if TYPE_CHECKING:
-    from sys import UnraisableHookArgs
-
-# By then the finalizer has returned.
-_AGAIN_SECONDS = 0.01
 # Time in which a command ends by itself; a transform may take longer to return to Python.
 SECONDS_TO_END = 1.0
 # Work that ends with what it has leaves out up to three steps, each when it is asked again.
@@ -27,45 +22,12 @@ class Terminated(SystemExit):
     """The process was asked to end by SIGTERM."""
 
 
-def raise_when_asked(deadline: Deadline) -> None:
-    """Raise KeyboardInterrupt and `Terminated` in the main thread when the process is asked to end.
-
-    Python only reports an exception that a signal raises within a finalizer. It is then raised again.
-
-    Args:
-        deadline: Deadline for the end of the process from then on.
-    """
-    # Python's tracker of semaphores outlives a process that ends at once and cleans up after it, with a warning that
-    # would be the last word.
-    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
-    signal.signal(signal.SIGTERM, _terminate)
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
-        signal.signal(signal.SIGINT, _interrupt)
-    if not hasattr(signal, "setitimer"):  # Windows
-        return
-    deadline.start()
-    report = sys.unraisablehook
-
-    def insist(lost: UnraisableHookArgs) -> None:
-        if not isinstance(lost.exc_value, KeyboardInterrupt | Terminated):
-            report(lost)
-            return
-        asked = type(lost.exc_value)
-
-        def ask_again(number: int, frame: FrameType | None) -> None:
-            raise asked
-
-        signal.signal(signal.SIGALRM, ask_again)
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_SECONDS)
-
-    sys.unraisablehook = insist
-
-
 class Deadline:
     """The end of this process soon after a request to end, even while it computes.
 
-    Python raises no exception until a library returns to it. A thread of its own hears of signals at once. It leaves
-    the command some time to clean up, and then ends the process: files and stores are only ever replaced as a whole.
+    Python raises no exception until a library returns to it, and loses one in a finalizer. A thread of its own hears
+    of signals at once. It leaves the command some time to clean up, and then ends the process: files and stores are
+    only ever replaced as a whole.
 
     Args:
         remark: What to add to the last message.
@@ -84,12 +46,19 @@ class Deadline:
         self._is_met = threading.Event()
 
     def start(self) -> None:
-        """Listen to signals from now on."""
-        Deadline._current = self
-        requests, wake = os.pipe()
-        os.set_blocking(wake, False)
-        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-        threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
+        """Raise KeyboardInterrupt and `Terminated` at requests from now on, and see that the process ends."""
+        # Python's tracker of semaphores outlives a process that ends at once and cleans up after it, with a warning
+        # that would be the last word.
+        sys.warnoptions.append("ignore:resource_tracker:UserWarning")
+        signal.signal(signal.SIGTERM, _raising(Terminated))
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
+            signal.signal(signal.SIGINT, _raising(KeyboardInterrupt))
+        if hasattr(signal, "pthread_kill"):  # not on Windows
+            Deadline._current = self
+            requests, wake = os.pipe()
+            os.set_blocking(wake, False)
+            signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+            threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
 
     def _listen(self, requests: int) -> None:
         number = 0
@@ -110,22 +79,19 @@ class Deadline:
         Args:
             has_results: Function that tells whether there is anything yet. It is called in another thread.
         """
-        before = signal.signal(signal.SIGTERM, _interrupt)
+        before = signal.signal(signal.SIGTERM, _raising(KeyboardInterrupt))
         deadline = cls._current or Deadline()
         deadline._has_results = has_results
         try:
             yield
-        except BaseException:
-            signal.signal(signal.SIGTERM, before)
-            raise
+            if deadline.request:
+                # What is left to do is short, and nothing may come between.
+                deadline._is_met.set()
+                ignore_requests()
         finally:
             deadline._has_results = None
-        if deadline.request:
-            # What is left to do is short, and nothing may come between.
-            deadline._is_met.set()
-            ignore_requests()
-        else:
-            signal.signal(signal.SIGTERM, before)
+            if not deadline._is_met.is_set():
+                signal.signal(signal.SIGTERM, before)
 
 
 def end_process(number: int, remark: str) -> NoReturn:
@@ -140,21 +106,13 @@ def ignore_requests() -> None:
     """Ignore further requests, which would change how an ending process ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
-    _silence_cancellations()
-    raise Terminated
+def _raising(error: type[BaseException]) -> Callable[[int, FrameType | None], None]:
+    def handle(number: int, frame: FrameType | None) -> None:
+        # Dask would print a traceback for each call that the request cancels, and for each worker that ends.
+        for name in ("tornado.application", "distributed"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        raise error
 
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    _silence_cancellations()
-    raise KeyboardInterrupt
-
-
-def _silence_cancellations() -> None:
-    """Keep Dask from printing a traceback for each call that the request cancels, and for each worker that ends."""
-    for name in ("tornado.application", "distributed"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    return handle

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from sobolev_batch import cli
+from sobolev_batch.cli.interruption import Deadline
 
 TOML = """
 study.name = "small"
@@ -61,7 +62,7 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
         patch.setattr(sys, "argv", ["sobolev-batch", *map(str, arguments)])
         # Signals, warnings and log records are the test runner's, and so are its log handlers: the command is to set up
         # its own.
-        patch.setattr(cli, "raise_when_asked", lambda deadline: None)
+        patch.setattr(Deadline, "start", lambda deadline: None)
         patch.setattr(cli, "make_messages_visible", lambda: None)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)

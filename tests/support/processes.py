@@ -6,19 +6,33 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import dask as dask_settings
 from distributed import Client
 from distributed.utils import get_mp_context
 
+T = TypeVar("T")
+
 SCHEDULER = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
 # Limit of every wait for another process, for a machine that does much else: nothing is to depend on it.
 PATIENCE_SECONDS = 200
+_POLL_SECONDS = 0.02
 # A worker's own HTTP server listens on every interface unless told otherwise, --no-dashboard or not.
 WORKER = ["--host", "127.0.0.1", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0", "--no-nanny"]
+
+
+def wait_until(condition: Callable[[], T]) -> T:
+    """Return the first true value of a condition, which other processes make true."""
+    started = time.monotonic()
+    while not (value := condition()):
+        assert time.monotonic() - started < PATIENCE_SECONDS, "it did not come true"
+        time.sleep(_POLL_SECONDS)
+    return value
 
 
 def dask(*arguments: str, found_first: Path | None = None) -> subprocess.Popen[str]:
@@ -34,7 +48,7 @@ def stop(process: subprocess.Popen[str]) -> None:
     """End a process, by force if need be: a worker may wait for a peer that is gone."""
     process.terminate()
     try:
-        process.communicate(timeout=20)
+        process.communicate(timeout=PATIENCE_SECONDS)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
