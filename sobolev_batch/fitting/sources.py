@@ -20,15 +20,17 @@ from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.derived.nested import NestedSource, load_mesh, parse_nested
-from sobolev_batch.surfaces.sources.fingerprints import installed_version
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
     Fingerprint,
     Member,
+    NestedSource,
     Source,
     at_most,
+    installed_version,
+    load_mesh,
+    parse_nested,
     single_member,
 )
 
@@ -60,11 +62,6 @@ class TargetSource(NestedSource, ABC):
     steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
     smoothing: Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=False)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """Distributions that both sources need."""
-        return *super().libraries, *(() if self.target is None else self.target.libraries)
 
     @field_validator("target", mode="before")
     @classmethod

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.sources.globs import expand
+from sobolev_batch.surfaces.sources.files import expand
 
 OBJECT, METHOD = "{object}", "{method}"
 # Characters of globs and templates, which the names of objects and methods cannot have.

@@ -23,8 +23,8 @@ from sobolev_batch.spectral.shells import Orders, Reals, check_orders
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.sources.derived.decimation import decimated
-from sobolev_batch.surfaces.sources.derived.displacement import with_noise
+from sobolev_batch.surfaces.sources.displaced import with_noise
+from sobolev_batch.surfaces.sources.reduced import decimated
 
 # Error of the values of changed meshes, as a fraction of the distance.
 _VALUES_ACCURACY = 1e-2

@@ -1,10 +1,14 @@
-"""The source `files`: meshes from the file system, by path or glob."""
+"""The source `files`: meshes from the file system, by path, by glob or in a list."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import translate
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -12,11 +16,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from sobolev_batch.errors import StudyError
+from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.formats.raw_files import checked_length, open_regular
 from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.fingerprints import file_digest
-from sobolev_batch.surfaces.sources.globs import expand
 from sobolev_batch.surfaces.sources.mesh_lists import MOST_MESHES, ListedMesh, checked_list, read_mesh_list
 from sobolev_batch.surfaces.sources.names import (
     caseless_key,
@@ -45,7 +48,7 @@ class FileSource(Source):
     Attributes:
         paths: Paths or globs (``**`` crosses folders), relative to the study file. A path may lie anywhere,
             and its file must exist when its mesh is computed. A glob must match a file at once, and matches
-            none outside the folder that it names: see `globs.expand`.
+            none outside the folder that it names: see `expand`.
         meshes: Instead of paths, a list of meshes with what is known of them: a CSV file, or tables of the study. See
             `mesh_lists`.
         distribution: Installed Python distribution. Paths are then those of files that it recorded at its
@@ -201,3 +204,83 @@ def _unique(names: list[str]) -> list[bool]:
     keys = list(map(caseless_key, names))
     counts = Counter(keys)
     return [counts[key] == 1 for key in keys]
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        MeshError: The file cannot be read.
+    """
+    try:
+        with open_regular(path) as file:
+            checked_length(file)
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def expand(folder: Path, pattern: str) -> list[Path]:
+    """Return the files that match a pattern of ``**``, ``*``, ``?`` and ``[...]``.
+
+    The part of the pattern before its first wildcard names a folder. Files outside of that folder are
+    refused, since nobody would notice them: ``..`` after a wildcard, and links that lead out. Hidden files
+    match only a part that begins with a dot; ``**`` follows no links to folders.
+
+    Args:
+        folder: Folder where relative patterns start.
+        pattern: Pattern with at least one wildcard.
+
+    Raises:
+        StudyError: The pattern matches no file, or one outside its folder.
+    """
+    parts = Path(pattern).parts
+    first = next(i for i, part in enumerate(parts) if has_magic(part))
+    base, rest = folder.joinpath(*parts[:first]), parts[first:]
+    glob = f"the glob {quoted(pattern, 300)}"
+    if ".." in rest:
+        raise StudyError(f"{glob} goes back up behind a wildcard; name the folder to search")
+    paths = [base]
+    for part in rest:
+        # Without duplicates, or some patterns would take for ever.
+        paths = list(dict.fromkeys(match for path in paths for match in _matches(path, part)))
+    inside = Path(os.path.realpath(base))
+    files = [path for path in paths if os.path.isfile(path)]
+    if not files:
+        raise StudyError(f"{glob} matches no file below {inside}; correct it, or put files there")
+    for path in files:
+        target = Path(os.path.realpath(path))
+        if not target.is_relative_to(inside):
+            raise StudyError(
+                f"{glob} matches {str(path)!r}, a link out of {inside} to {target}; name such files by their paths"
+            )
+    return files
+
+
+def _matches(folder: Path, part: str) -> Iterator[Path]:
+    """Yield the paths in a folder that match one part of a pattern."""
+    if part == "**":
+        # Any number of folders; as the last part it stands for their files.
+        yield folder
+        for parent, folders, files in os.walk(folder):
+            folders[:] = [
+                name for name in folders if not name.startswith(".") and not os.path.islink(os.path.join(parent, name))
+            ]
+            for name in (*folders, *files):
+                if not name.startswith("."):
+                    yield Path(parent, name)
+    elif not has_magic(part):
+        if os.path.lexists(folder / part):
+            yield folder / part
+    else:
+        matches = re.compile(translate(part)).match
+        try:
+            names = os.listdir(folder)
+        except OSError:
+            # A file, or a folder that may not be listed, matches nothing, as in a shell.
+            return
+        for name in names:
+            if matches(name) and (part.startswith(".") or not name.startswith(".")):
+                yield folder / name

@@ -19,7 +19,6 @@ from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.ellipsoid import Ellipsoid
 from sobolev_batch.surfaces.smooth.torus import MOST_TRIANGLES, Torus
-from sobolev_batch.surfaces.sources.fingerprints import installed_version
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
@@ -28,6 +27,7 @@ from sobolev_batch.surfaces.sources.registry import (
     Source,
     SurfaceMember,
     at_most,
+    installed_version,
 )
 
 # Measured peak of the subdivision, for each triangle that it makes.

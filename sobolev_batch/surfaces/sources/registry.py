@@ -17,13 +17,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, field_validator
 
-from sobolev_batch.errors import StudyError
+from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import quoted
 
@@ -31,6 +32,25 @@ from sobolev_batch.surfaces.sources.names import quoted
 MOST_ENTRIES = 1000
 
 _GROUP = "sobolev_batch.sources"
+_HERE = "sobolev_batch.surfaces.sources"
+# The package's own sources, by name.
+_OWN = {
+    "decimate": f"{_HERE}.reduced:DecimateSource",
+    "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
+    "ellipsoid-levels": f"{_HERE}.generated:EllipsoidLevelsSource",
+    "files": f"{_HERE}.files:FileSource",
+    "fit": "sobolev_batch.fitting.sources:FitSource",
+    "flow": f"{_HERE}.displaced:FlowSource",
+    "icosphere": f"{_HERE}.generated:IcosphereSource",
+    "moved": f"{_HERE}.displaced:MovedSource",
+    "noisy": f"{_HERE}.displaced:NoisySource",
+    "refine": "sobolev_batch.fitting.sources:RefineSource",
+    "remesh": f"{_HERE}.reduced:RemeshSource",
+    "sphere": f"{_HERE}.generated:SphereSource",
+    "spherical-levels": f"{_HERE}.reduced:SphericalLevelsSource",
+    "torus": f"{_HERE}.generated:TorusSource",
+    "torus-grid": f"{_HERE}.generated:TorusGridSource",
+}
 
 Fingerprint = Mapping[str, Any]
 Metadata = tuple[tuple[str, float | str], ...]
@@ -259,6 +279,50 @@ def parse_source(table: Mapping[str, Any]) -> Source:
     return source_type.model_validate({key: value for key, value in table.items() if key != "source"})
 
 
+class NestedSource(Source):
+    """A source that works on the surfaces of others; each field that holds one is handed what it is handed.
+
+    Attributes:
+        mesh: Table of the other source.
+    """
+
+    mesh: SerializeAsAny[Source]
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions that the other sources need."""
+        return tuple(library for source in self._nested().values() for library in source.libraries)
+
+    def with_reference(self, reference: Source) -> Self:
+        """Return the source with the study's reference handed to the other sources."""
+        return self.model_copy(
+            update={name: source.with_reference(reference) for name, source in self._nested().items()}
+        )
+
+    def _nested(self) -> dict[str, Source]:
+        return {name: value for name, value in self if isinstance(value, Source)}
+
+    @field_validator("mesh", mode="before")
+    @classmethod
+    def _parse_mesh(cls, table: object) -> object:
+        return parse_nested(table)
+
+
+def parse_nested(table: object) -> Source:
+    """Return the source that a table within the table of another source names.
+
+    Raises:
+        ValueError: It is no table.
+        StudyError: See `parse_source`.
+    """
+    if not isinstance(table, dict):
+        raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
+    try:
+        return parse_source(table)
+    except StudyError as error:
+        raise StudyError(f"the table {quoted(table)}: {error}") from error
+
+
 def source_type_of(name: object) -> type[Source]:
     """Return the source of a name.
 
@@ -301,6 +365,34 @@ def single_member(source: Source, folder: Path) -> Member:
     return members[0]
 
 
+def load_mesh(member: Member) -> Mesh:
+    """Return the surface of a member that must be a mesh.
+
+    Raises:
+        MeshError: The surface is no mesh, or cannot be made.
+    """
+    mesh = member.load()
+    if not isinstance(mesh, Mesh):
+        raise MeshError(f"{member.name} is no mesh; its triangles are needed, so take a source of meshes")
+    return mesh
+
+
+def installed_version(distribution: str) -> str:
+    """Return the installed version of a library whose output is part of a surface.
+
+    Raises:
+        MeshError: The library is not installed.
+    """
+    try:
+        return version(distribution)
+    except PackageNotFoundError as error:
+        raise MeshError(
+            f"this source needs the library {distribution}, which is not installed; install the extra: "
+            "pip install 'sobolev-batch[studies]'"
+        ) from error
+
+
 @lru_cache(maxsize=1)
 def _registry() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=_GROUP)}
+    own = [EntryPoint(name, value, _GROUP) for name, value in _OWN.items()]
+    return {point.name: point for point in (*entry_points(group=_GROUP), *own)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,7 +12,7 @@ from pydantic import BaseModel
 
 from sobolev_batch import Lattice, Study, StudyError
 from sobolev_batch.batch.study.schema import FamilyReferenceSection, FamilySection, StudyDocument
-from sobolev_batch.surfaces.sources.registry import Source
+from sobolev_batch.surfaces.sources.registry import Source, keys_by_source
 from tests.support.repository import blocks
 from tests.support.studies import changed, small_table
 
@@ -83,10 +82,10 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
         assert re.search(rf"[`\[]{key}[`\]]", text), key
-    points = {point.name: point for point in entry_points(group="sobolev_batch.sources")}
-    assert "decimate" in points
-    for name, point in points.items():
-        for key in point.load().model_fields:
+    sources = keys_by_source()
+    assert "decimate" in sources
+    for name, keys_of_source in sources.items():
+        for key in keys_of_source:
             assert f"`{key}`" in rows[name], (name, key)
 
 

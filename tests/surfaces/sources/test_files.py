@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import MeshError, Study, StudyError
-from sobolev_batch.surfaces.sources.fingerprints import file_digest
+from sobolev_batch.surfaces.sources.files import file_digest
 from tests.support.members import listed, loaded, members
 from tests.support.mesh_files import box_scene, off
 from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES

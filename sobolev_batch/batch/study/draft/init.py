@@ -30,8 +30,7 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.study.templates import METHOD, OBJECT
 from sobolev_batch.errors import StudyError
 from sobolev_batch.html import reasons, table_html
-from sobolev_batch.surfaces.sources.files import FileMember, FileSource
-from sobolev_batch.surfaces.sources.globs import expand
+from sobolev_batch.surfaces.sources.files import FileMember, FileSource, expand
 from sobolev_batch.visible import visible
 
 # The method that marks the reference of an object in a list.

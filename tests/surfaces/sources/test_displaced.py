@@ -1,4 +1,4 @@
-"""The source `flow`, against the velocity of the paper, integrated."""
+"""Meshes with vertices elsewhere: `moved` and `noisy` ones, and those of a `flow`, against its integrated velocity."""
 
 from __future__ import annotations
 
@@ -9,11 +9,50 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
-from sobolev_batch.surfaces.sources.derived.flows import carried
+from sobolev_batch import Mesh, icosphere
+from sobolev_batch.surfaces.sources.displaced import carried, with_noise
 from sobolev_batch.surfaces.sources.registry import parse_source
-from tests.support.members import loaded, members
+from tests.support.members import BALL, listed, loaded, members
 
+# The ball has radius 1.
+MOVED: dict[str, Any] = {"source": "moved", "mesh": BALL, "distances": [0.3, 0.1], "direction": [0, 3, 4]}
+NOISY: dict[str, Any] = {"source": "noisy", "mesh": BALL, "amplitudes": [0.02, 0.01], "seed": 5}
 FLOW: dict[str, Any] = {"source": "flow", "mesh": {"source": "icosphere", "levels": [2]}, "times": [0.0]}
+
+
+def displacements(table: dict[str, Any]) -> list[np.ndarray]:
+    start = np.asarray(icosphere(3).vertices)
+    return [np.asarray(loaded(member).vertices) - start for member in members(table)]
+
+
+def test_every_vertex_moves_by_a_fraction_of_the_radius() -> None:
+    assert listed(members(MOVED)) == [("0.1", -1), ("0.3", -1)]
+    for distance, moves in zip((0.1, 0.3), displacements(MOVED), strict=True):
+        np.testing.assert_allclose(moves, np.broadcast_to([0, 0.6 * distance, 0.8 * distance], moves.shape), atol=1e-12)
+    # A torus of radius 5, whose tube has corners at 60 degrees.
+    torus = {"source": "torus-grid", "R": 4, "r": 1, "levels": [0]}
+    (member,) = members({**MOVED, "mesh": torus, "distances": [0.1]})
+    assert loaded(member).extent.box[1][2] == pytest.approx(3**0.5 / 2 + 0.8 * 0.5)
+
+
+def test_noise_is_gaussian_along_the_normals() -> None:
+    small, large = displacements(NOISY)
+    np.testing.assert_allclose(large, 2 * small, atol=1e-12)
+    normals = np.asarray(icosphere(3).vertices)
+    sizes = np.einsum("ij,ij->i", small, normals)
+    # Vertices of the icosphere lie along its normals, to the accuracy of the mesh.
+    assert np.abs(small - sizes[:, None] * normals).max() < 1e-3
+    assert sizes.std() == pytest.approx(0.01, rel=0.1)
+    assert abs(sizes.mean()) < 3 * 0.01 / np.sqrt(len(sizes))
+    assert not np.allclose(displacements({**NOISY, "seed": 6})[0], small)
+
+
+def test_noise_opens_no_cracks() -> None:
+    ball = icosphere(1)
+    corners = np.asarray(ball.vertices)[ball.triangles].reshape(-1, 3)
+    torn = Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
+    places = np.asarray(with_noise(torn, 0.1, 0).vertices).round(12)
+    assert len(np.unique(places, axis=0)) == len(ball.vertices)
 
 
 def positions(time: float, **settings: Any) -> np.ndarray:
@@ -62,21 +101,22 @@ def test_members_are_in_the_order_of_their_times() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"times": []}, r"must be a list of numbers, such as \[0.0, 0.5, 1.0\]"),
-        ({"times": "0, 1"}, "must be a list of numbers"),
-        ({"times": [0.0, True]}, "each time must be a finite number, found True among them"),
-        ({"times": [1.0, 2.0, 1.0]}, "each time can be there once, found 1 again"),
-        ({"times": [float("nan")]}, "each time must be a finite number, found nan among them"),
-        ({"period": 0.0}, "period"),
-        ({"strength": float("inf")}, "strength"),
-    ],
-)
-def test_settings_are_checked(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        parse_source({**FLOW, **change})
+WRONG: list[tuple[dict[str, Any], str, list[Any]]] = [
+    (MOVED, "distances", [[], [0.0]]),
+    (MOVED, "direction", [[0, 0, 0], [1, 2]]),
+    (NOISY, "amplitudes", [[-0.1], "many"]),
+    (NOISY, "seed", [-1, 0.5]),
+    (FLOW, "times", [[], "0, 1", [0.0, True], [1.0, 2.0, 1.0], [float("nan")]]),
+    (FLOW, "period", [0.0]),
+    (FLOW, "strength", [float("inf")]),
+]
+
+
+@pytest.mark.parametrize(("table", "key", "values"), WRONG)
+def test_wrong_parameters_are_refused(table: dict[str, Any], key: str, values: list[Any]) -> None:
+    for value in values:
+        with pytest.raises(ValueError, match=key):
+            parse_source({**table, key: value})
 
 
 def test_what_the_vertices_depend_on_is_in_the_fingerprint() -> None:

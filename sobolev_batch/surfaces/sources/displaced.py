@@ -1,4 +1,4 @@
-"""The sources `moved` and `noisy`: a mesh elsewhere, and a mesh with noise, by which distances can be measured."""
+"""Meshes with vertices elsewhere: `moved` and `noisy` ones, by which distances are measured, and those of a `flow`."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ from pydantic import Field, field_validator
 
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Point
-from sobolev_batch.surfaces.sources.derived.nested import NestedSource, load_mesh
 from sobolev_batch.surfaces.sources.generated import Triple
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
     Fingerprint,
     Member,
+    NestedSource,
+    Times,
     at_most,
+    load_mesh,
     single_member,
 )
 
 Reals = NDArray[np.float64]
 
-# Raise it whenever a mesh is displaced in another way.
+# Raise it whenever a mesh is displaced or carried in another way.
 _VERSION = 1
-# Measured peak of displacing a mesh, for each of its triangles.
-_DISPLACING_BYTES = 400
+# Measured peaks of displacing a mesh and of carrying it along, for each of its triangles.
+_DISPLACING_BYTES, _CARRYING_BYTES = 400, 200
 
 # Lengths as fractions of the radius of the mesh's bounding sphere.
 Fractions = Annotated[
@@ -89,6 +91,35 @@ class NoisySource(NestedSource):
         )
 
 
+class FlowSource(NestedSource):
+    """A mesh at several times, with its vertices carried along by a flow on the spheres around the origin.
+
+    The flow winds the sphere up while it turns, and back: after one period each vertex is where it began. It is the
+    fourth case of Nair and Lauritzen: the second with a background rotation, without divergence. Vertices follow it
+    exactly; triangles stay flat.
+
+    Source: R. Nair, P. Lauritzen, "A class of deformational flow test cases for linear transport problems on the
+    sphere" (2010), doi:10.1016/j.jcp.2010.08.014.
+
+    Attributes:
+        mesh: Table of a source with one member, the mesh at time 0.
+        times: Times, in the unit of the period.
+        period: Time after which all is as it was.
+        strength: Strength k of the deformation, in radians per unit of time.
+    """
+
+    times: Times
+    period: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)] = 5.0
+    strength: Annotated[float, Field(allow_inf_nan=False, strict=False)] = 2.0
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each time, in their order."""
+        start = single_member(self.mesh, folder)
+        return tuple(
+            CarriedMember(repr(time), -1, start, self.period, self.strength, time=time) for time in sorted(self.times)
+        )
+
+
 @dataclass(frozen=True)
 class _DisplacedMember(Member, ABC):
     """A mesh with other vertices.
@@ -108,8 +139,7 @@ class _DisplacedMember(Member, ABC):
 
     def expected_size(self) -> ExpectedSize:
         """Return the size of the mesh, and the memory that it takes to make and to displace it."""
-        size = self.original.expected_size()
-        return ExpectedSize(size.triangles, max(size.projected_bytes, _DISPLACING_BYTES * size.triangles), size.seconds)
+        return _size_of_changed(self.original, _DISPLACING_BYTES)
 
 
 @dataclass(frozen=True)
@@ -148,6 +178,39 @@ class NoisyMember(_DisplacedMember):
         return {**super().fingerprint(), "seed": self.seed}
 
 
+@dataclass(frozen=True)
+class CarriedMember(Member):
+    """A mesh that a flow has carried along since time 0.
+
+    Attributes:
+        start: Member of the mesh at time 0.
+        period: Period of the flow.
+        strength: Strength of the deformation.
+    """
+
+    start: Member
+    period: float
+    strength: float
+
+    def load(self) -> Mesh:
+        """Move the vertices of the mesh."""
+        mesh = load_mesh(self.start)
+        return Mesh(carried(np.asarray(mesh.vertices), self.time or 0.0, self.period, self.strength), mesh.triangles)
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the fingerprint of the mesh at time 0, the time and the flow."""
+        return {
+            "flow": dict(self.start.fingerprint()),
+            "time": self.time,
+            "settings": [self.period, self.strength],
+            "version": _VERSION,
+        }
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the size of the mesh, and the memory that it takes to make and to move it."""
+        return _size_of_changed(self.start, _CARRYING_BYTES)
+
+
 def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
     """Return a mesh whose vertices are displaced along its normals by independent Gaussian numbers.
 
@@ -174,3 +237,32 @@ def _normals(vertices: Reals, triangles: NDArray[np.int64]) -> Reals:
     )
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.asarray(np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0))
+
+
+def carried(points: Reals, time: float, period: float, strength: float) -> Reals:
+    """Return where the flow of `FlowSource` carries points from time 0 on, (n, 3).
+
+    Args:
+        points: Points at time 0, (n, 3).
+        time: Time at which they are asked for.
+        period: Period T.
+        strength: Strength k, in radians per unit of time.
+
+    On the unit sphere, in a frame that turns once around z in a period T, the velocity at x is
+    2k cos(πt/T) y (x × e_y), where y is the point's own coordinate. It keeps y, so each circle around the y axis turns
+    as a whole, by the angle -(2kT/π) sin(πt/T) y.
+    """
+    x, y, z = points.T
+    radii = np.linalg.norm(points, axis=1)
+    heights = np.divide(y, radii, out=np.zeros_like(y), where=radii > 0)
+    angles = -2 * strength * period / np.pi * np.sin(np.pi * time / period) * heights
+    cosines, sines = np.cos(angles), np.sin(angles)
+    wound = np.stack([cosines * x + sines * z, y, cosines * z - sines * x])
+    turn = 2 * np.pi * time / period
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray((rotation @ wound).T)
+
+
+def _size_of_changed(original: Member, bytes_per_triangle: int) -> ExpectedSize:
+    size = original.expected_size()
+    return ExpectedSize(size.triangles, max(size.projected_bytes, bytes_per_triangle * size.triangles), size.seconds)
