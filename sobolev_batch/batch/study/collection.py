@@ -10,11 +10,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, ValidationError
 
-from sobolev_batch.batch.study.refusals import joined, source_refusals
-from sobolev_batch.batch.study.schema import Name, Section, StudyDocument, require_modest, without_frames
+from sobolev_batch.batch.study.refusals import joined, refusals
+from sobolev_batch.batch.study.schema import Name, Section, read_toml, require_modest, without_frames
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, filled, holds, names_of
-from sobolev_batch.batch.study.toml import read_toml
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.surfaces.sources.mesh_lists import ListedMesh, checked_list, number_as_text, read_mesh_list
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
@@ -191,9 +190,7 @@ class _Listed:
             given = checked_list(_ObjectsSection.model_validate(section).meshes)
         except ValidationError as error:
             values = section if isinstance(section, dict) else {}
-            raise StudyError(
-                joined(source_refusals(error, values, "[objects]", _ObjectsSection, StudyDocument))
-            ) from error
+            raise StudyError(joined(refusals(error, values, _ObjectsSection, "[objects]"))) from error
         except ValueError as error:
             raise StudyError(f"[objects]: meshes {error}") from error
         base = Path()
@@ -330,7 +327,7 @@ def _object_sections(entries: Mapping[str, dict[str, Any]]) -> list[_ObjectSecti
         try:
             sections.append(_ObjectSection.model_validate(entry))
         except ValidationError as error:
-            refused += source_refusals(error, entry, place, _ObjectSection, StudyDocument)
+            refused += refusals(error, entry, _ObjectSection, place)
     if refused:
         raise StudyError(joined(refused))
     return sections

@@ -1,11 +1,15 @@
-"""Schema of study files: sections, keys, limits, and messages that name every offender."""
+"""Schema of study files: their syntax, sections, keys and limits."""
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -21,6 +25,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.surfaces.formats.raw_files import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import at_most
@@ -35,6 +40,10 @@ _LONGEST_TEXT = 10_000
 _MOST_ORDERS = 100
 MOST_OCTAVES = 24
 _LONGEST_NAME, _LONGEST_TITLE = 100, 1000
+# Larger study files are mistakes, or made to keep the parser busy.
+_LARGEST_FILE_BYTES = 4 << 20
+# The parser takes time that is quadratic in the number of dotted parts of a key.
+_LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.[ \t]*+){100}""")
 # The range of TOML's integers.
 _LARGEST_INTEGER = (1 << 63) - 1
 
@@ -175,6 +184,45 @@ class StudyDocument(Section):
         if self.accuracy is not None and (self.transform.eps is not None or self.transform.quadrature != "auto"):
             raise ValueError("an [accuracy] chooses eps and quadrature; take them out of [transform]")
         return self
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a study file.
+
+    Raises:
+        StudyError: It cannot be read, is too large, or is not TOML. The message does not name it.
+    """
+    try:
+        with open_regular(path) as file:
+            length = os.fstat(file.fileno()).st_size
+            data = file.read(_LARGEST_FILE_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if len(data) > _LARGEST_FILE_BYTES:
+        raise StudyError(
+            f"a study file has at most {_LARGEST_FILE_BYTES} bytes, found {max(length, len(data))}; "
+            "globs name many meshes in few words"
+        )
+    if data.startswith(codecs.BOM_UTF8):
+        raise StudyError("not a TOML file: it begins with a byte order mark; save it as UTF-8 without one")
+    if _LONG_KEY.search(data):
+        raise StudyError("a key has 100 dotted parts or more; those of a study have two")
+    try:
+        text = data.decode("utf-8")
+        return tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise StudyError(f"not a TOML file: {error}; save it as UTF-8") from error
+    except RecursionError as error:
+        raise StudyError("its tables and lists are nested too deeply") from error
+    # Beyond TOML's own errors, numbers and dates that Python cannot hold.
+    except ValueError as error:
+        raise StudyError(f"not a TOML file: {error}{_line_at(str(error), text)}") from error
+
+
+def _line_at(message: str, text: str) -> str:
+    """Return the line where the parser stopped."""
+    position = re.search(r"\(at line (\d+), ", message)
+    return f": {quoted(text.splitlines()[int(position[1]) - 1].strip())}" if position else ""
 
 
 def without_frames(table: Mapping[str, Any]) -> dict[str, Any]:

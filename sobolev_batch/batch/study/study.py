@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,17 +14,16 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import ValidationError
 
-from sobolev_batch.batch.study.refusals import joined, shown_value, source_refusals, study_refusals
+from sobolev_batch.batch.study.refusals import joined, known_names, refusals, shown_value
 from sobolev_batch.batch.study.schema import (
     Backends,
     FamilyReferenceSection,
     FamilySection,
     StudyDocument,
+    read_toml,
     require_modest,
     without_frames,
 )
-from sobolev_batch.batch.study.suggestions import similar_name
-from sobolev_batch.batch.study.toml import read_toml
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
@@ -245,7 +244,7 @@ class Study:
         try:
             document = StudyDocument.model_validate(values)
         except ValidationError as error:
-            refused += study_refusals(error, values, StudyDocument)
+            refused += refusals(error, values, StudyDocument)
         entries = values.get("family")
         tables = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
         families = tuple(_families(tables, refused))
@@ -346,19 +345,19 @@ def _families(entries: list[dict[str, Any]], refused: list[str]) -> Iterator[Fam
         try:
             section = FamilySection.model_validate(own)
         except ValidationError as error:
-            refused += source_refusals(error, entry, place, FamilySection, StudyDocument)
-        source = _source({key: value for key, value in entry.items() if key not in own}, place, refused)
+            refused += refusals(error, entry, FamilySection, place)
+        parameters = {key: value for key, value in entry.items() if key not in own}
+        source = _source(parameters, place, refused, FamilySection.model_fields)
         if section is not None and source is not None:
             yield Family(section.name, source, section.order_by)
 
 
-def _source(parameters: dict[str, Any], place: str, refused: list[str]) -> Source | None:
+def _source(parameters: dict[str, Any], place: str, refused: list[str], others: Iterable[str] = ()) -> Source | None:
     """Return the source of a table, or add what is wrong with it to the refusals."""
     try:
         return parse_source(parameters)
     except ValidationError as error:
-        model = source_type_of(parameters["source"])
-        refused += source_refusals(error, parameters, place, model, StudyDocument)
+        refused += refusals(error, parameters, source_type_of(parameters["source"]), place, tuple(others))
     except InputError as error:
         refused.append(f"{place}: {error}")
     return None
@@ -375,13 +374,11 @@ def _reference(entry: object, families: list[dict[str, Any]], refused: list[str]
     try:
         section = FamilyReferenceSection.model_validate(parameters)
     except ValidationError as error:
-        refused += source_refusals(error, parameters, place, FamilyReferenceSection, StudyDocument)
+        refused += refusals(error, parameters, FamilyReferenceSection, place, ("source",))
         return None
     names = [str(family.get("name")) for family in families]
     if section.family not in names:
-        similar = similar_name(section.family, names)
-        hint = f"; did you mean {quoted(similar)}?" if similar else f"; its families are {quoted(names)}"
-        refused.append(f"{place}: no family is named {quoted(section.family)}{hint}")
+        refused.append(f"{place}: no family is named {quoted(section.family)}; {known_names(section.family, names)}")
         return None
     return FamilyReference(section.family, section.member)
 

@@ -14,7 +14,6 @@ import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
@@ -341,15 +340,6 @@ def source_type_of(name: object) -> type[Source]:
     if not (isinstance(source_type, type) and issubclass(source_type, Source)):
         raise StudyError(f"the entry point of the source {name!r} is not a subclass of Source: {registry[name].value}")
     return source_type
-
-
-def keys_by_source() -> dict[str, tuple[str, ...]]:
-    """Return the keys of each source that can be loaded, by its name."""
-    keys = {}
-    for name in sorted(_registry()):
-        with suppress(StudyError):
-            keys[name] = tuple(source_type_of(name).model_fields)
-    return keys
 
 
 def single_member(source: Source, folder: Path) -> Member:

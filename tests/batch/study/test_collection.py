@@ -91,7 +91,7 @@ def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> N
         ({"object": [{"name": "a/b"}]}, "holds none of|without / and"),
         ({"object": [{"name": ".a"}]}, r"does not begin with \. or __"),
         ({"object": [{"name": "cow"}, {"name": "COW"}]}, r"object: names must differ by more than case"),
-        ({"object": [{"name": "cow", "colour": 1}]}, r"\[\[object\]\] 1: unknown key colour"),
+        ({"object": [{"name": "cow", "colour": 1}]}, r"\[\[object\]\] 1: colour is unknown"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "cow"}]}}, "'a.ply' has no method"),
         ({"reference": {"source": "files", "paths": ["none/{object}.ply"]}}, "matches no file"),
         ({"norm": {"orders": [0.0]}}, r"object 'bee9': "),

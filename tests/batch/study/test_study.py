@@ -7,12 +7,14 @@ import re
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from sobolev_batch import Lattice, Study, StudyError
+from sobolev_batch import Lattice, OrderError, Study, StudyError
 from sobolev_batch.batch.study.schema import FamilyReferenceSection, FamilySection, StudyDocument
-from sobolev_batch.surfaces.sources.registry import Source, keys_by_source
+from sobolev_batch.surfaces.sources.registry import Source, source_type_of
+from tests.support.members import KINDS
 from tests.support.repository import blocks
 from tests.support.studies import changed, small_table
 
@@ -82,10 +84,8 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
         assert re.search(rf"[`\[]{key}[`\]]", text), key
-    sources = keys_by_source()
-    assert "decimate" in sources
-    for name, keys_of_source in sources.items():
-        for key in keys_of_source:
+    for name in KINDS:
+        for key in source_type_of(name).model_fields:
             assert f"`{key}`" in rows[name], (name, key)
 
 
@@ -109,85 +109,32 @@ def test_the_workflows_are_valid(name: str) -> None:
     assert Study.from_toml(WORKFLOWS / f"{name}.toml").name == name
 
 
-BROKEN = [
-    ("study.nam", "x", "[study]: unknown key nam: did you mean name?"),
-    ("stdy", {}, "unknown section [stdy]: did you mean [study]?"),
-    (
-        "study.name",
-        "",
-        "[study]: name: a name is 1 to 100 visible characters, blanks only between them, without / and \\; it is",
-    ),
-    ("study.name", "a/b", "without / and \\; it holds '/', found 'a/b'"),
-    ("study.name", "a\nb", "it holds the invisible character U+000A"),
-    ("study.name", " a", "it begins or ends with a blank"),
-    ("study.name", "x" * 10_000, "it has 10000 characters, 100 are allowed"),
-    ("study.name", 3, '[study]: name must be text in quotes, such as name = "3", found 3'),
-    ("lattice.M", 17, "M must be an even integer from 2 to 2048, found 17"),
-    ("lattice.M", 16.0, "[lattice]: M must be a whole number, such as M = 16, found 16.0"),
-    ("lattice.M", "16", "[lattice]: M must be a whole number, such as M = 16, found '16'"),
-    ("lattice.M", True, "[lattice]: M must be a whole number, such as M = 64, found true"),
-    ("lattice.xi_max", -1.0, "xi_max must be positive"),
-    ("lattice.xi_max", float("nan"), "[lattice]: xi_max must be a finite number"),
-    ("norm.orders", [-0.5], "orders below -1/2, found -0.5"),
-    ("norm.orders", [-2.0, 1], "orders below -1/2, found 1"),
-    ("norm.orders", [], "[norm]: orders must be a list with 1 or more entries"),
-    ("norm.orders", -2.0, "[norm]: orders must be a list, such as orders = [-2.0], found -2.0"),
-    ("norm.orders", ["-2"], "[norm]: entry 1 of orders must be a number, such as -2"),
-    ("norm.pairs", "some", "[norm]: pairs must be 'all' or 'reference'"),
-    ("transform.eps", 1e-20, "eps must lie between 1e-14 and 0.1"),
-    ("transform.dtype", "float64", "[transform]: dtype must be 'complex128' or 'complex64'"),
-    ("transform.quadrature", "gauss9", "quadrature must be"),
-    ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
-    ("scaling.mode", "fixed", "scale and origin belong to mode = 'fixed'"),
-    ("reference", {}, '[reference]: source is missing; add it, such as source = "files"'),
-    ("reference", {"source": "spere"}, "[reference]: no source is named 'spere'; known are decimate, ellipsoid, "),
-    ("reference", {"source": "os.system"}, "[reference]: no source is named 'os.system'"),
-    ("reference", {"source": "sphere", "radius": 0}, "[reference]: radius must be above 0"),
-    ("reference", {"source": "sphere", "radius": "1"}, "[reference]: radius must be a number, such as radius = 1.0"),
-    ("reference", {"source": "family", "family": "no"}, "[reference]: no family is named 'no'"),
-    ("family", [], "at least one [[family]] is needed"),
-    ("family", {}, "write [[family]], with two brackets on each side"),
-    ("family.0.name", "reference", "no family can be named 'reference'"),
-    ("family.0.name", "../up", "[[family]] 1 (named '../up'): name: a name is 1 to 100 visible characters"),
-    ("family.0.levels", [0, 1.5], "[[family]] 1 (named 'ico'): entry 2 of levels must be a whole number"),
-    ("family.0.levels", [13], "[[family]] 1 (named 'ico'): entry 1 of levels must be at most 12"),
-    ("family.0.level", [1], "[[family]] 1 (named 'ico'): unknown key level: did you mean levels?"),
-]
+def test_python_may_give_arrays_and_paths() -> None:
+    table = small_table()
+    table["norm"]["orders"] = np.array([-3.0, -2.0])
+    table["lattice"] = {"xi_max": np.float32(3.0), "M": np.int64(16)}
+    table["family"].append({"name": "f", "source": "files", "paths": (Path("a.ply"),)})
+    study = Study.from_table(table)
+    assert (study.orders, study.lattice) == ((-3.0, -2.0), Lattice(3.0, 16))
+    assert study.table["norm"]["orders"] == [-3.0, -2.0]
+    assert study.table["family"][1]["paths"] == ["a.ply"]
 
 
-@pytest.mark.parametrize(("path", "value", "message"), BROKEN)
-def test_broken_studies_name_the_place_on_one_line(path: str, value: Any, message: str) -> None:
-    with pytest.raises(StudyError) as caught:
-        Study.from_table(changed(path, value))
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize(
+    ("name", "value"), [("orders", [-2.0]), ("lattice", (3.0, 16)), ("name", 3), ("proximity", True), ("folder", ".")]
+)
+def test_the_constructor_refuses_other_types(name: str, value: Any) -> None:
+    study = Study.from_table(small_table())
+    with pytest.raises(StudyError, match=rf"Study: {name} must be a value of type .*, found .*Study\.from_table"):
+        Study(**{**vars(study), name: value})
+    with pytest.raises(OrderError, match="below -1/2"):
+        Study(**{**vars(study), "orders": (-0.5,)})
 
 
-def test_family_names_that_differ_by_case_only_are_twins() -> None:
-    twins = [{"name": name, "source": "icosphere", "levels": [0]} for name in ("Ico", "ico")]
-    with pytest.raises(StudyError, match="'Ico', 'ico' twice"):
-        Study.from_table(small_table(family=twins))
-
-
-def test_all_offenders_are_listed() -> None:
-    table = changed("lattice.M", "x")
-    table["norm"]["pairs"] = 3
-    del table["reference"]
-    with pytest.raises(StudyError, match=r"\[lattice\]: M .*\[norm\]: pairs .*\[reference\] is missing"):
-        Study.from_table(table)
-
-
-@pytest.mark.parametrize("content", [b"[study", b"\xff\xfe", b"a = 1\na = 2\n"])
-def test_files_that_are_not_toml(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "bad.toml"
-    path.write_bytes(content)
-    with pytest.raises(StudyError, match=r"bad\.toml: not a TOML file"):
-        Study.from_toml(path)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match=r"no\.toml: cannot be read: No such file"):
-        Study.from_toml(tmp_path / "no.toml")
+@pytest.mark.parametrize("name", ["a", "two words", "Größe", "日本", "..a", "-", "a" * 100, "😀", "5%"])
+def test_names_may_be_of_any_script(name: str) -> None:
+    study = Study.from_table({**changed("family.0.name", name), "study": {"name": name}})
+    assert (study.name, study.families[0].name) == (name, name)
 
 
 def asking(**accuracy: Any) -> Study:
