@@ -71,13 +71,13 @@ from .surfaces.formats.objects import write_mesh as write_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh
 from .surfaces.proximity import Proximity as Proximity
 from .surfaces.proximity import proximity as proximity
-from .surfaces.shapes.icosphere import icosphere as icosphere
 from .surfaces.shapes.mesh import Mesh as Mesh
 from .surfaces.shapes.similarity import Similarity as Similarity
 from .surfaces.shapes.sphere import Sphere as Sphere
+from .surfaces.shapes.subdivision import icosphere as icosphere
 from .surfaces.smooth.ellipsoid import Ellipsoid as Ellipsoid
-from .surfaces.smooth.interval import Interval as Interval
 from .surfaces.smooth.parametrised import ParametrisedSurface as ParametrisedSurface
+from .surfaces.smooth.smooth import Interval as Interval
 from .surfaces.smooth.torus import Torus as Torus
 from .surfaces.sources.conformance import check_source as check_source
 from .surfaces.sources.registry import ExpectedSize as ExpectedSize

@@ -84,8 +84,7 @@ def compare_command(
     from sobolev_batch.spectral.metrics.yardsticks import yardsticks
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
-    from sobolev_batch.surfaces.shapes.placement import placement_doubt
-    from sobolev_batch.surfaces.shapes.similarity import Similarity
+    from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
     from sobolev_batch.testing.witness import require_place, write_difference
 
     if below is not None:

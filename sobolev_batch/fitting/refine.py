@@ -171,7 +171,7 @@ class _Refinement:
     def _split(self, task: FitTask, fitted: Mesh, triangles: int) -> Mesh:
         """Return the fitted mesh, at the place that was given, with the edges split where that helps most."""
         mesh = task.own(fitted)
-        edges = Edges.of(mesh)
+        edges = Edges.from_mesh(mesh)
         if triangles >= 4 * len(mesh.triangles):
             return edges.split(np.ones(len(edges.ends), dtype=bool))
         scores = edges.lengths * np.linalg.norm(self._derivatives(edges), axis=1)

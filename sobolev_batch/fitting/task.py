@@ -18,11 +18,10 @@ from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, 
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, quality_of
 from sobolev_batch.spectral.transform.settings import Execution
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
 Reals = NDArray[np.float64]
 
@@ -164,7 +163,7 @@ def _free_vertices(mesh: Mesh, *, keep_boundary: bool) -> NDArray[np.int64]:
     """
     free = np.asarray(mesh.used_vertices)
     if keep_boundary:
-        edges = Edges.of(mesh)
+        edges = Edges.from_mesh(mesh)
         free = np.setdiff1d(free, edges.ends[edges.on_boundary])
     if not len(free):
         raise InputError("all vertices lie on the boundary: there is nothing to move")

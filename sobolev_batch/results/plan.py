@@ -25,8 +25,7 @@ from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.results.forecast import Forecast
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.surfaces.shapes.placement import placement_doubt
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
 from sobolev_batch.visible import visible
 
 DEFAULT_FOLDER = Path("storage")

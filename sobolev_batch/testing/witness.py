@@ -15,10 +15,9 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.metrics.witness import witness
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
 Reals = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sobolev_batch import Lattice, Mesh
-from sobolev_batch.surfaces.shapes.extent import Extent
+from sobolev_batch.surfaces.shapes.surface import Extent
 from tests.coverage.kinds import KINDS, Kind
 from tests.coverage.pairs import Pair
 

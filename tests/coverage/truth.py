@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import AccuracyError, Lattice, Mesh, Sphere, distance, fourier_transform
-from sobolev_batch.surfaces.shapes.extent import Extent
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 from tests.coverage import spheres
 from tests.coverage.matern import (
     Sides,

@@ -84,7 +84,7 @@ def test_vertices_at_one_place_become_one_and_boundaries_stay() -> None:
     target = sb.Mesh(1.1 * np.asarray(sheet.vertices), upper)
     found = sb.refine(soup, target, -4.0, triangles=2 * len(upper), steps=5, keep_boundary=True).mesh
     assert len(found.vertices) < 3 * len(found.triangles) / 4
-    edges = Edges.of(sb.Mesh(sheet.vertices, upper))
+    edges = Edges.from_mesh(sb.Mesh(sheet.vertices, upper))
     kept = np.asarray(sheet.vertices)[np.unique(edges.ends[edges.on_boundary])]
     distances = np.linalg.norm(np.asarray(found.vertices)[:, None] - kept, axis=2).min(axis=0)
     assert distances.max() < 1e-12

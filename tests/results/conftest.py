@@ -8,7 +8,7 @@ import xarray as xr
 
 from sobolev_batch.spectral.errors.probe import Probe
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.surfaces.shapes.icosphere import icosphere
+from sobolev_batch.surfaces.shapes.subdivision import icosphere
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
 QUALITY = Quality(4 * np.pi, icosphere(0).extent, Probe()).to_json()

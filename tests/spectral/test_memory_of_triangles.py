@@ -16,7 +16,7 @@ from sobolev_batch import Mesh, Similarity, icosphere
 from sobolev_batch.spectral.errors.probe import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles
+from sobolev_batch.surfaces.shapes.mesh import shared_triangles
 
 # 327,680 triangles, of which whole arrays stand out from what the process takes anyway.
 _LEVEL = 7

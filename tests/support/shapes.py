@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
-from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -33,7 +33,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 5

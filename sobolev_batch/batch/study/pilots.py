@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Self
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 
 # Family and member of each surface, by label.

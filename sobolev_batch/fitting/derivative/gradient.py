@@ -31,8 +31,8 @@ from sobolev_batch.spectral.metrics.inputs import (
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Extent
 
 Reals = NDArray[np.float64]
 

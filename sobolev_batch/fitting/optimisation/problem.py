@@ -24,9 +24,8 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import field_values, quality_of
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.extent import Extent
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
 Reals = NDArray[np.float64]
 

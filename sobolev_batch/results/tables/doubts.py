@@ -6,7 +6,7 @@ import xarray as xr
 
 from sobolev_batch.results.tables.groups import complete_meshes, reference_of
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.surfaces.shapes.placement import placement_doubt
+from sobolev_batch.surfaces.shapes.similarity import placement_doubt
 
 
 def doubts_of(tree: xr.DataTree) -> dict[str, str]:

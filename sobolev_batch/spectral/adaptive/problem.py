@@ -20,11 +20,9 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SampledOctave
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
-from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.mesh_counts import shared_triangles
+from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Surface
 
 Reals = NDArray[np.float64]
 Samples = tuple[Sample, ...]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import exprel, gammaln, kve
 
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 
 Reals = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.errors.probe import Probe, norms_of_checks
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.surfaces.shapes.extent import Extent
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
 
 @dataclass(frozen=True)

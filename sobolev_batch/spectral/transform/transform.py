@@ -20,10 +20,10 @@ from sobolev_batch.spectral.quadrature.plan import QuadraturePlan, unknown_surfa
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.icosphere import icosphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 

@@ -10,8 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS, Extent
-from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point, checked_point, is_finite_number, moved_point
+from sobolev_batch.surfaces.shapes.surface import (
+    DIRECTIONS,
+    LARGEST_LENGTH,
+    Extent,
+    Point,
+    checked_point,
+    is_finite_number,
+    moved_point,
+)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scipy.special import elliprg
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.icosphere import icosphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point, checked_point, is_finite_number, moved_point
-from sobolev_batch.surfaces.smooth.interval import Interval
-from sobolev_batch.surfaces.smooth.smooth import Smooth
+from sobolev_batch.surfaces.smooth.smooth import Interval, Smooth
 
 Reals = NDArray[np.float64]
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.shapes.surface import Point, checked_point, is_finite_number
-from sobolev_batch.surfaces.smooth.interval import Interval
-from sobolev_batch.surfaces.smooth.smooth import Smooth
+from sobolev_batch.surfaces.smooth.smooth import Interval, Smooth
 
 Reals = NDArray[np.float64]
 # x, y and z at each pair of parameters; numbers stand for constants.

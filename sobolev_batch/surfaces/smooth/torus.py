@@ -13,8 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Point, checked_point, is_finite_number, moved_point
-from sobolev_batch.surfaces.smooth.interval import Interval
-from sobolev_batch.surfaces.smooth.smooth import Smooth
+from sobolev_batch.surfaces.smooth.smooth import Interval, Smooth
 
 Reals = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.icosphere import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.ellipsoid import Ellipsoid
 from sobolev_batch.surfaces.smooth.torus import MOST_TRIANGLES, Torus

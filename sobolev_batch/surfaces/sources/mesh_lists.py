@@ -48,7 +48,7 @@ class ListedMesh:
     metadata: Metadata = ()
 
     @classmethod
-    def of(cls, table: Mapping[str, Any]) -> ListedMesh:
+    def from_table(cls, table: Mapping[str, Any]) -> ListedMesh:
         """Return the mesh that a table describes; empty texts and NaN say nothing.
 
         Raises:
@@ -141,7 +141,7 @@ def _listed(tables: Any) -> tuple[ListedMesh, ...]:
     widest = max(map(len, tables))
     if widest > _MOST_COLUMNS:
         raise ValueError(f"at most {_MOST_COLUMNS} columns are allowed, found {widest}")
-    return tuple(map(ListedMesh.of, tables))
+    return tuple(map(ListedMesh.from_table, tables))
 
 
 def _checked_key(key: object) -> str:

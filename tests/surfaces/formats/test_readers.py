@@ -16,7 +16,7 @@ import trimesh
 
 from sobolev_batch import Mesh, icosphere, read_mesh
 from sobolev_batch.surfaces.formats.readers import mesh_format, mesh_stem
-from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 from tests.support.mesh_files import (
     BIG,
     BOXES,

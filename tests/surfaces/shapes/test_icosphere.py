@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Mesh, icosphere
-from sobolev_batch.surfaces.shapes.icosphere import FINEST_LEVEL
+from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL
 
 LEVELS = range(6)
 

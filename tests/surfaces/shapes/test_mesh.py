@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import InputError, Mesh, MeshError
-from sobolev_batch.surfaces.shapes.mesh_counts import MeshCounts
+from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 from tests.support.shapes import (
     BOX_AREA,
     TETRAHEDRON_AREA,

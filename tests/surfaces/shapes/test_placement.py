@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.surfaces.shapes.placement import placement_doubt
+from sobolev_batch.surfaces.shapes.similarity import placement_doubt
 
 BALL = sb.icosphere(2)
 

@@ -34,7 +34,7 @@ def smallest_angles(mesh: sb.Mesh) -> np.ndarray:
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 0.7, 1.0])
 @pytest.mark.parametrize("mesh", [sb.icosphere(2), open_mesh()], ids=["closed", "open"])
 def test_a_split_mesh_is_the_same_surface(mesh: sb.Mesh, share: float) -> None:
-    edges = Edges.of(mesh)
+    edges = Edges.from_mesh(mesh)
     marks = np.random.default_rng(7).random(len(edges.ends)) < share
     split = edges.split(marks)
     # Each triangle has one more for each of its marked edges.
@@ -46,13 +46,13 @@ def test_a_split_mesh_is_the_same_surface(mesh: sb.Mesh, share: float) -> None:
     fields = [sb.fourier_transform(one, sb.Lattice(2.0, 24), eps=1e-12).values for one in (split, mesh)]
     assert np.abs(fields[0] - fields[1]).max() < 1e-10 * mesh.area
     # Without vertices inside of edges, the boundary only has its marked edges halved.
-    boundary, finer = edges.on_boundary, Edges.of(split).on_boundary
+    boundary, finer = edges.on_boundary, Edges.from_mesh(split).on_boundary
     assert np.count_nonzero(finer) == np.count_nonzero(boundary) + np.count_nonzero(boundary & marks)
 
 
 def test_all_edges_split_are_the_usual_subdivision() -> None:
     ball = sb.icosphere(1)
-    edges = Edges.of(ball)
+    edges = Edges.from_mesh(ball)
     split = edges.split(np.ones(len(edges.ends), dtype=bool))
     assert len(split.triangles) == 320
     middles = np.asarray(ball.vertices)[edges.ends].mean(axis=1)
@@ -61,7 +61,7 @@ def test_all_edges_split_are_the_usual_subdivision() -> None:
 
 @pytest.mark.parametrize("wanted", [320, 321, 330, 500, 1000, 1279, 1280, 10_000])
 def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
-    edges = Edges.of(sb.icosphere(2))
+    edges = Edges.from_mesh(sb.icosphere(2))
     # Scores that fall from one point on, as those of a place with much detail do.
     scores = -np.linalg.norm(np.asarray(edges.mesh.vertices)[edges.mesh.triangles].mean(axis=1) - [0.1, 0.2, 1], axis=1)
     marks = edges.best(scores, wanted)
@@ -80,7 +80,7 @@ def test_triangles_do_not_become_ever_thinner() -> None:
     first = smallest_angles(mesh).min()
     rng = np.random.default_rng(5)
     for _ in range(8):
-        edges = Edges.of(mesh)
+        edges = Edges.from_mesh(mesh)
         # Always near one place, where thin triangles would pile up.
         distances = np.linalg.norm(np.asarray(mesh.vertices)[mesh.triangles].mean(axis=1) - [0, 0, 1], axis=1)
         mesh = edges.split(edges.best(-distances + 0.01 * rng.random(len(distances)), len(mesh.triangles) + 40))

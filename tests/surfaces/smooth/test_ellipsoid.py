@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.special import ellipe
 
 from sobolev_batch import Ellipsoid, InputError, Similarity, Sphere, icosphere
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 AXES = [(1.0, 1.0, 1.0), (1.0, 0.7, 0.4), (0.4, 1.0, 0.7), (2.0, 2.0, 0.5), (0.3, 0.3, 1.5)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Mesh, Similarity, Torus
-from sobolev_batch.surfaces.shapes.extent import DIRECTIONS
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 TORUS = Torus(1.0, 0.4, (0.1, -0.2, 0.3))
