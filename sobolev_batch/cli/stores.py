@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +41,13 @@ def _formats(given: tuple[str, ...]) -> tuple[str, ...]:
         if name not in _PICTURE_FORMATS:
             raise click.BadParameter(f"{name!r} is none of {', '.join(_PICTURE_FORMATS)}")
     return formats
+
+
+def _require_folder(path: Path) -> None:
+    """Refuse a folder that files cannot be written into, before they are made. It need not exist yet."""
+    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise StoreError(f"{path}: no files can be written there: {nearest} is no folder that can be written")
 
 
 @cli.command("status")
@@ -257,6 +265,7 @@ def plot_command(
     from sobolev_batch.results.tables.sizes import EDGE_LENGTH
 
     written_as = Output(formats or ("png",), None if size is None else parse_size(size))
+    _require_folder(output)
     if CollectionStore.found(store) is not None:
         if meshes:
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
@@ -318,10 +327,8 @@ def witness_command(
 
     exporter = Exporter.of(store, orders or None, folder)
     labels = exporter.labels(meshes)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"{output}: no files can be written there: {error.strerror or error}") from error
+    _require_folder(output)
+    output.mkdir(parents=True, exist_ok=True)
     is_complete = True
     for label in labels:
         try:

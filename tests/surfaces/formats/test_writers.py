@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -55,3 +56,17 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(sb.MeshError, match="cannot be written there: File name too long"):
         sb.write_mesh(MESH, tmp_path / f"{'x' * 300}.ply")
     assert os.listdir(tmp_path) == ["folder.ply"]
+
+
+def test_an_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    sb.write_mesh(sb.icosphere(0), path)
+    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before), limits[1]))
+    try:
+        with pytest.raises(sb.MeshError, match=r"mesh\.ply: the mesh cannot be written there: File too large"):
+            sb.write_mesh(sb.icosphere(3), path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
