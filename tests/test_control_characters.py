@@ -156,7 +156,7 @@ def test_commands_show_names_of_files(folder: Path) -> None:
         ("compare", f"{HOSTILE}/good.obj", f"{HOSTILE}/broken.obj"),
         ("compare", f"{HOSTILE}.obj", f"{HOSTILE}/good.obj", "--below", "90%"),
         ("fit", f"{HOSTILE}/good.obj", f"{HOSTILE}/good.obj", "-o", f"{HOSTILE}/none/a.obj"),
-        ("--debug", "run", f"{HOSTILE}.toml"),
+        ("run", f"{HOSTILE}.toml"),
     ):
         assert r"evil\x1b]0;owned\x07" in printed(*arguments, folder=folder)[1], arguments
     for key in ("title", "name"):

@@ -95,7 +95,7 @@ def fit(
             order; or a setting is out of range.
 
     >>> import sobolev_batch as sb
-    >>> fitted = sb.fit(sb.icosphere(1), sb.Sphere(), -4.0, steps=20)
+    >>> fitted = sb.fit(sb.icosphere(1), sb.Sphere(), -4.0, steps=8)
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
