@@ -15,7 +15,7 @@ import sobolev_batch as sb
 from benchmarks.table import Row
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 

@@ -21,7 +21,7 @@ from benchmarks.memory import highest_bytes
 from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block

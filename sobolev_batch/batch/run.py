@@ -15,10 +15,9 @@ from distributed import Client
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
+from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
-from sobolev_batch.batch.cluster.execution import Cluster
-from sobolev_batch.batch.cluster.progress import Notify, Progress
-from sobolev_batch.batch.cluster.store_access import require_store_access
+from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
@@ -163,7 +162,7 @@ def run(
     2
     """
     require_give_up_after(give_up_after)
-    location, reusable = Location.of(store), _Reusable.of([Location.of(other) for other in reuse])
+    location, reusable = Location.parse(store), _Reusable.of([Location.parse(other) for other in reuse])
     cluster: AbstractContextManager[Client]
     if client is None:
         # The workers of another cluster are asked before anything is computed.
@@ -330,7 +329,7 @@ def carry_out(
                 heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                 notify(progress)
 
-            cluster = Cluster.of(client, study.libraries, beat)
+            cluster = Cluster.prepare(client, study.libraries, beat)
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend)
             cluster.workers.require_accuracy(study.accuracy)

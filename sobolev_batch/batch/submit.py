@@ -14,9 +14,9 @@ from uuid import uuid4
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
-from sobolev_batch.batch.cluster.store_access import require_store_access
+from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
+from sobolev_batch.batch.cluster.workers import prepare_workers
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
@@ -94,7 +94,7 @@ def submit(
     2
     """
     require_give_up_after(give_up_after)
-    location = Location.of(store).absolute()
+    location = Location.parse(store).absolute()
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
@@ -138,7 +138,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
         run: Run that the store is locked for.
         give_up_after: Seconds after which what is silent is given up.
     """
-    location = Location.of(store)
+    location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)
     try:
         present = Lock.read(location)

@@ -65,7 +65,7 @@ def location(value: Any) -> Location:
     """Return the location of a store that an option names."""
     from sobolev_batch.batch.storage.location import Location
 
-    return Location.of(value)
+    return Location.parse(value)
 
 
 def _memory_size(value: Any) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 from sobolev_batch.cli.output import echo, overwrite, progress_bar
 
 if TYPE_CHECKING:
-    from sobolev_batch.batch.cluster.progress import Progress
+    from sobolev_batch.batch.cluster.execution import Progress
 
 
 class ProgressLine:

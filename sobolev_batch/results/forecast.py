@@ -8,8 +8,7 @@ from typing import Self
 
 from distributed import Client
 
-from sobolev_batch.batch.cluster.worker_plugin import worker_slowness
-from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.cluster.workers import Workers, worker_slowness
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.results.tables.formatting import duration

@@ -117,7 +117,9 @@ def fields_read(store: AnyStore) -> Iterator[None]:
         # zarr's codec has no exception of its own.
         if "checksum" not in str(error):
             raise
-        place = (store.encoding.get(_SOURCE) or "the store") if isinstance(store, xr.DataTree) else Location.of(store)
+        place = (
+            (store.encoding.get(_SOURCE) or "the store") if isinstance(store, xr.DataTree) else Location.parse(store)
+        )
         raise DamageError(
             f"{place}: a field is damaged: its bytes are not those that were stored; "
             "sobolev-batch verify names it, and run computes it again",

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from distributed import Client
 
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
-from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.cluster.workers import Workers, prepare_workers
 from sobolev_batch.batch.fields.memory import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
@@ -249,7 +248,7 @@ def plan(
     ...
     """
     study = study if isinstance(study, Study) else Study.from_toml(study)
-    location = default_store(study) if store is None else Location.of(store)
+    location = default_store(study) if store is None else Location.parse(store)
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
     workers.require_accuracy(study.accuracy)
     earlier_choice, started = stored_choice(location), time.process_time()
@@ -284,7 +283,7 @@ def _doubts_of(study_plan: Plan) -> dict[str, str]:
 
 def default_store(study: Study | StudyCollection) -> Location:
     """Return the location of a study's store if none is named."""
-    return Location.of(DEFAULT_FOLDER / f"{study.name}.zarr")
+    return Location.parse(DEFAULT_FOLDER / f"{study.name}.zarr")
 
 
 def _stored_records(location: Location) -> dict[str, Record]:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock
-from sobolev_batch.batch.storage.timestamps import age_seconds, utc_now
+from sobolev_batch.batch.storage.lock import Lock, age_seconds, utc_now
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
@@ -268,5 +267,5 @@ def status(store: AnyStore) -> Status:
     done; by process ...
     """
     place = location_of(store)
-    collection = CollectionStore.found(Location.of(place))
+    collection = CollectionStore.found(Location.parse(place))
     return Status.of(place) if collection is None else Status.of_collection(collection)

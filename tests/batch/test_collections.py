@@ -141,13 +141,13 @@ def test_a_collection_goes_on_while_its_next_object_is_planned(store: Path, tmp_
     ended = sb.status(copy)
     assert not ended.going_on
     assert list(ended.failed) == ["gone"]
-    with locked(Location.of(copy / "gone"), Lock.of_this_process()):
+    with locked(Location.parse(copy / "gone"), Lock.of_this_process()):
         status = sb.status(copy)
         assert (status.going_on, status.complete, status.total, status.failed) == (True, 10, 11, {})
         assert "running: planning; by process " in str(status)
     # The lock of a process of which nobody knows whether it runs, from long ago.
     lock = replace(Lock.of_this_process(outlives_process=True), since="2020-01-01T00:00:00Z")
-    with locked(Location.of(copy / "gone"), lock):
+    with locked(Location.parse(copy / "gone"), lock):
         status = sb.status(copy)
         assert status.lost
         assert f"sobolev-batch release {copy / 'gone'}" in str(status)

@@ -23,7 +23,7 @@ from sobolev_batch import (
     run,
 )
 from sobolev_batch.batch.analysis import reduce
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support.studies import SMALL_LATTICE, small_table, variable
 

@@ -20,9 +20,8 @@ import yaml
 from distributed import Client
 
 from sobolev_batch import ClusterError, open_store
-from sobolev_batch.batch.cluster.clients import remote_client
-from sobolev_batch.batch.cluster.connection import check_connection
-from tests.support.processes import stop
+from sobolev_batch.batch.cluster.clients import check_connection, remote_client
+from tests.support.processes import PATIENCE_SECONDS, stop
 from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, write_study
 
 pytestmark = pytest.mark.all
@@ -87,7 +86,7 @@ def cluster(home: Path, certificates: Path) -> Iterator[Cluster]:
         address = next(match[0] for line in lines if (match := re.search(r"tls://127\.0\.0\.1:\d+", line)))
         start(worker, log, **{"tls://HOST:8786": address})
         with configured(certificates), Client(address) as client:
-            client.wait_for_workers(2, timeout=60)
+            client.wait_for_workers(2, timeout=PATIENCE_SECONDS)
         yield Cluster(address, processes)
     finally:
         for process in reversed(processes):
@@ -161,14 +160,14 @@ def test_a_client_without_certificate_is_refused(cluster: Cluster, certificates:
     context.check_hostname = False
     host, port = cluster.address.removeprefix("tls://").split(":")
     with (
-        socket.create_connection((host, int(port)), timeout=20) as plain,
+        socket.create_connection((host, int(port)), timeout=PATIENCE_SECONDS) as plain,
         context.wrap_socket(plain) as encrypted,
         pytest.raises(ssl.SSLError, match="certificate required"),
     ):
         encrypted.recv(1)
 
 
-def test_each_way_to_miss_an_encrypted_scheduler_has_its_words(
+def test_each_way_to_miss_an_encrypted_scheduler_is_told_in_one_line(
     cluster: Cluster, certificates: Path, others: Path, tmp_path: Path
 ) -> None:
     def refusal(folder: Path | None, address: str) -> str:
@@ -178,19 +177,25 @@ def test_each_way_to_miss_an_encrypted_scheduler_has_its_words(
         return str(caught.value)
 
     plain = cluster.address.replace("tls", "tcp")
-    assert "names none; export DASK_CONFIG=FOLDER/tls.yaml" in refusal(None, cluster.address)
-    assert f"use {cluster.address} and export DASK_CONFIG" in refusal(None, plain)
-    assert f"demands encryption; use {cluster.address}" in refusal(certificates, plain)
-    assert f"is not good for {others}/ca.pem" in refusal(others, cluster.address)
     # The right authority, and a certificate that it did not sign.
     for name in ("certificate.pem", "key.pem"):
         (tmp_path / name).write_bytes((others / name).read_bytes())
     (tmp_path / "ca.pem").write_bytes((certificates / "ca.pem").read_bytes())
     settings = (others / "tls.yaml").read_text().replace(str(others), str(tmp_path))
     (tmp_path / "tls.yaml").write_text(settings)
-    assert f"refuses the certificate {tmp_path}/certificate.pem" in refusal(tmp_path, cluster.address)
+    for folder, address, reason in [
+        (None, cluster.address, "TLS expects a `ssl_context`"),
+        (None, plain, "closed"),
+        (certificates, plain, "encryption required"),
+        (others, cluster.address, "certificate verify failed"),
+        (tmp_path, cluster.address, "no Dask scheduler answers"),
+    ]:
+        message = refusal(folder, address)
+        assert reason.lower() in message.lower()
+        assert f"no Dask scheduler answers at {address!r}" in message
+        assert "its DASK_CONFIG is needed here" in message
     (tmp_path / "key.pem").unlink()
-    assert "cannot be read" in refusal(tmp_path, cluster.address)
+    assert "No such file" in refusal(tmp_path, cluster.address)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +204,7 @@ def test_each_way_to_miss_an_encrypted_scheduler_has_its_words(
         ("tcp", b"", "within 0.5 s"),
         ("tls", b"", "within 0.5 s"),
         ("tcp", b"SSH-2.0-OpenSSH_9.2\r\n", "no Dask scheduler answers"),
-        ("tls", b"SSH-2.0-OpenSSH_9.2\r\n", "is not encrypted; start the scheduler with --protocol tls"),
+        ("tls", b"SSH-2.0-OpenSSH_9.2\r\n", "WRONG_VERSION_NUMBER"),
     ],
 )
 def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says: bytes, message: str) -> None:

@@ -48,9 +48,10 @@ def jobqueue(
             "slurm",
             ["-p compute", "-A project42", "--cpus-per-task=8", "--mem=32G", "-t 04:00:00"],
         ),
-        (
+        pytest.param(
             "pbs",
             ["-q compute", "-A project42", "-l select=1:ncpus=8:mem=32GB", "-l walltime=04:00:00"],
+            marks=pytest.mark.all,
         ),
     ],
 )
@@ -106,20 +107,19 @@ def slurm(tmp_path: Path) -> Path:
 
 
 REPLACED = """
-import time
 import jobqueue
 from distributed import Client
+from tests.support.processes import wait_until
 
 if __name__ == "__main__":
     jobqueue.INTERVAL_SECONDS = 0.2
     with jobqueue.jobs_of("slurm", 1) as cluster, Client(cluster) as client:
-        client.wait_for_workers(2)
+        client.wait_for_workers(2, timeout=200)
         first = set(client.scheduler_info(n_workers=-1)["workers"])
         assert all(worker.startswith("tls://127.0.0.1") for worker in first)
-        while not all(getattr(job, "had_workers", False) for job in cluster.workers.values()):
-            time.sleep(0.05)  # until the job has been checked
+        wait_until(lambda: all(getattr(job, "had_workers", False) for job in cluster.workers.values()))
         client.retire_workers(list(first))
-        client.wait_for_workers(2)
+        client.wait_for_workers(2, timeout=200)
         assert not first & set(client.scheduler_info(n_workers=-1)["workers"])
 """
 

@@ -12,7 +12,7 @@ import trimesh
 from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.results.status import Status

@@ -13,7 +13,7 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, verify
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support.commands import call, write_toml
 from tests.support.stores import assert_same_fields, assert_same_tables

@@ -82,7 +82,7 @@ class Sequence:
 def strike_all(folder: Path, plans: Mapping[int, tuple[Strike, ...]]) -> Iterator[Sequence]:
     """Yield what comes of each plan, on a study that takes some seconds; the key of a plan chooses its victims."""
     study = write_study(folder, MESHES, seed=0, cells=24, level=3)
-    clean = Location.of(folder / "clean.zarr")
+    clean = Location.parse(folder / "clean.zarr")
     with local_client(WORKERS) as client:
         run(Study.from_toml(study), clean, client)
     for seed, strikes in plans.items():
@@ -109,7 +109,7 @@ def _strike(study: Path, clean: Location, folder: Path, seed: int, strikes: tupl
             if due and len(fields) >= due[0].complete and _befall(due[0], cluster, driver, fields, chance):
                 came.append(due.pop(0))
         seconds = time.monotonic() - started
-    return Sequence(tuple(came), seconds, driver.commands, tuple(differences(Location.of(store), clean)))
+    return Sequence(tuple(came), seconds, driver.commands, tuple(differences(Location.parse(store), clean)))
 
 
 def counts(sequences: list[Sequence]) -> Counter[str]:

@@ -40,14 +40,14 @@ def test_nothing_is_lost_by_kills_and_failing_requests(outcome: Outcome) -> None
 
 def test_what_is_lost_would_be_noticed(outcome: Outcome, folder: Path) -> None:
     clean, other = folder / "clean.zarr", folder / "other.zarr"
-    assert list(differences(Location.of(clean), Location.of(clean))) == []
+    assert list(differences(Location.parse(clean), Location.parse(clean))) == []
     shutil.copytree(clean, other)
     fields = other / "fourier" / "fourier" / "c"
     shutil.copyfile(fields / "1" / "0" / "0" / "0", fields / "2" / "0" / "0" / "0")
     (fields / "3" / "0" / "0" / "0").unlink()
     (other / "records" / "record" / "c" / "4").unlink()
     shutil.copyfile(other / "norms" / "norm" / "c" / "0" / "0", other / "norms" / "error" / "c" / "0" / "0")
-    found = list(differences(Location.of(other), Location.of(clean)))
+    found = list(differences(Location.parse(other), Location.parse(clean)))
     assert found[:3] == ["bumpy/000004: missing", "bumpy/000002: another field", "bumpy/000003: another field"]
     assert [difference.split(":")[0] for difference in found[3:]] == ["norms"]
 

@@ -50,8 +50,8 @@ class Outcome:
 def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, rate: float) -> Outcome:
     """Run a study of so many meshes, with kills, and with a share of all requests failing."""
     path = write_study(folder, meshes, seed)
-    clean = Location.of(folder / "clean.zarr")
-    soaked = Location.of(f"s3://{BUCKET}/soaked.zarr")
+    clean = Location.parse(folder / "clean.zarr")
+    soaked = Location.parse(f"s3://{BUCKET}/soaked.zarr")
     # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
     # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
     plan = HavocPlan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)

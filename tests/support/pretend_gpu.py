@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 
-from sobolev_batch.batch.cluster import worker_plugin
+from sobolev_batch.batch.cluster import workers
 from tests.support.fake_device import Device
 
 _DEVICE = Device(capacity=float(os.environ.get("PRETEND_GPU_BYTES", "1e12")))
 _NAME = os.environ["PRETEND_GPU"]
 
-vars(worker_plugin)["visible_devices"] = lambda: (_NAME,)
-vars(worker_plugin)["gpu_backend"] = _DEVICE.backend
+vars(workers)["visible_devices"] = lambda: (_NAME,)
+vars(workers)["gpu_backend"] = _DEVICE.backend

@@ -18,8 +18,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.analysis.ordering import TableOrder
-from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
-from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe_failure
 from sobolev_batch.batch.fields.memory import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store

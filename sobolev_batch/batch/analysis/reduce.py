@@ -21,8 +21,7 @@ from sobolev_batch.batch.analysis.datasets import (
 from sobolev_batch.batch.analysis.ordering import TableOrder
 from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
-from sobolev_batch.batch.cluster.execution import Cluster, Task
-from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import Tables

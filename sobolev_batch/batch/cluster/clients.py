@@ -1,20 +1,30 @@
-"""Clients of the clusters that studies run on: processes or threads of this machine, or any Dask scheduler."""
+"""Clients of the clusters that studies run on: processes or threads of this machine, or any Dask scheduler.
+
+Who reaches a scheduler can run programs on its machines, so its address has to be private.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
+import socket
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
 from multiprocessing import resource_tracker
+from typing import Any, Self
 
 import dask
 from dask.utils import parse_timedelta
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Security
+from distributed.comm import connect
+from distributed.comm.addressing import parse_address, parse_host_port
 
-from sobolev_batch.batch.cluster import worker_preload
-from sobolev_batch.batch.cluster.connection import Address, check_connection
-from sobolev_batch.errors import ClusterError, InputError
+from sobolev_batch.batch.cluster import workers as workers_module
+from sobolev_batch.errors import AddressError, ClusterError, InputError, one_line
 from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
 from sobolev_batch.parameters import byte_count, format_bytes
 
@@ -27,6 +37,9 @@ _LARGEST_KEPT_BYTES = 32 << 20
 # After a worker has died, Dask looks once whether it is back, and gives it up for ever if it is just then
 # being started again, as after a second death. Nannies start workers for as long as they live themselves.
 _LOST_WORKER_SECONDS = 10**7
+_ENCRYPTED = ("tls", "wss")
+_PLAIN = ("tcp", "ws", "ucx", "ucxx")
+_WITHIN_A_PROCESS = "inproc"
 
 
 @contextmanager
@@ -53,7 +66,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
-                "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), worker_preload.__name__],
+                "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), workers_module.__name__],
                 "distributed.deploy.lost-worker-timeout": _LOST_WORKER_SECONDS,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": _LARGEST_KEPT_BYTES,
@@ -144,41 +157,6 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
         yield client
 
 
-@contextmanager
-def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
-    """Give a client of the scheduler at an address, for which it waits as long as Dask is set up to connect.
-
-    Args:
-        address: Address of the scheduler, such as tls://host:8786.
-        trust_network: True to go on where scheduler or workers are neither encrypted nor on loopback: whoever
-            reaches their ports can run programs there and read the meshes.
-
-    Raises:
-        AddressError: The address is malformed, or its network would have to be trusted.
-        ClusterError: Nothing answers there, or Dask's configuration does not fit.
-    """
-    scheduler = Address.of(address)
-    if not trust_network:
-        scheduler.require_private("the scheduler")
-    seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))
-    check_connection(address, seconds)
-    try:
-        client = Client(address, timeout=seconds)
-    except (OSError, ValueError) as error:
-        raise ClusterError(
-            f"no Dask scheduler answers at {address!r} within {seconds:g} s ({error}); start one with: dask scheduler"
-        ) from error
-    with client:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-        if not workers:
-            raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
-        if not trust_network:
-            # An address on loopback may be one end of a tunnel.
-            for worker in workers:
-                Address.of(worker).require_private("a worker")
-        yield client
-
-
 def memory_limit(memory: float | str, workers: int) -> int:
     """Return the memory of a worker in bytes.
 
@@ -197,3 +175,142 @@ def memory_limit(memory: float | str, workers: int) -> int:
     require_machine_memory(limit, "the memory of a worker")
     require_machine_memory(workers * limit, f"the memory of {workers} workers", "for each, or take fewer")
     return limit
+
+
+@contextmanager
+def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
+    """Give a client of the scheduler at an address, for which it waits as long as Dask is set up to connect.
+
+    Args:
+        address: Address of the scheduler, such as tls://host:8786.
+        trust_network: True to go on where scheduler or workers are neither encrypted nor on loopback: whoever
+            reaches their ports can run programs there and read the meshes.
+
+    Raises:
+        AddressError: The address is malformed, or its network would have to be trusted.
+        ClusterError: Nothing answers there, or Dask's configuration does not fit.
+    """
+    scheduler = Address.parse(address)
+    if not trust_network:
+        scheduler.require_private("the scheduler")
+    seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))
+    check_connection(address, seconds)
+    try:
+        client = Client(address, timeout=seconds)
+    except (OSError, ValueError) as error:
+        raise _unreachable(address, seconds, error) from error
+    with client:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
+            raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
+        if not trust_network:
+            # An address on loopback may be one end of a tunnel.
+            for worker in workers:
+                Address.parse(worker).require_private("a worker")
+        yield client
+
+
+@dataclass(frozen=True)
+class Address:
+    """An address at which a process of a cluster listens.
+
+    Attributes:
+        name: Address as it was given.
+        scheme: Protocol, such as tls.
+        host, port: Host and port; empty and 0 within a process.
+    """
+
+    name: str
+    scheme: str
+    host: str
+    port: int
+
+    @classmethod
+    def parse(cls, name: str) -> Self:
+        """Return the address with this name; without a scheme, Dask's default is meant.
+
+        Raises:
+            AddressError: The name is malformed.
+        """
+        scheme, rest = parse_address(name)
+        if scheme == _WITHIN_A_PROCESS:
+            return cls(name, scheme, "", 0)
+        if scheme not in (*_ENCRYPTED, *_PLAIN):
+            raise _malformed(name, f"{scheme!r} is not one of {', '.join((*_ENCRYPTED, *_PLAIN))}")
+        try:
+            host, port = parse_host_port(rest)
+        except ValueError as error:
+            raise _malformed(name, str(error)) from error
+        if not host or any(character.isspace() or character in "/@" for character in host):
+            raise _malformed(name, f"{host!r} is no host")
+        if not 0 < port < 65536:
+            raise _malformed(name, f"{port} is no port")
+        return cls(name, scheme, host, port)
+
+    def require_private(self, who: str) -> None:
+        """Check that nobody else reaches this address: it asks for certificates, or is on loopback.
+
+        Args:
+            who: Process that listens, for the message.
+
+        Raises:
+            AddressError: Others may reach it.
+            ClusterError: The host does not exist.
+        """
+        if self.scheme in (*_ENCRYPTED, _WITHIN_A_PROCESS):
+            return
+        try:
+            infos = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError) as error:
+            raise ClusterError(f"no Dask scheduler answers at {self.name!r}: there is no host {self.host!r}") from error
+        hosts = [str(socket_address[0]) for *_, socket_address in infos]
+        beyond = [host for host in hosts if not _is_loopback(host)]
+        if beyond:
+            raise AddressError(
+                f"{who} at {self.name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
+                "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "
+                "--trust-network (in Python trust_network=True) where nobody else is on that network"
+            )
+
+
+def check_connection(address: str, seconds: float) -> None:
+    """Shake hands with the scheduler at an address once.
+
+    Dask's client waits for ever where something listens that is no scheduler.
+
+    Raises:
+        ClusterError: Nothing answers in time, or certificates and configuration do not fit.
+    """
+    try:
+        arguments = Security().get_connection_args("client")
+        # In a thread: a notebook has a loop of its own running in this one.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(asyncio.run, _shake_hands(address, seconds, arguments)).result()
+    except (OSError, RuntimeError, TypeError, ValueError, MemoryError) as error:
+        raise _unreachable(address, seconds, error) from error
+
+
+async def _shake_hands(address: str, seconds: float, arguments: dict[str, Any]) -> None:
+    # The handshake that follows on the connection has no limit of its own.
+    async with asyncio.timeout(seconds + 1):
+        comm = await connect(address, timeout=seconds, **arguments)
+        await comm.close()
+
+
+def _unreachable(address: str, seconds: float, error: BaseException) -> ClusterError:
+    causes = [one_line(cause) for cause in (error, error.__cause__) if cause is not None and str(cause)]
+    return ClusterError(
+        f"no Dask scheduler answers at {address!r} within {seconds:g} s "
+        f"({'; '.join(causes) or 'something listens and says nothing'}); start one with: dask scheduler. One with "
+        "certificates has an address tls://..., and its DASK_CONFIG is needed here (docs/clusters.md)"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    address = ip_address(host)
+    mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
+    return (mapped or address).is_loopback
+
+
+def _malformed(name: str, reason: str) -> AddressError:
+    return AddressError(f"{name!r} is not the address of a scheduler ({reason}); one is tls://host:8786")

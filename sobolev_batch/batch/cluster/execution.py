@@ -1,20 +1,62 @@
-"""Tasks on a cluster: handed out so many at a time, in the memory that there is, and their outcomes taken back."""
+"""Tasks on a cluster: handed out so many at a time, in the memory that there is, and their outcomes taken back.
+
+Each step is reported to those who watch.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
 from distributed.comm import CommClosedError
 from distributed.scheduler import KilledWorker
 
-from sobolev_batch.batch.cluster.progress import Notify
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers, prepare_workers
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.errors import ClusterError, StoreError, one_line
+
+Stage = Literal["cluster", "fields", "reduction", "proximity"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of a run.
+
+    Attributes:
+        stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
+            tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
+        done, total: Steps of the stage.
+        label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
+        record: Completion record of that mesh.
+        part: Object of a collection that is worked on, and its number, such as "cow, 2 of 8"; else empty.
+    """
+
+    stage: Stage
+    done: int
+    total: int
+    label: str = ""
+    record: Record | None = None
+    part: str = ""
+
+
+Notify = Callable[[Progress], None]
+
+
+class Steps:
+    """The steps of one stage, counted and reported."""
+
+    def __init__(self, notify: Notify, stage: Stage, total: int) -> None:
+        """Report that the stage begins."""
+        self._notify, self._stage, self._total, self._done = notify, stage, total, 0
+        notify(Progress(stage, 0, total))
+
+    def advance(self, label: str = "", record: Record | None = None) -> None:
+        """Report one more step."""
+        self._done += 1
+        self._notify(Progress(self._stage, self._done, self._total, label, record))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +100,7 @@ class Cluster:
     in_flight_per_thread: int = 20
 
     @classmethod
-    def of(cls, client: Client, libraries: Iterable[str] = (), notify: Notify = lambda progress: None) -> Self:
+    def prepare(cls, client: Client, libraries: Iterable[str] = (), notify: Notify = lambda progress: None) -> Self:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
         return cls(client, prepare_workers(client, libraries), notify)
 

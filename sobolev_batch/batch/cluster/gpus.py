@@ -23,7 +23,8 @@ class GpuLock:
     """A GPU that belongs to this process until it ends or releases it.
 
     The lock is a socket bound to a name that Linux keeps in memory: it is exclusive, needs no permissions,
-    leaves no file, and ends with the process however that ends.
+    leaves no file, and ends with the process however that ends. Containers share it if they share the network of the
+    host. Others have temporary folders of their own, too, so that no file would serve them better.
 
     Attributes:
         device: UUID of the GPU.

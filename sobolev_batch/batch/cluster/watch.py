@@ -11,9 +11,9 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, Self
+from typing import Any
 from uuid import uuid4
 
 from distributed import CancelledError, Client
@@ -40,22 +40,17 @@ class _Silence:
     Attributes:
         heard: When it was last heard of. It is compared with nothing else: clocks differ, and this process may itself
             be stopped for a while, in which it hears nobody.
-        since: Time at which the silence was noticed.
+        since: Time at which the silence was noticed; now unless given.
         seconds: Seconds that it has lasted since.
     """
 
     heard: object
-    since: str
+    since: str = field(default_factory=lambda: f"{datetime.now(UTC):%H:%M:%S} UTC")
     seconds: float = 0.0
-
-    @classmethod
-    def begun(cls, heard: object) -> Self:
-        """Return a silence that begins now."""
-        return cls(heard, f"{datetime.now(UTC):%H:%M:%S} UTC")
 
     def lasting(self, heard: object, elapsed: float) -> _Silence:
         """Return the silence after some time, which ends it if the process was heard of since."""
-        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else _Silence.begun(heard)
+        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else _Silence(heard)
 
 
 class Watch:
@@ -76,7 +71,7 @@ class Watch:
         self._client, self._needs_gpu, self._give_up_after = client, needs_gpu, give_up_after
         self._address = str(client.scheduler.address)
         self._workers: dict[str, _Silence] = {}
-        self._scheduler = _Silence.begun(None)
+        self._scheduler = _Silence(None)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._look_out, name="sobolev-batch-watch", daemon=True)
 
@@ -129,9 +124,9 @@ class Watch:
                 # What waits for its answer wakes up, as if it had ended.
                 self._client.loop.add_callback(self._hang_up)
             return self._silent_scheduler() if self._scheduler.seconds > _TELL_AFTER_SECONDS else ""
-        self._scheduler = _Silence.begun(None)
+        self._scheduler = _Silence(None)
         self._workers = {
-            address: self._workers.get(address, _Silence.begun(None)).lasting(worker["last_seen"], elapsed)
+            address: self._workers.get(address, _Silence(None)).lasting(worker["last_seen"], elapsed)
             for address, worker in workers.items()
         }
         for address, silence in self._workers.items():

@@ -6,8 +6,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
-from sobolev_batch.batch.cluster.progress import Steps
+from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe_failure
 from sobolev_batch.batch.fields.memory import TaskSizes, reference_in_tasks, size_rows
 from sobolev_batch.batch.fields.tasks import (
     FieldSettings,
@@ -18,7 +17,7 @@ from sobolev_batch.batch.fields.tasks import (
     finish_mesh,
 )
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.workspace import Workspace, complete_records

@@ -15,8 +15,8 @@ from typing import Self
 import numpy as np
 from distributed import get_worker
 
-from sobolev_batch.batch.cluster.worker_plugin import worker_backend
-from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.cluster.workers import worker_backend
+from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row

@@ -15,8 +15,7 @@ from typing import Protocol
 from fsspec import available_protocols
 from zarr.abc.store import Store as ZarrStore
 
-from sobolev_batch.batch.storage.local import PARTIAL_FILE, Folder
-from sobolev_batch.batch.storage.remote import BUCKET_SCHEMES, ObjectStorage
+from sobolev_batch.batch.storage.stores import BUCKET_SCHEMES, PARTIAL_FILE, Folder, ObjectStorage
 from sobolev_batch.errors import SobolevBatchError, StoreError
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
@@ -45,7 +44,7 @@ class Location:
     fence: Fence | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def of(cls, store: str | Path | Location) -> Location:
+    def parse(cls, store: str | Path | Location) -> Location:
         """Return the location that a path or URL names.
 
         Raises:

@@ -11,10 +11,12 @@ stored something newer. Before each write it looks whether the lock is still tha
 
 from __future__ import annotations
 
+import calendar
 import json
 import logging
 import os
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -23,11 +25,11 @@ from typing import Self
 from uuid import uuid4
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.timestamps import utc_now
 from sobolev_batch.errors import LockError, StoreError
 
 _log = logging.getLogger(__name__)
 
+_TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 # States of a process that only waits for its parent to take notice.
 _ENDED = ("Z", "X")
 
@@ -237,3 +239,17 @@ def _machine() -> str:
         return f"{boot}/{os.readlink('/proc/self/ns/pid')}"
     except OSError:
         return ""
+
+
+def utc_now() -> str:
+    """Return the time in UTC, in ISO 8601, to the second.
+
+    >>> len(utc_now())
+    20
+    """
+    return time.strftime(_TIME_FORMAT, time.gmtime())
+
+
+def age_seconds(moment: str) -> float:
+    """Return the seconds since a time that `utc_now` returned."""
+    return time.time() - calendar.timegm(time.strptime(moment, _TIME_FORMAT))

@@ -9,8 +9,7 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Self
 
-from sobolev_batch.batch.storage.lock import Lock, this_process
-from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.storage.lock import Lock, this_process, utc_now
 from sobolev_batch.batch.store.records import RunRecord, RunState
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import LockError, StoreError, one_line

@@ -61,7 +61,7 @@ class Hierarchy:
     """
 
     def __init__(self, store: str | Path | Location) -> None:
-        self.location = Location.of(store)
+        self.location = Location.parse(store)
         self.documents: dict[str, Document] = {}
         self.digests: dict[str, str] = {}
 

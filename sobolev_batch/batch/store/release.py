@@ -7,8 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, break_lock
-from sobolev_batch.batch.storage.timestamps import age_seconds
+from sobolev_batch.batch.storage.lock import Lock, age_seconds, break_lock
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import LockError, StoreError
@@ -34,7 +33,7 @@ def release(store: str | Path | Location, *, force: bool = False) -> Lock | None
     >>> sb.release("memory://new.zarr") is None
     True
     """
-    location = Location.of(store)
+    location = Location.parse(store)
     lock = Lock.read(location)
     if lock is None:
         return None

@@ -365,7 +365,7 @@ def _stores(store: AnyCollection | AnyStore) -> Mapping[str, AnyStore]:
         return {"": store}
     if not isinstance(store, str | Path | Location):
         return store
-    collection = CollectionStore.found(Location.of(store))
+    collection = CollectionStore.found(Location.parse(store))
     if collection is None:
         return {"": store}
     return dict(collection.begun)
@@ -427,7 +427,7 @@ def stores_of(store: AnyCollection) -> tuple[dict[str, AnyStore], tuple[str, ...
     """
     if isinstance(store, Mapping):
         return dict(store), tuple(store)
-    location = Location.of(store)
+    location = Location.parse(store)
     found = CollectionStore.found(location)
     if found is None:
         raise StoreError(

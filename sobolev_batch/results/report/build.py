@@ -17,7 +17,7 @@ from uuid import uuid4
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.timestamps import utc_now
+from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.meshes.views import Axis, make_views
@@ -150,7 +150,7 @@ def make_report(
             "the extra has it: pip install 'sobolev-batch[report]'"
         )
     limits = limits or ReportLimits()
-    collection = CollectionStore.found(Location.of(location_of(store)))
+    collection = CollectionStore.found(Location.parse(location_of(store)))
     if collection is None:
         return _study_page(store, folder, witnesses, up, limits)
     if witnesses:

@@ -167,7 +167,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.found(Location.of(store))
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.found(Location.parse(store))
     if collection is not None:
         return _joined(tables_of(collection.begun, order, x=x))
     tree = as_tree(store)

@@ -21,7 +21,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.analysis import proximity as module
 from sobolev_batch.batch.analysis.proximity import StoredMesh, measure_proximity
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.records import Facts, ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from sobolev_batch import AddressError, ClusterError, InputError
-from sobolev_batch.batch.cluster.clients import remote_client
-from sobolev_batch.batch.cluster.connection import Address
+from sobolev_batch.batch.cluster.clients import Address, remote_client
 
 MALFORMED = ["", "tcp://", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
 MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "tcp://a b:1", "tcp://me@host:1", "a://b://c:1"]
@@ -23,8 +22,8 @@ def test_malformed(name: str) -> None:
 
 
 def test_parts() -> None:
-    assert Address.of("host:8786") == Address("host:8786", "tcp", "host", 8786)
-    assert Address.of("tls://[::1]:1") == Address("tls://[::1]:1", "tls", "::1", 1)
+    assert Address.parse("host:8786") == Address("host:8786", "tcp", "host", 8786)
+    assert Address.parse("tls://[::1]:1") == Address("tls://[::1]:1", "tls", "::1", 1)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +34,7 @@ def test_parts() -> None:
     ],
 )
 def test_private(name: str) -> None:
-    Address.of(name).require_private("the scheduler")
+    Address.parse(name).require_private("the scheduler")
 
 
 @pytest.mark.parametrize("name", ["tcp://192.0.2.1:1", "192.0.2.1:1", "ws://[2001:db8::1]:1", "tcp://0.0.0.0:1"])
@@ -53,7 +52,7 @@ def test_all_that_a_name_stands_for_counts(places: list[str], private: bool, mon
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (place, port)) for place in places]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    address = Address.of("tcp://scheduler:8786")
+    address = Address.parse("tcp://scheduler:8786")
     if private:
         address.require_private("the scheduler")
     else:
@@ -63,5 +62,5 @@ def test_all_that_a_name_stands_for_counts(places: list[str], private: bool, mon
 
 def test_a_host_that_is_not_there_is_no_wrong_input() -> None:
     with pytest.raises(ClusterError, match=r"there is no host 'example\.invalid'") as caught:
-        Address.of("tcp://example.invalid:1").require_private("the scheduler")
+        Address.parse("tcp://example.invalid:1").require_private("the scheduler")
     assert not isinstance(caught.value, InputError)

@@ -13,10 +13,11 @@ import dask as dask_settings
 import numpy as np
 import psutil
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
 
 from sobolev_batch import AddressError, ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from tests.support.commands import call
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.recipes import write_study
 from tests.support.studies import variable
@@ -45,15 +46,14 @@ def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
     assert len(workers) == 2
 
 
-@pytest.mark.process
+@pytest.mark.slow
 def test_a_scheduler_without_workers() -> None:
-    scheduler = dask(*SCHEDULER)
-    try:
-        address = scheduler_address(scheduler)
-        with pytest.raises(ClusterError, match="has no workers; start some with: dask worker"), remote_client(address):
-            pass
-    finally:
-        stop(scheduler)
+    with (
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster,
+        pytest.raises(ClusterError, match="has no workers; start some with: dask worker"),
+        remote_client(cluster.scheduler_address),
+    ):
+        pass
 
 
 def _die_once(mark: Path) -> int:
@@ -72,11 +72,6 @@ def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
         assert client.submit(_die_once, tmp_path / "mark").result(timeout=PATIENCE_SECONDS) != first
 
 
-def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sobolev_batch", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
-
-
 @pytest.mark.all
 def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: Path) -> None:
     """0.0.0.0 leads to loopback, and is not known to: what listens here nobody else reaches."""
@@ -84,7 +79,7 @@ def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: P
     with tcp_cluster([]) as (address, _):
         beyond = address.replace("127.0.0.1", "0.0.0.0")
         arguments: list[str | Path] = ["plan", tmp_path / "study.toml", "--scheduler", beyond]
-        refused, trusted = cli(*arguments), cli(*arguments, "--trust-network")
+        refused, trusted = call(*arguments), call(*arguments, "--trust-network")
     assert refused.returncode == 2
     assert refused.stderr.startswith(f"error: the scheduler at {beyond} is neither encrypted nor on loopback (0.0.0.0)")
     assert trusted.returncode == 0, trusted.stderr
@@ -115,10 +110,9 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
             stop(process)
 
 
-@pytest.mark.process
 def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
     write_study(tmp_path)
-    done = cli("submit", tmp_path / "study.toml", "--scheduler", "host")
+    done = call("submit", tmp_path / "study.toml", "--scheduler", "host")
     assert done.returncode == 2
     assert done.stderr.startswith("error: 'host' is not the address of a scheduler (missing port number")
     assert done.stderr.count("\n") == 1

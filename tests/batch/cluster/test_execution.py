@@ -12,10 +12,8 @@ from distributed.core import Status as WorkerStatus
 from distributed.scheduler import WorkerState
 
 from sobolev_batch import ClusterError, DamageError, StoreError, Study, run
-from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
-from sobolev_batch.batch.cluster.progress import Progress
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
-from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
+from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
+from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop

@@ -13,8 +13,7 @@ import xarray as xr
 
 from sobolev_batch import ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
-from sobolev_batch.batch.cluster.workers import GPU
+from sobolev_batch.batch.cluster.workers import GPU, prepare_workers
 from tests.support.processes import tcp_cluster
 from tests.support.repository import ROOT
 from tests.support.studies import small_table, variable

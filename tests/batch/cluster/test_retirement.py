@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,15 +18,13 @@ import pytest
 from distributed import Client, Worker
 
 from sobolev_batch import Study, icosphere, open_store, run
-from sobolev_batch.batch.cluster.progress import Progress
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support import gate
-from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop
+from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, wait_until
 from tests.support.studies import small_table, variable
 
 pytestmark = pytest.mark.all
-
-_POLL_SECONDS = 0.02
 
 
 class Cluster:
@@ -159,8 +156,7 @@ def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
                 threading.Thread(target=replace, args=(held,)).start()
 
         def replace(held: Gate) -> None:
-            while not any(ours.run(executing).values()):
-                time.sleep(_POLL_SECONDS)
+            wait_until(lambda: any(ours.run(executing).values()))
             ours.run(end_lifetime)
             assert left.wait(timeout=PATIENCE_SECONDS)
             held.set_aside()

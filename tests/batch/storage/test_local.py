@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from zarr.core.buffer import default_buffer_prototype
+from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
-from sobolev_batch.batch.storage.local import path_in
 from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.stores import path_in
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table, variable
@@ -56,7 +59,7 @@ def test_nothing_is_written_or_removed_elsewhere(copy: Path, tmp_path: Path) -> 
         store = Path(shutil.copytree(copy, tmp_path / f"{key.replace('/', '-')}.zarr"))
         (store / key).mkdir(exist_ok=True)
         lead_away(store / key, elsewhere)
-        location = Location.of(store)
+        location = Location.parse(store)
         with pytest.raises(StoreError, match="a link, which may lead out of the store"):
             location.write({f"{key}/5/new": b"bytes"})
         with pytest.raises(StoreError, match="a link, which may lead out of the store"):
@@ -66,6 +69,29 @@ def test_nothing_is_written_or_removed_elsewhere(copy: Path, tmp_path: Path) -> 
     with pytest.raises(StoreError, match="a link, which may lead out of the store"):
         run(Study.from_table(small_table()), tmp_path / "records-record-c.zarr")
     assert [path.name for path in elsewhere.rglob("*")] == ["5", "precious"]
+
+
+@pytest.mark.parametrize(
+    "method", ["get", "get_partial_values", "exists", "getsize", "delete", "delete_dir", "list_dir"]
+)
+def test_no_method_of_the_store_that_zarr_sees_follows_a_link(method: str, copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "precious").write_text("text")
+    (copy / "link").symlink_to(tmp_path / "elsewhere")
+    keys: Any = Location.parse(copy).zarr_store()
+    prototype, key = default_buffer_prototype(), "link/precious"
+    arguments = {"get": (key, prototype), "get_partial_values": (prototype, [(key, None)])}.get(method, (key,))
+
+    async def ask() -> None:
+        outcome = getattr(keys, method)(*arguments)
+        if method == "list_dir":
+            assert not [name async for name in outcome]
+        else:
+            await outcome
+
+    with pytest.raises(StoreError, match="a link, which may lead out of the store"):
+        sync(ask())
+    assert (tmp_path / "elsewhere" / "precious").exists()
 
 
 def test_keys_that_climb(tmp_path: Path) -> None:

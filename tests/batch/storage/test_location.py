@@ -29,9 +29,9 @@ from sobolev_batch.batch.store.store import Store
     ],
 )
 def test_folders_and_urls(place: str | Path, name: str, scheme: str) -> None:
-    location = Location.of(place)
+    location = Location.parse(place)
     assert (location.name, str(location), location.scheme) == (name, name, scheme)
-    assert Location.of(location) is location
+    assert Location.parse(location) is location
     assert pickle.loads(pickle.dumps(location)) == location
     assert Store(place).path == name
 
@@ -54,7 +54,7 @@ def test_folders_and_urls(place: str | Path, name: str, scheme: str) -> None:
 )
 def test_urls_that_are_refused_and_not_repeated(place: str | Path, message: str) -> None:
     with pytest.raises(StoreError, match=message) as caught:
-        Location.of(place)
+        Location.parse(place)
     assert "hid" not in str(caught.value)
     assert caught.value.__cause__ is None
 
@@ -65,7 +65,7 @@ def test_an_unknown_protocol() -> None:
 
 
 def test_documents_of_a_folder_and_of_a_url(tmp_path: Path) -> None:
-    for location in (Location.of(tmp_path / "new"), Location.of("memory://documents/a")):
+    for location in (Location.parse(tmp_path / "new"), Location.parse("memory://documents/a")):
         location.require_free()
         assert location.names() == set()
         assert location.read("b/c") is None
@@ -93,10 +93,10 @@ def test_documents_of_a_folder_and_of_a_url(tmp_path: Path) -> None:
 )
 def test_reasons_in_one_line(error: Exception, reason: str) -> None:
     message = rf"^s3://bucket/a: the store cannot be read: {reason}"
-    with pytest.raises(StoreError, match=message) as caught, Location.of("s3://bucket/a").access("read"):
+    with pytest.raises(StoreError, match=message) as caught, Location.parse("s3://bucket/a").access("read"):
         raise error
     assert "\n" not in str(caught.value)
     # Of a folder, what is no failure of the disk is a defect of ours.
     if not isinstance(error, OSError):
-        with pytest.raises(ZeroDivisionError), Location.of("folder").access("read"):
+        with pytest.raises(ZeroDivisionError), Location.parse("folder").access("read"):
             raise error

@@ -17,8 +17,8 @@ from zarr.core.sync import sync
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.cluster.progress import Progress
-from sobolev_batch.batch.storage import remote
+from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.batch.storage import stores
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
@@ -65,7 +65,7 @@ def storage(served: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]
 @pytest.fixture
 def location(request: pytest.FixtureRequest) -> Location:
     """A place that no other test uses."""
-    return Location.of(f"s3://{BUCKET}/{re.sub(r'[^a-z0-9]+', '-', request.node.name.lower())}/results.zarr")
+    return Location.parse(f"s3://{BUCKET}/{re.sub(r'[^a-z0-9]+', '-', request.node.name.lower())}/results.zarr")
 
 
 @pytest.mark.slow
@@ -148,8 +148,8 @@ def test_an_outage_ends_in_one_line(storage: Server, location: Location, kind: K
 
 
 def test_storage_that_never_answers_is_given_up(location: Location, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote, "LONGEST_SECONDS", 0.1)
-    monkeypatch.setattr(remote, "_ANSWER_SECONDS", 0.1)
+    monkeypatch.setattr(stores, "LONGEST_SECONDS", 0.1)
+    monkeypatch.setattr(stores, "_ANSWER_SECONDS", 0.1)
     with (
         socket.create_server(("127.0.0.1", 0)) as deaf,
         taken_for_s3({"AWS_ENDPOINT_URL": f"http://127.0.0.1:{deaf.getsockname()[1]}"}),

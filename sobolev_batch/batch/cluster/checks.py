@@ -1,14 +1,21 @@
-"""Versions of client, scheduler and workers, which must agree: results would mix what they compute."""
+"""What has to hold on a cluster before a study begins: all processes have the same versions and see the same store."""
 
 from __future__ import annotations
 
+import logging
+import os
+import uuid
 from collections.abc import Iterable, Mapping
 
 from distributed import Client
 
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.errors import ClusterError, StoreError
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION
+
+_log = logging.getLogger(__name__)
 
 _OF_DASK = ("dask", "distributed")
 _OF_NUMBERS = (
@@ -17,6 +24,8 @@ _OF_NUMBERS = (
 )
 # Not every study needs these. Processes that have them must have the same.
 _OF_EXTRAS = ("pyacvd", "vtk")
+# One for each process that imports this; a forked process has its parent's, but another number.
+_PROCESS = uuid.uuid4().hex
 
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:
@@ -72,3 +81,41 @@ def _differences(ours: Mapping[str, str], theirs: Mapping[str, Mapping[str, str]
             here = f"{ours[name]} here" if ours[name] else "there is none here"
             described.append(f"{name} {version or 'is missing'} at the {first}{more}, {here}")
     return described
+
+
+def require_store_access(client: Client, location: Location, lock: Lock) -> None:
+    """Check that all workers see the store that this process has locked.
+
+    Drivers and credentials differ between processes: a store that this process reaches, a worker may not. And a
+    folder of the same name may be another folder on another machine.
+
+    Raises:
+        StoreError: A worker does not see it; the message names the worker.
+    """
+    for worker, answer in client.run(_look, location, lock, on_error="return").items():
+        if isinstance(answer, BaseException):
+            # A worker that has just gone says nothing about the store; tasks will tell.
+            _log.warning("the worker %s does not say whether it reaches %s: %s", worker, location, answer)
+            continue
+        process, problem = answer
+        if location.is_in_memory and process != _this_process():
+            raise StoreError(
+                f"{location}: what is written there stays in the memory of one process, and the worker {worker} is "
+                "another one; name a folder or an s3:// URL, or leave out the client"
+            )
+        if problem:
+            raise StoreError(f"the worker {worker} cannot use the store: {problem}")
+
+
+def _look(location: Location, lock: Lock) -> tuple[str, str]:
+    """Return the process that runs this, and why it does not see the store."""
+    try:
+        sees_lock = lock.is_held(location)
+    except StoreError as error:
+        return _this_process(), str(error)
+    elsewhere = f"{location} is another place there; name one that all machines share"
+    return _this_process(), "" if sees_lock else elsewhere
+
+
+def _this_process() -> str:
+    return f"{_PROCESS}/{os.getpid()}"

@@ -1,4 +1,7 @@
-"""Stores in object storage, or wherever else a driver of fsspec reaches.
+"""Where the keys of a store are: in a folder, or wherever a driver of fsspec reaches.
+
+A store may come from somebody else. A link in it may lead to a device that never ends, or make a run write outside of
+the store. So no link below its folder is followed: checksums would reveal a wrong chunk only after it was read.
 
 Credentials are never part of a URL. The drivers take them from the environment of each process.
 """
@@ -6,20 +9,31 @@ Credentials are never part of a URL. The drivers take them from the environment 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+import inspect
+import os
+import re
+import shutil
+import stat
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar, cast
+from uuid import uuid4
 
 from fsspec.asyn import AsyncFileSystem, sync
 from fsspec.core import url_to_fs
 from fsspec.implementations.asyn_wrapper import AsyncFileSystemWrapper
 from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import FsspecStore
+from zarr.storage import FsspecStore, LocalStore
 
 from sobolev_batch.errors import StoreError
 
 T = TypeVar("T")
+
+# zarr gives files such names, too, until they are complete.
+PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
 
 BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
@@ -30,6 +44,145 @@ _SLOWEST_BYTES_PER_SECOND = 500_000
 _RANGE_BYTES = 50 << 20
 # Another attempt would not change these answers.
 _FINAL = (PermissionError, FileNotFoundError, NotADirectoryError)
+
+
+def path_in(root: str | Path, key: str) -> Path:
+    """Return the path of a key of a store in a folder. The folder itself may be reached by a link.
+
+    Raises:
+        StoreError: The key leads out of the folder, or its path holds a link or a special file.
+    """
+    if key.startswith("/") or ".." in key.split("/"):
+        raise StoreError(f"{root}: {key} leads out of the store")
+    path = os.fspath(root)
+    # One by one, since resolving a whole path takes ten times as long, and each record is a key.
+    for name in filter(None, key.split("/")):
+        path = f"{path}/{name}"
+        try:
+            mode = os.lstat(path).st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            break
+        if stat.S_ISLNK(mode):
+            raise StoreError(f"{path}: a link, which may lead out of the store; put what it leads to in its place")
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise StoreError(f"{path}: neither a file nor a folder, in a store; remove it")
+    return Path(root) / key
+
+
+class FolderStore(LocalStore):
+    """zarr's store in a folder, which follows no link in it."""
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        """Return the bytes of ranges of keys."""
+        ranges = list(key_ranges)
+        for key, _ in ranges:
+            path_in(self.root, key)
+        return await super().get_partial_values(prototype, ranges)
+
+
+def _checked(method: Callable[..., Any]) -> Callable[..., Any]:
+    def call(self: FolderStore, *arguments: Any, **options: Any) -> Any:
+        path_in(self.root, arguments[0] if arguments else options.get("key", options.get("prefix", "")))
+        return method(self, *arguments, **options)
+
+    return call
+
+
+# By their arguments, since newer versions of zarr add some.
+for _name, _method in inspect.getmembers(LocalStore, inspect.isfunction):
+    if not _name.startswith("_") and list(inspect.signature(_method).parameters)[1:2] in (["key"], ["prefix"]):
+        setattr(FolderStore, _name, _checked(_method))
+
+
+class Folder:
+    """Keys of a store as files in a folder."""
+
+    # Any other exception is a defect.
+    failures: tuple[type[Exception], ...] = (OSError,)
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def zarr_store(self, largest_bytes: int) -> FolderStore:
+        """Return zarr's store in the folder."""
+        return FolderStore(self._path)
+
+    def read(self, key: str, most_bytes: int | None) -> bytes:
+        """Return the content of a file."""
+        path = path_in(self._path, key)
+        if most_bytes is not None and path.stat().st_size > most_bytes:
+            raise StoreError(f"{self._path}: {key} has more than {most_bytes} bytes")
+        return path.read_bytes()
+
+    def write(self, documents: Mapping[str, bytes]) -> None:
+        """Write files, each under a temporary name first."""
+        for key, document in documents.items():
+            path = path_in(self._path, key)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # A reader finds the old document or the new one, never half of it.
+            with _partial_file(path, document) as partial:
+                partial.replace(path)
+
+    def create(self, key: str, document: bytes) -> None:
+        """Write a file unless it exists."""
+        path = path_in(self._path, key)
+        path.parent.mkdir(exist_ok=True)
+        with _partial_file(path, document) as partial:
+            # Unlike opening a new file, a link never shows the key without its content.
+            os.link(partial, path)
+
+    def delete(self, key: str) -> None:
+        """Remove a file."""
+        path_in(self._path, key).unlink()
+
+    def delete_all(self, prefix: str) -> None:
+        """Remove a folder below."""
+        shutil.rmtree(path_in(self._path, prefix))
+
+    def delete_partial_files(self) -> None:
+        """Remove files that were not written to their end."""
+        for folder, _, names in os.walk(self._path):
+            for name in filter(PARTIAL_FILE.search, names):
+                # It may have got its final name since, from a task that outlived its run.
+                (Path(folder) / name).unlink(missing_ok=True)
+
+    def sizes(self, prefix: str) -> dict[str, int]:
+        """Return the sizes of all files below a prefix."""
+        sizes = {}
+        for folder, _, names in os.walk(path_in(self._path, prefix)):
+            for name in names:
+                path = os.path.join(folder, name)
+                with suppress(FileNotFoundError):  # removed since
+                    status = os.lstat(path)
+                    if stat.S_ISREG(status.st_mode):
+                        sizes[os.path.relpath(path, self._path).replace(os.sep, "/")] = status.st_size
+        return sizes
+
+    def names(self) -> set[str]:
+        """Return the names of files and folders."""
+        return set(os.listdir(self._path)) if Path(self._path).exists() else set()
+
+    def require_usable(self) -> None:
+        """Check that the folder exists or can be made."""
+        path = Path(self._path)
+        if path.exists() and not path.is_dir():
+            raise StoreError(f"{path}: a file is there; name a folder that is new or holds a store")
+        parent = path.absolute().parent
+        if not parent.is_dir():
+            raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
+
+
+@contextmanager
+def _partial_file(path: Path, document: bytes) -> Iterator[Path]:
+    """Write a document to a file beside a path. The file is removed unless it was moved to the path."""
+    partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
+    try:
+        partial.write_bytes(document)
+        yield partial
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 async def _twice(attempt: Callable[[], Awaitable[T]], size_bytes: int = 0, final: Any = _FINAL) -> T:

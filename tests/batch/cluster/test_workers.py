@@ -11,8 +11,7 @@ from distributed import Client
 
 from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
-from sobolev_batch.batch.cluster.worker_plugin import prepare_workers
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, prepare_workers
 from sobolev_batch.machine import MachineMemory
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
