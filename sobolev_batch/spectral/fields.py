@@ -15,12 +15,12 @@ from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.errors.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 # The orders that a field is probed for if none are named.
@@ -175,7 +175,7 @@ def field_for(
     Returns:
         The first of a few attempts that meets the target, or the last.
     """
-    if isinstance(surface, Sphere):
+    if kind_of(surface).is_closed_form:
         return compute_field(surface, lattice, settings, target.orders, sample=sample)
     for _ in range(_ATTEMPTS):
         chosen = choose_settings(surface, lattice, target, settings)

@@ -12,8 +12,8 @@ import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.spectral.backends.backends import NufftSpec
 from sobolev_batch.spectral.lattice import AXES
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
-from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.nufft import transform_points
 
 WORKFLOW = Path(__file__).parents[2] / "workflows/cortex.toml"
@@ -33,7 +33,7 @@ def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:
     assert isinstance(coarse, sb.Mesh)
     similarity = sb.Similarity.to_unit_ball(whole)
     rule = Quadrature(2)
-    plans = (QuadraturePlan.of(similarity.apply(surface), 1.0, 1e-9, rule) for surface in (coarse, whole))
+    plans = (kind_of(similarity.apply(surface)).plan(1.0, 1e-9, rule) for surface in (coarse, whole))
     first, second = (list(plan.batches(1 << 20)) for plan in plans)
     return first, second
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh, Similarity, icosphere
-from sobolev_batch.spectral.errors.probe import exact_transform_of
 from sobolev_batch.spectral.exact.sampled import sampled_transform
+from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.surfaces.shapes.mesh import shared_triangles
 
@@ -24,7 +24,7 @@ _FREQUENCIES = 100.0 * np.eye(3)
 _STEPS: dict[str, Callable[[Mesh], object]] = {
     "move to the unit of the study": lambda mesh: Similarity(0.5, (1.0, 0.0, 0.0)).apply(mesh),
     "box and extent": lambda mesh: (mesh.bounding_sphere, mesh.extent),
-    "exact values": lambda mesh: exact_transform_of(mesh, _FREQUENCIES),
+    "exact values": lambda mesh: exact_transform(mesh, _FREQUENCIES),
     "values in octaves, by two threads": lambda mesh: sampled_transform(mesh, _FREQUENCIES, 2),
     "directions of faces": lambda mesh: FaceNormals.of([mesh]),
     "common triangles": lambda mesh: shared_triangles(mesh.vertices[mesh.triangles], np.zeros((1, 3, 3))),

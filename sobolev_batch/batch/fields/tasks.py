@@ -31,11 +31,11 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 _log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ class Job:
 
     def transform_settings(self, surface: Surface) -> TransformSettings:
         """Return the settings of a field that is computed block by block, from its a priori error."""
-        if self.distance_target is None or isinstance(surface, Sphere):
+        if self.distance_target is None:
             return self.settings.transform
         return choose_settings(
             surface, self.settings.lattice, self.distance_target.error_target(surface), self.settings.transform
@@ -237,7 +237,7 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
     """Compute and store a field of one block; its facts have the number of points alone."""
     lattice, transform, execution = job.settings.lattice, job.settings.transform, job.execution
-    if job.distance_target is not None and not isinstance(surface, Sphere):
+    if job.distance_target is not None and not kind_of(surface).is_closed_form:
         error_target = job.distance_target.error_target(surface)
         field = field_for(surface, lattice, error_target, transform, execution)
     else:

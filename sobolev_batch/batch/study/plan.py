@@ -21,11 +21,11 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.surfaces.sources.registry import Member, single_member
@@ -139,7 +139,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     similarity = Similarity.to_unit_ball(own) if study.scaling.mode == "reference" else study.scaling.fixed
     surface = similarity.apply(own)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
-    if not isinstance(surface, Sphere):
+    if not kind_of(surface).is_closed_form:
         require_inside(surface, choice.lattice)
     if study.proximity is not None and not isinstance(surface, Mesh):
         raise StudyError(
@@ -152,7 +152,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
         rows.append(Row(label, family, member, fingerprint, _key(study, similarity, choice, fingerprint)))
     sample = None
     if study.accuracy is not None:
-        sample = Sample.of(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
+        sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
     return Plan(
         study,
         similarity,

@@ -62,7 +62,7 @@ class MeshTransform:
     @classmethod
     def of(cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
-        rules = RuleAssignment.of(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
+        rules = RuleAssignment.for_mesh(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
         nodes = MovingNodes.of(mesh, rules)
         triangles = np.asarray(mesh.triangles, dtype=np.int64)
         return cls(triangles, len(mesh.vertices), nodes, lattice, settings.eps, execution)

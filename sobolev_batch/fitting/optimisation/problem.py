@@ -86,7 +86,7 @@ class FitProblem:
         """
         lattice = lattice or fit_lattice(mesh, surface, orders)
         draws = draws_for([mesh, surface], lattice, orders, USUAL_DEGREE)
-        distances = estimate([Sample.of(one, draws) for one in (mesh, surface)], orders)
+        distances = estimate([Sample.from_surface(one, draws) for one in (mesh, surface)], orders)
         rounding = np.finfo(np.float64).eps * surface.area
         target = ErrorTarget(orders, tuple(np.maximum(_TARGET_FRACTION * distances, rounding).tolist()))
         field = field_for(surface, lattice, target, TransformSettings(), execution)

@@ -109,7 +109,7 @@ class Problem:
     def samples(self, lattice: Lattice) -> Samples:
         """Return samples of all surfaces at the same frequencies."""
         draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
-        return tuple(Sample.of(surface, draws) for surface in self.surfaces)
+        return tuple(Sample.from_surface(surface, draws) for surface in self.surfaces)
 
     def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:
         """Return the cheapest dtype that meets a target."""

@@ -19,10 +19,11 @@ from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.probe import Sample, estimate, exact_transform_of
+from sobolev_batch.spectral.errors.probe import Sample, estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -79,7 +80,7 @@ class DistanceTarget:
         """Return the target for the field of a surface."""
         values = np.array(self.distances)
         if self.reference is not None:
-            sample = Sample.of(surface, self.reference.draws)
+            sample = Sample.from_surface(surface, self.reference.draws)
             values = ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
         return error_target(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
 
@@ -201,7 +202,7 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
     """Tell whether surfaces that agree on a lattice differ at higher frequencies, as two shifts of a fine grid do."""
     draws = problem.samples(lattice)[0].draws
     frequencies = np.concatenate([factor * draws.frequencies for factor in _BEYOND])
-    first, *others = (exact_transform_of(surface, frequencies) for surface in problem.surfaces)
+    first, *others = (kind_of(surface).exact_values(frequencies) for surface in problem.surfaces)
     difference = np.abs(first - others[0]) if others else np.abs(first)
     # Rounding of coordinates turns the phases at high frequencies.
     phases = 2 * np.pi * problem.support.reach * np.linalg.norm(frequencies, axis=1)

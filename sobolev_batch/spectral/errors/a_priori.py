@@ -1,29 +1,21 @@
-"""Prediction of a field's error before it is computed, and the cheapest settings that keep it small.
+"""The cheapest settings that are predicted to keep a field's error small.
 
-The prediction adds up the errors of the rules on typical triangles of the mesh's sizes. On fine meshes it
-was measured to be one to ten times the true error, on coarse ones down to a fifth of it. That is good
-enough to choose settings by; the probe measures the error afterwards.
+The prediction is good enough to choose settings by; the probe measures the error afterwards.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import singledispatch
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.lattice import FrequencyLattice
-from sobolev_batch.spectral.quadrature.meshes import choose_rules
-from sobolev_batch.spectral.quadrature.rules import FINEST_TOLERANCE, TriangleRule, rule_ranges, typical_errors
+from sobolev_batch.spectral.quadrature.kinds import kind_of
+from sobolev_batch.spectral.quadrature.prediction import weight_masses
 from sobolev_batch.spectral.transform.settings import COARSEST_EPS, FINEST_EPS, TransformSettings
-from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -33,14 +25,6 @@ _NUFFT_FRACTION = 0.4
 _NUFFT_ERROR = 0.005
 # The same of single precision over the area, however small its eps; measured 1e-7 at most.
 _SINGLE_ROUNDING = 3e-7
-# Fraction of the odd errors that was seen to remain between neighbouring triangles.
-_ODD_REMAINDER = 0.2
-# A parametrised surface has at least so many nodes.
-_FEWEST_NODES = 500
-_BINS = 48
-_RADII = 32
-_LOOSEST_TOLERANCE = 0.1
-_STEPS_PER_DECADE = 4
 
 
 @dataclass(frozen=True)
@@ -62,145 +46,37 @@ class ErrorTarget:
 
 def permits_single(surface: Surface, lattice: FrequencyLattice, target: ErrorTarget) -> bool:
     """Tell whether single precision meets a target: its rounding is 1e-7 of the area at every frequency."""
-    rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(_weight_masses(lattice, target.orders))
+    rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(weight_masses(lattice, target.orders))
     return bool(np.all(rounding <= _NUFFT_FRACTION * np.array(target.norms)))
 
 
-@singledispatch
 def choose_settings(
     surface: Surface, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> TransformSettings:
     """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
 
     Args:
-        surface: Surface of the field, a mesh or a parametrised one.
-        lattice: FrequencyLattice of the field.
+        surface: Surface of the field.
+        lattice: Lattice of the field.
         target: Largest permitted error.
         settings: Settings whose dtype and quadrature are kept.
 
     Returns:
-        ``settings`` with a new eps and tolerance.
-
-    Raises:
-        InputError: Fields of this kind of surface have no such settings.
+        ``settings`` with a new eps and tolerance; as they are for a closed form, which depends on neither.
     """
-    raise InputError(
-        f"settings follow from an accuracy for meshes and parametrised surfaces, found {type(surface).__name__}"
-    )
-
-
-@choose_settings.register
-def _(surface: Mesh, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings) -> TransformSettings:
-    rules = ErrorTarget(target.orders, tuple((1 - _NUFFT_FRACTION) * np.array(target.norms)))
-    eps = _nufft_eps(surface.area, len(surface.triangles), lattice, target, settings)
-    return replace(settings, eps=eps, tolerance=loosest_tolerance(surface, lattice, rules))
-
-
-@choose_settings.register
-def _(
-    surface: Smooth, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
-) -> TransformSettings:
-    # The tolerance bounds the error at every single frequency: assume it at all of them.
-    masses = _weight_masses(lattice, target.orders)
-    rest = (1 - _NUFFT_FRACTION) * np.array(target.norms)
-    eps = _nufft_eps(surface.area, _FEWEST_NODES, lattice, target, settings)
-    return replace(settings, eps=eps, tolerance=float(np.min(rest / (surface.area * np.sqrt(masses)))))
+    kind = kind_of(surface)
+    if kind.is_closed_form:
+        return settings
+    tolerance = kind.loosest_tolerance(lattice, target.orders, (1 - _NUFFT_FRACTION) * np.array(target.norms))
+    eps = _nufft_eps(surface.area, kind.fewest_points, lattice, target, settings)
+    return replace(settings, eps=eps, tolerance=tolerance)
 
 
 def _nufft_eps(
     area: float, points: float, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> float:
     """Return the largest eps with which the NUFFT of so many points keeps to its fraction of a target."""
-    masses = _weight_masses(lattice, target.orders)
+    masses = weight_masses(lattice, target.orders)
     spread = _NUFFT_ERROR + 1 / math.sqrt(points)
     eps = float(np.min(_NUFFT_FRACTION * np.array(target.norms) / (area * spread * np.sqrt(masses))))
     return min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS)
-
-
-def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, target: ErrorTarget) -> float:
-    """Return the largest tolerance of the triangle rules whose error is predicted to meet a target."""
-    sizes = SizeHistogram.of(mesh)
-    decades = math.log10(_LOOSEST_TOLERANCE / FINEST_TOLERANCE)
-    tolerances = _LOOSEST_TOLERANCE * 10 ** -np.linspace(0, decades, round(decades * _STEPS_PER_DECADE) + 1)
-
-    def suffices(tolerance: float) -> bool:
-        return bool(np.all(sizes.quadrature_error(lattice, target.orders, float(tolerance)) <= target.norms))
-
-    # The finest one where none suffices.
-    return float(tolerances[bisect_left(tolerances[:-1], True, key=suffices)])
-
-
-@dataclass(frozen=True, eq=False)
-class SizeHistogram:
-    """Triangles of a mesh, counted in classes of similar size.
-
-    Attributes:
-        smallest: Least centroid radius of each class, in units of length.
-        largest: Greatest centroid radius of each class.
-        areas: Sum of the areas in each class.
-        squares: Sum of the squared areas in each class.
-    """
-
-    smallest: Reals
-    largest: Reals
-    areas: Reals
-    squares: Reals
-
-    @classmethod
-    def of(cls, mesh: Mesh) -> SizeHistogram:
-        """Return the histogram of a mesh."""
-        radii, areas = mesh.centroid_radii, mesh.areas
-        largest = float(radii.max())
-        smallest = max(float(radii.min()), 1e-6 * largest)
-        count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
-        edges = np.geomspace(smallest, largest, count + 1)
-        classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
-        sums = [np.bincount(classes, values, count).astype(np.float64, copy=False) for values in (areas, areas * areas)]
-        return cls(edges[:-1], edges[1:], *sums)
-
-    def quadrature_error(self, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float) -> Reals:
-        """Predict the norm of the quadrature's part of a field's error (orders,).
-
-        The even parts of the triangles' errors add up like the surface's transform itself, whose
-        energy on |ξ| = r is area² near zero and area / (2π r²) on average far out. The odd parts add
-        up like random numbers.
-        """
-        rules, ranges = rule_ranges(tolerance)
-        # The rule for the smallest of a class, applied to the largest of it: never less than the truth.
-        splits, choice = choose_rules(2 * np.pi * lattice.highest_frequency * self.smallest, ranges)
-        radii = _radii(lattice)
-        phases = 2 * np.pi * radii[:, None] * (self.largest / 2.0**splits)
-        even, odd = np.empty_like(phases), np.empty_like(phases)
-        for rule in np.unique(choice):
-            members = choice == rule
-            even[:, members], odd[:, members] = _interpolated_errors(rules[rule], phases[:, members])
-        area = self.areas.sum()
-        coherence = np.minimum(1.0, 1 / (2 * np.pi * radii**2 * area))
-        energy = (even @ self.areas) ** 2 * coherence
-        energy += (even**2 + (_ODD_REMAINDER * odd) ** 2) @ (self.squares / 4.0**splits)
-        return np.asarray(np.sqrt(_radial_integrals(energy, radii, orders)))
-
-
-def _interpolated_errors(rule: TriangleRule, phases: Reals) -> tuple[Reals, Reals]:
-    """Return the typical even and odd errors of a rule at some phases."""
-    sizes, even, odd = typical_errors(rule)
-    logs, grid = np.log(np.maximum(phases, sizes[0])), np.log(sizes)
-    first, second = (np.exp(np.interp(logs, grid, np.log(errors + 1e-17))) for errors in (even, odd))
-    return first, second
-
-
-def _radii(lattice: FrequencyLattice) -> Reals:
-    low, high = lattice.radial_range
-    radii: Reals = low + (np.arange(_RADII) + 0.5) / _RADII * (high - low)
-    return radii
-
-
-def _weight_masses(lattice: FrequencyLattice, orders: Sequence[float]) -> Reals:
-    """Return ∫ (1+|ξ|²)^s over the range of a lattice (orders,)."""
-    return _radial_integrals(np.ones(_RADII), _radii(lattice), orders)
-
-
-def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> Reals:
-    """Return ∫ (1+r²)^s energy(r) 4πr² dr by the midpoint rule (orders,)."""
-    step = radii[1] - radii[0]
-    return np.array([np.sum((1 + radii**2) ** order * energy * 4 * np.pi * radii**2) * step for order in orders])

@@ -10,24 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, singledispatch
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.arrays import Complexes
-from sobolev_batch.spectral.exact.spheres import sphere_transform
-from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.quadrature.smooth import exact_values, resolution_of
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
@@ -183,39 +177,6 @@ def _draw_point(lattice: Lattice, shell: int, rng: np.random.Generator) -> NDArr
     return np.array([indices[i[chosen]], indices[j[chosen]], k[i[chosen], j[chosen]]])
 
 
-@singledispatch
-def exact_transform_of(surface: Surface, frequencies: Reals) -> NDArray[np.complex128]:
-    """Return the exact transform of a surface at frequencies (P, 3), complex128 (P,).
-
-    Each kind of surface registers its own function.
-
-    Raises:
-        InputError: The surface is of an unknown kind.
-    """
-    kinds = ", ".join(sorted(kind.__name__ for kind in exact_transform_of.registry if kind is not object))
-    raise InputError(f"the kinds of surfaces with an exact transform are {kinds}; found {type(surface).__name__}")
-
-
-@exact_transform_of.register
-def _(surface: Mesh, frequencies: Reals) -> NDArray[np.complex128]:
-    return exact_transform(surface, frequencies)
-
-
-@exact_transform_of.register
-def _(surface: Sphere, frequencies: Reals) -> NDArray[np.complex128]:
-    return sphere_transform(surface, frequencies)
-
-
-@exact_transform_of.register
-def _(surface: Smooth, frequencies: Reals) -> NDArray[np.complex128]:
-    return exact_values(surface, frequencies)
-
-
-def term_count(surface: Surface) -> int:
-    """Return the number of triangles that an exact transform adds up; 1 for other surfaces."""
-    return len(surface.triangles) if isinstance(surface, Mesh) else 1
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Exact transform of a surface at drawn frequencies.
@@ -229,9 +190,9 @@ class Sample:
     exact: NDArray[np.complex128]
 
     @classmethod
-    def of(cls, surface: Surface, draws: Draws) -> Sample:
+    def from_surface(cls, surface: Surface, draws: Draws) -> Sample:
         """Return the sample of a surface at given draws."""
-        return cls(draws, exact_transform_of(surface, draws.frequencies))
+        return cls(draws, kind_of(surface).exact_values(draws.frequencies))
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
@@ -243,7 +204,7 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
         orders: Orders s.
         degree: Lowest degree of the triangle rules in use.
     """
-    terms = max(map(term_count, surfaces))
+    terms = max(kind_of(surface).term_count for surface in surfaces)
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
     return draw(lattice, orders, degree, draw_count(terms), seed)
 
@@ -267,23 +228,17 @@ def probe_block(
     if draws is None:
         draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice))
     draws = draws.within(block)
-    probe = measure(draws, values[draws.places(block)], Sample.of(surface, draws).exact)
+    probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws).exact)
+    change = settings.plan(surface, lattice).change
     # Once for the whole field.
-    if isinstance(surface, Smooth) and block.start == lattice.half.start:
-        change = resolution_of(surface, lattice.highest_frequency, settings.tolerance).change
+    if change and block.start == lattice.half.start:
         return join([probe, uniform_probe(lattice, change * surface.area)])
     return probe
 
 
-@singledispatch
 def needs_probe(surface: Surface, settings: TransformSettings) -> bool:
     """Tell whether a field computed with these settings can differ noticeably from the exact transform."""
-    return True
-
-
-@needs_probe.register
-def _(surface: Sphere, settings: TransformSettings) -> bool:
-    return settings.dtype == "complex64"
+    return not kind_of(surface).is_closed_form or settings.dtype == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:

@@ -52,7 +52,7 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     if others.size:
         with ThreadPoolExecutor(threads) as pool:
             for _, batch in mesh.batches(_PAIRS):
-                others += np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.of(batch)), parts)))
+                others += np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.from_mesh(batch)), parts)))
     values[~fine] = others
     return values
 
@@ -76,7 +76,7 @@ class _Triangles:
     after: Reals
 
     @classmethod
-    def of(cls, mesh: Mesh) -> _Triangles:
+    def from_mesh(cls, mesh: Mesh) -> _Triangles:
         corners = np.ascontiguousarray(mesh.triangles.T)
         a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
         return cls(np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), b - a, c - b)

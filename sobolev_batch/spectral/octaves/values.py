@@ -10,16 +10,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
-from sobolev_batch.spectral.errors.probe import exact_transform_of, norms_of_checks, term_count
-from sobolev_batch.spectral.exact.sampled import sampled_transform
+from sobolev_batch.spectral.errors.probe import norms_of_checks
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
@@ -90,7 +88,7 @@ def settings_for(target: ErrorTarget, dtype: ComplexDtype | None = None) -> Sett
     """Return a function that gives the cheapest settings for a target; the dtype may be given."""
 
     def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
-        if isinstance(surface, Sphere):
+        if kind_of(surface).is_closed_form:
             return TransformSettings(dtype=dtype or "complex128")
         cheapest: ComplexDtype = "complex64" if permits_single(surface, lattice, target) else "complex128"
         return choose_settings(surface, lattice, target, TransformSettings(dtype=dtype or cheapest))
@@ -145,17 +143,12 @@ def octave_values(
 
 def check_count(surface: Surface) -> int:
     """Return the number of comparisons on each lattice: fewer where each costs more; none for closed forms."""
-    if isinstance(surface, Sphere):
-        return 0
-    return int(np.clip(_PAIRS // term_count(surface), _FEWEST_CHECKS, _MOST_CHECKS))
+    kind = kind_of(surface)
+    return 0 if kind.is_closed_form else int(np.clip(_PAIRS // kind.term_count, _FEWEST_CHECKS, _MOST_CHECKS))
 
 
 def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:
-    return (
-        sampled_transform(surface, frequencies, execution.threads)
-        if isinstance(surface, Mesh)
-        else exact_transform_of(surface, frequencies)
-    )
+    return kind_of(surface).sampled_values(frequencies, execution.threads)
 
 
 def _compared(

@@ -129,7 +129,7 @@ class RuleAssignment:
     codes: NDArray[np.uint16] | None = None
 
     @classmethod
-    def of(cls, mesh: Mesh, highest_frequency: float, tolerance: float, quadrature: Quadrature) -> RuleAssignment:
+    def for_mesh(cls, mesh: Mesh, highest_frequency: float, tolerance: float, quadrature: Quadrature) -> RuleAssignment:
         """Return the rules that keep a tolerance up to a frequency, or those that the method prescribes."""
         triangles = len(mesh.triangles)
         fixed = quadrature.fixed_rule
@@ -177,7 +177,7 @@ class Faces:
     areas: Array
 
     @classmethod
-    def of(cls, mesh: Mesh, backend: Backend) -> Faces:
+    def uploaded(cls, mesh: Mesh, backend: Backend) -> Faces:
         """Return the arrays of a mesh, uploaded."""
         return cls(*map(backend.upload, (mesh.vertices, mesh.triangles, mesh.areas)))
 

@@ -11,8 +11,8 @@ from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.lattice import FrequencyLattice
+from sobolev_batch.spectral.quadrature.kinds import QuadraturePlan, kind_of
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature
-from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.memory import DEFAULT_BATCH
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -64,7 +64,7 @@ class TransformSettings:
 
     def plan(self, surface: Surface, lattice: FrequencyLattice) -> QuadraturePlan:
         """Return the quadrature plan of a surface for a lattice."""
-        return QuadraturePlan.of(surface, lattice.highest_frequency, self.tolerance, self.quadrature)
+        return kind_of(surface).plan(lattice.highest_frequency, self.tolerance, self.quadrature)
 
     def lowest_degree(self, surface: Surface, lattice: FrequencyLattice) -> int:
         """Return the lowest degree among the rules of a surface: see `QuadraturePlan.lowest_degree`."""

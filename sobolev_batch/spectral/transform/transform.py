@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from dataclasses import dataclass, replace
-from functools import lru_cache, singledispatch
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,15 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
 from sobolev_batch.spectral.backends.backends import CPU, CPU_COSTS, Backend, Gpu, NufftSpec
-from sobolev_batch.spectral.exact.spheres import sphere_block
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
-from sobolev_batch.spectral.quadrature.plan import QuadraturePlan, unknown_surface
+from sobolev_batch.spectral.quadrature.kinds import QuadraturePlan, SurfaceKind, kind_of
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 # Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
 # computed again instead of being compared with new ones.
@@ -80,9 +77,25 @@ def transform_block(
         InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
             the surface is of an unknown kind.
     """
-    if isinstance(lattice, Lattice) and isinstance(surface, Mesh | Smooth | Sphere):
+    kind = kind_of(surface)
+    if isinstance(lattice, Lattice):
         require_inside(surface, lattice)
-    return _transform(surface, _Target(lattice, block, settings, execution, plan))
+    if kind.is_closed_form:
+        return Transformed(_closed_form(kind, lattice, block, settings.dtype), 0, "closed form")
+    low, high = surface.bounds
+    fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
+    task = _QuadratureTransform(plan or settings.plan(surface, lattice), lattice, block, settings, execution, fill)
+    # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
+    batching = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
+    failure = ""
+    if isinstance(execution.backend, Gpu):
+        transformed = task.on_gpu(execution.backend)
+        if isinstance(transformed, Transformed):
+            return transformed
+        library = execution.backend.library
+        _log.warning("%s: %s; the processor computes it instead", library, transformed)
+        failure = f" after {library}: {transformed}"
+    return task.compute(CPU, batching, failure)
 
 
 def projected_bytes(
@@ -105,49 +118,6 @@ def projected_bytes(
     if execution.allowed_bytes is not None:
         needed = min(needed, execution.allowed_bytes)
     return block.size * whole.spec.item_bytes + math.ceil(needed)
-
-
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """The arguments of `transform_block`, without the surface."""
-
-    lattice: FrequencyLattice
-    block: Block
-    settings: TransformSettings
-    execution: Execution
-    plan: QuadraturePlan | None
-
-
-@singledispatch
-def _transform(surface: object, target: _Target) -> Transformed:
-    raise unknown_surface(surface)
-
-
-@_transform.register
-def _(surface: Sphere, target: _Target) -> Transformed:
-    values = _closed_form(surface, target.lattice, target.block, target.settings.dtype)
-    return Transformed(values, 0, "closed form")
-
-
-@_transform.register(Mesh)
-@_transform.register(Smooth)
-def _(surface: Mesh | Smooth, target: _Target) -> Transformed:
-    lattice, execution = target.lattice, target.execution
-    plan = target.plan or target.settings.plan(surface, lattice)
-    low, high = surface.bounds
-    fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
-    task = _QuadratureTransform(plan, lattice, target.block, target.settings, execution, fill)
-    # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
-    batching = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
-    failure = ""
-    if isinstance(execution.backend, Gpu):
-        transformed = task.on_gpu(execution.backend)
-        if isinstance(transformed, Transformed):
-            return transformed
-        library = execution.backend.library
-        _log.warning("%s: %s; the processor computes it instead", library, transformed)
-        failure = f" after {library}: {transformed}"
-    return task.compute(CPU, batching, failure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,13 +191,13 @@ class _QuadratureTransform:
         return _OUT_OF_MEMORY
 
 
-def _closed_form(sphere: Sphere, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
+def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
     values: Complexes = np.empty(block.shape, dtype=dtype)
     step = max(1, _SAMPLES // math.prod(block.shape[1:]))
     for first in range(0, block.shape[0], step):
         count = min(step, block.shape[0] - first)
         slab = Block((block.start[0] + first, *block.start[1:]), (count, *block.shape[1:]))
-        values[first : first + count] = sphere_block(sphere, lattice, slab)
+        values[first : first + count] = kind.block_values(lattice, slab)
     return values
 
 

@@ -79,6 +79,8 @@ MeshLike = (
     | Open3dTensorMesh
 )
 SurfaceLike = Surface | MeshLike
+# A further kind has a class in `spectral/quadrature/kinds` too.
+SURFACE_KINDS = (Mesh, Sphere, Smooth)
 
 _EXPECTED = (
     "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh, PyVista, meshio or "
@@ -129,7 +131,7 @@ def as_surface(surface: SurfaceLike) -> Surface:
         InputError: It is no surface of a known kind.
         MeshError: See `as_mesh`.
     """
-    if isinstance(surface, Sphere | Smooth):
+    if isinstance(surface, SURFACE_KINDS):
         return surface
     return _converted(surface, f"{_EXPECTED}, {_SURFACES} or a Fourier field")
 

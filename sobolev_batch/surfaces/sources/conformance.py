@@ -15,10 +15,9 @@ from unittest import mock
 from pydantic import ValidationError
 
 from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.formats.objects import SURFACE_KINDS
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 from sobolev_batch.surfaces.sources.names import duplicate_names, label_problem, quoted
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member, Source
 
@@ -184,7 +183,7 @@ def _checked_identity(member: Member, report: _Report) -> object:
         "in load()",
     )
     surface = member.load()
-    if not isinstance(surface, Mesh | Sphere | Smooth):
+    if not isinstance(surface, SURFACE_KINDS):
         report.problems.append(
             f"{label} makes a {type(surface).__name__}, expected a Mesh, Sphere, Ellipsoid, Torus or "
             "ParametrisedSurface"

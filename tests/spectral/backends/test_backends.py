@@ -57,7 +57,7 @@ def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, toleranc
 
 
 def rules_in_use(mesh: Mesh, settings: TransformSettings) -> set[str]:
-    assignment = RuleAssignment.of(mesh, LATTICE.highest_frequency, settings.tolerance, settings.quadrature)
+    assignment = RuleAssignment.for_mesh(mesh, LATTICE.highest_frequency, settings.tolerance, settings.quadrature)
     kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
     return {"split" if use.splits else kinds.get(use.rule, "interior") for use in assignment.uses}
 

@@ -9,14 +9,9 @@ import pytest
 import trimesh
 
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.errors.a_priori import (
-    ErrorTarget,
-    SizeHistogram,
-    choose_settings,
-    loosest_tolerance,
-    permits_single,
-)
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
 from sobolev_batch.spectral.fields import field_for
+from sobolev_batch.spectral.quadrature.prediction import SizeHistogram
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
@@ -75,7 +70,7 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
         settings = TransformSettings(1e-13, tolerance=tolerance)
         transformed = transform_block(mesh, lattice, lattice.half, settings)
         true = norm(exact.copy(data=transformed.values - exact.values), orders)["norm"].values
-        forecast = SizeHistogram.of(mesh).quadrature_error(lattice, orders, tolerance)
+        forecast = SizeHistogram.from_mesh(mesh).quadrature_error(lattice, orders, tolerance)
         assert (forecast > 0.5 * true).all()
         assert (forecast < 15 * true).all()
 
@@ -83,7 +78,7 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
 def test_a_stricter_goal_never_loosens_the_rules() -> None:
     mesh = MESHES["drawn"]
     targets = [ErrorTarget((-3.0,), (value,)) for value in np.geomspace(1e-1, 1e-12, 12)]
-    tolerances = [loosest_tolerance(mesh, LATTICE, target) for target in targets]
+    tolerances = [choose_settings(mesh, LATTICE, target, TransformSettings()).tolerance for target in targets]
     assert tolerances == sorted(tolerances, reverse=True)
     assert targets[0].tightened(10.0).norms == pytest.approx([1e-2])
 

@@ -17,7 +17,6 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.errors.probe import Sample, draw, draws_for, estimate, measure, needs_probe
 from sobolev_batch.spectral.fields import PROBED_ORDERS
 from sobolev_batch.spectral.shells import SobolevWeights
@@ -32,7 +31,7 @@ ORDERS = (-2.0, -5.0)
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [icosphere(3), Sphere(0.9), Ellipsoid((0.9, 0.7, 0.5))])
 def test_norms_are_estimated_from_a_few_frequencies(surface: Surface) -> None:
-    samples = [Sample.of(surface, draw(LATTICE, ORDERS, 2, 32, seed)) for seed in range(20)]
+    samples = [Sample.from_surface(surface, draw(LATTICE, ORDERS, 2, 32, seed)) for seed in range(20)]
     squares = np.mean([estimate([sample], ORDERS) ** 2 for sample in samples], axis=0)
     expected = norm(surface, ORDERS, lattice=LATTICE)["norm"].values
     assert np.sqrt(squares) == pytest.approx(expected, rel=0.15)
@@ -66,8 +65,5 @@ def test_closed_forms_need_a_probe_in_single_precision_alone() -> None:
 
 
 def test_unknown_kinds_of_surfaces_are_refused_with_the_known_ones() -> None:
-    draws = draws_for([Sphere()], LATTICE, ORDERS, 2)
-    with pytest.raises(InputError, match=r"exact transform are Mesh, Smooth, Sphere; found Lattice"):
-        Sample.of(LATTICE, draws)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"for meshes and parametrised surfaces, found Sphere"):
-        choose_settings(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-3,)), TransformSettings())
+    with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised surface .*, found Lattice"):
+        Sample.from_surface(LATTICE, draws_for([Sphere()], LATTICE, ORDERS, 2))  # type: ignore[arg-type]

@@ -24,8 +24,8 @@ from sobolev_batch import (
 )
 from sobolev_batch.spectral.backends.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
-from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.memory import Batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -117,7 +117,7 @@ def test_its_integral_against_the_difference_is_the_squared_distance(other: Mesh
     a, b = (fourier_transform(surface, lattice, 1e-14) for surface in (mesh, other))
     total = np.zeros(len(ORDERS))
     for surface, sign in ((mesh, 1.0), (other, -1.0)):
-        for batch in QuadraturePlan.of(surface, lattice.highest_frequency, 1e-14).batches(1 << 20):
+        for batch in kind_of(surface).plan(lattice.highest_frequency, 1e-14).batches(1 << 20):
             values = witness(a, b, ORDERS, batch.coordinates.T, eps=1e-14).values
             total += sign * values @ batch.weights
     assert total == pytest.approx(distance(a, b, ORDERS)["distance"].values ** 2, rel=1e-10)
@@ -130,7 +130,7 @@ def test_is_the_difference_smoothed_by_the_matern_kernel() -> None:
     points = np.random.default_rng(7).uniform(-1, 1, (9, 3))
     expected = np.zeros(len(points))
     for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in QuadraturePlan.of(mesh, 1.0, 1e-9, Quadrature(22)).batches(1 << 20):
+        for batch in kind_of(mesh).plan(1.0, 1e-9, Quadrature(22)).batches(1 << 20):
             r = np.linalg.norm(points[:, None] - batch.coordinates.T, axis=2)
             kernel = 2 * np.pi**power / gamma(power) * r ** (power - 1.5) * kv(1.5 - power, 2 * np.pi * r)
             expected += sign * kernel @ batch.weights

@@ -28,7 +28,7 @@ from sobolev_batch import (
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.exact.spheres import sphere_transform
-from sobolev_batch.spectral.quadrature import plan as quadrature_plan
+from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolution_of
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
@@ -250,7 +250,7 @@ def test_the_error_of_the_nufft_is_reported(surface: Smooth, eps: float) -> None
 def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SMOOTH[1]
     exact = fourier_transform(surface, LATTICE, 1e-14, threads=1)
-    monkeypatch.setattr(quadrature_plan, "resolution_of", lambda *_: Resolution((91, 25), 0.0, True))
+    monkeypatch.setattr(kinds, "resolution_of", lambda *_: Resolution((91, 25), 0.0, True))
     field = fourier_transform(surface, LATTICE, 1e-12, threads=1)
     orders = [-2.0, -5.0]
     truth = distance(field, exact, orders)["distance"].values

@@ -10,8 +10,8 @@ import pytest
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, Torus, fourier_transform, icosphere
 from sobolev_batch.spectral.fields import compute_field
 from sobolev_batch.spectral.quadrature import meshes
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
-from sobolev_batch.spectral.quadrature.plan import QuadraturePlan
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -20,7 +20,7 @@ from tests.support.shapes import CENTRED_BOX as BOX
 @pytest.mark.parametrize("method", ["auto", "gauss8", 1, 7, 50])
 @pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
 def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
-    batches = list(QuadraturePlan.of(BOX, 8.0, 1e-10, Quadrature(method)).batches(capacity))
+    batches = list(kind_of(BOX).plan(8.0, 1e-10, Quadrature(method)).batches(capacity))
     assert max(len(batch.weights) for batch in batches) <= capacity
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
@@ -33,14 +33,14 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
 
 
 def test_batches_are_nearly_equal() -> None:
-    plan = QuadraturePlan.of(icosphere(5), 8.66, 1e-9)
+    plan = kind_of(icosphere(5)).plan(8.66, 1e-9)
     sizes = [len(batch.weights) for batch in plan.batches(200_000)]
     assert len(sizes) == 3
     assert max(sizes) < 1.4 * min(sizes)
 
 
 def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
-    batches = QuadraturePlan.of(mesh, 8.66, tolerance, Quadrature(method)).batches(1 << 22)
+    batches = kind_of(mesh).plan(8.66, tolerance, Quadrature(method)).batches(1 << 22)
     return sum(len(batch.weights) for batch in batches) / len(mesh.triangles)
 
 
@@ -56,20 +56,20 @@ def test_small_triangles_get_few_points() -> None:
 @pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
 @pytest.mark.parametrize("method", ["auto", 7])
 def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
-    plan = QuadraturePlan.of(surface, 8.66, 1e-2, Quadrature(method))
+    plan = kind_of(surface).plan(8.66, 1e-2, Quadrature(method))
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
     assert plan.size.expected == pytest.approx(count, rel=0.05)
     assert count <= plan.size.largest
 
 
 def test_a_closed_form_has_no_points() -> None:
-    plan = QuadraturePlan.of(Sphere(), 8.66, 1e-9)
+    plan = kind_of(Sphere()).plan(8.66, 1e-9)
     assert (plan.size, plan.lowest_degree, list(plan.batches(1 << 20))) == ((0.0, 0), 0, [])
 
 
 def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> None:
     with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised surface .*, found str"):
-        QuadraturePlan.of("torus.ply", 8.66, 1e-9)  # type: ignore[arg-type]
+        kind_of("torus.ply")
     with pytest.raises(InputError, match=r"expected a Mesh, .*; found dict"):
         fourier_transform({}, Lattice(1.0, 4))  # type: ignore[arg-type]
 
@@ -77,13 +77,13 @@ def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> No
 def test_the_rules_of_a_field_are_chosen_once(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, lattice = icosphere(4), Lattice(5.0, 32)
     calls: list[int] = []
-    choose = RuleAssignment.of
+    choose = RuleAssignment.for_mesh
 
     def counted(*arguments: Any) -> RuleAssignment:
         calls.append(1)
         return choose(*arguments)
 
-    monkeypatch.setattr(RuleAssignment, "of", counted)
+    monkeypatch.setattr(RuleAssignment, "for_mesh", counted)
     # Little memory: the points are counted, then made, and the probe asks for the lowest degree.
     compute_field(mesh, lattice, TransformSettings(), [-2.0], Execution(allowed_bytes=1.2e7))
     assert len(calls) == 1
@@ -92,9 +92,9 @@ def test_the_rules_of_a_field_are_chosen_once(monkeypatch: pytest.MonkeyPatch) -
 def test_a_plan_holds_two_bytes_for_each_triangle(monkeypatch: pytest.MonkeyPatch) -> None:
     sphere = icosphere(5)
     mesh = Mesh(sphere.vertices * np.where(sphere.vertices[:, 2:] > 0.2, 1.0, 0.02), sphere.triangles)
-    whole = RuleAssignment.of(mesh, 8.66, 1e-9, Quadrature())
+    whole = RuleAssignment.for_mesh(mesh, 8.66, 1e-9, Quadrature())
     monkeypatch.setattr(meshes, "_TRIANGLES", 1000)
-    assignment = RuleAssignment.of(mesh, 8.66, 1e-9, Quadrature())
+    assignment = RuleAssignment.for_mesh(mesh, 8.66, 1e-9, Quadrature())
     assert assignment.uses == whole.uses
     assert assignment.codes is not None
     assert whole.codes is not None

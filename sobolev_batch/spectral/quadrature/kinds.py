@@ -1,0 +1,302 @@
+"""The kinds of surfaces, and what transforms need of each: quadrature points, exact values, and how both are chosen.
+
+A further kind of surface is one more class here.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.backends.backends import CPU, Backend
+from sobolev_batch.spectral.exact.sampled import sampled_transform
+from sobolev_batch.spectral.exact.spheres import sphere_block, sphere_transform
+from sobolev_batch.spectral.exact.triangles import exact_transform
+from sobolev_batch.spectral.lattice import Block, FrequencyLattice
+from sobolev_batch.spectral.quadrature.meshes import AUTO, Faces, Quadrature, RuleAssignment, WeightedPoints
+from sobolev_batch.spectral.quadrature.prediction import loosest_tolerance, weight_masses
+from sobolev_batch.spectral.quadrature.smooth import Resolution, exact_values, resolution_of
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.smooth.smooth import Smooth
+
+# Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
+_NODES = 1 << 14
+# The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of the
+# degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that showed most of it.
+_SMOOTH_DEGREE = 16
+
+
+class PointCount(NamedTuple):
+    """Number of points: the expected one, and a bound before shared points are merged."""
+
+    expected: float
+    largest: int
+
+
+class QuadraturePlan(ABC):
+    """Points that stand for a surface up to a frequency: chosen when first asked for, made batch by batch."""
+
+    @property
+    @abstractmethod
+    def size(self) -> PointCount:
+        """Number of points."""
+
+    @property
+    @abstractmethod
+    def lowest_degree(self) -> int:
+        """Lowest degree among the rules, whose error shows first; 0 for a closed form."""
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles."""
+        return 0
+
+    @property
+    def change(self) -> float:
+        """Change of values when nodes are doubled, over the area, where exact values come from such nodes too."""
+        return 0.0
+
+    @abstractmethod
+    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
+        """Yield the points in batches, which are nearly equal for a mesh.
+
+        Args:
+            capacity: Largest number of points of a batch; at least 8 times that of the largest rule (3,624).
+            backend: Backend to make the points on.
+
+        Raises:
+            InputError: A parametrised surface whose quadrature does not converge.
+        """
+
+
+class _ClosedFormPlan(QuadraturePlan):
+    """Plan of a surface whose transform has a closed form: no points."""
+
+    size = PointCount(0.0, 0)
+    lowest_degree = 0
+
+    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
+        yield from ()
+
+
+@dataclass(frozen=True, eq=False)
+class _MeshPlan(QuadraturePlan):
+    """Plan of a mesh, which holds two bytes for each triangle."""
+
+    mesh: Mesh
+    highest_frequency: float
+    tolerance: float
+    quadrature: Quadrature
+
+    @cached_property
+    def assignment(self) -> RuleAssignment:
+        """Rules of the triangles."""
+        return RuleAssignment.for_mesh(self.mesh, self.highest_frequency, self.tolerance, self.quadrature)
+
+    @property
+    def size(self) -> PointCount:
+        uses = self.assignment.uses
+        return PointCount(sum((use.expected_points for use in uses), 0.0), sum(use.largest_points for use in uses))
+
+    @property
+    def lowest_degree(self) -> int:
+        return min(use.rule.degree for use in self.assignment.uses)
+
+    @property
+    def triangles(self) -> int:
+        return len(self.mesh.triangles)
+
+    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
+        # Nodes are merged within a batch of triangles: these are large where nodes are shared.
+        triangles = [
+            batch
+            for whole in self.assignment.batches()
+            for batch in whole.split(capacity // (2 if whole.rule.sharing > 1 else 8))
+        ]
+        ends = np.cumsum([batch.largest_points for batch in triangles])
+        total = int(ends[-1])
+        count = -(-total // (capacity - max(batch.largest_points for batch in triangles)))
+        # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
+        # number by at most one batch of triangles.
+        numbers = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
+        faces = Faces.uploaded(self.mesh, backend)
+        for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
+            yield WeightedPoints.concatenated([batch.points(faces, backend) for _, batch in group])
+
+
+@dataclass(frozen=True, eq=False)
+class _SmoothPlan(QuadraturePlan):
+    """Plan of a parametrised surface."""
+
+    surface: Smooth
+    highest_frequency: float
+    tolerance: float
+
+    lowest_degree = _SMOOTH_DEGREE
+
+    @property
+    def resolution(self) -> Resolution:
+        """Nodes along both parameters, and the change of the transform when they are doubled."""
+        return resolution_of(self.surface, self.highest_frequency, self.tolerance)
+
+    @property
+    def size(self) -> PointCount:
+        return PointCount(float(self.resolution.size), self.resolution.size)
+
+    @property
+    def change(self) -> float:
+        return self.resolution.change
+
+    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
+        gathered: list[WeightedPoints] = []
+        count = 0
+        for coordinates, weights in self.surface.nodes(self.resolution.counts, min(capacity, _NODES)):
+            if count + len(weights) > capacity:
+                yield WeightedPoints.concatenated(gathered)
+                gathered, count = [], 0
+            gathered.append(WeightedPoints(backend.upload(coordinates), backend.upload(weights)))
+            count += len(weights)
+        yield WeightedPoints.concatenated(gathered)
+
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# A parametrised surface has at least so many nodes.
+_FEWEST_NODES = 500
+
+
+class SurfaceKind(ABC):
+    """A surface as transforms see it; `kind_of` makes it."""
+
+    @property
+    def is_closed_form(self) -> bool:
+        """True if the transform is a formula at every frequency."""
+        return False
+
+    @property
+    def term_count(self) -> int:
+        """Number of terms that an exact value adds up, where they grow with the surface; else 1."""
+        return 1
+
+    @property
+    def fewest_points(self) -> int:
+        """Number of quadrature points at least, among which the errors of a NUFFT spread."""
+        return 1
+
+    @abstractmethod
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
+        """Return the plan of the quadrature points.
+
+        Args:
+            highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
+            tolerance: Largest quadrature error at any such frequency, relative to the area. Only "auto" and
+                parametrised surfaces observe it.
+            quadrature: Method to choose the rules of triangles.
+        """
+
+    @abstractmethod
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        """Return the exact transform at frequencies (P, 3), complex128 (P,)."""
+
+    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
+        """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
+        return self.exact_values(frequencies)
+
+    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
+        """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
+        raise TypeError(f"{type(self).__name__} has no closed form")
+
+    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
+        """Return the largest tolerance of a plan whose error is predicted to have at most some norms (orders,)."""
+        raise TypeError(f"{type(self).__name__} has no quadrature")
+
+
+@dataclass(frozen=True, eq=False)
+class _Triangles(SurfaceKind):
+    mesh: Mesh
+
+    @property
+    def term_count(self) -> int:
+        return len(self.mesh.triangles)
+
+    @property
+    def fewest_points(self) -> int:
+        return len(self.mesh.triangles)
+
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
+        return _MeshPlan(self.mesh, highest_frequency, tolerance, quadrature)
+
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        return exact_transform(self.mesh, frequencies)
+
+    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
+        return sampled_transform(self.mesh, frequencies, threads)
+
+    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
+        return loosest_tolerance(self.mesh, lattice, orders, norms)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parametrised(SurfaceKind):
+    surface: Smooth
+
+    @property
+    def fewest_points(self) -> int:
+        return _FEWEST_NODES
+
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
+        return _SmoothPlan(self.surface, highest_frequency, tolerance)
+
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        return exact_values(self.surface, frequencies)
+
+    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
+        # The tolerance bounds the error at every single frequency: assume it at all of them.
+        return float(np.min(norms / (self.surface.area * np.sqrt(weight_masses(lattice, orders)))))
+
+
+@dataclass(frozen=True, eq=False)
+class _ClosedForm(SurfaceKind):
+    sphere: Sphere
+
+    @property
+    def is_closed_form(self) -> bool:
+        return True
+
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
+        return _ClosedFormPlan()
+
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        return sphere_transform(self.sphere, frequencies)
+
+    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
+        return sphere_block(self.sphere, lattice, block)
+
+
+_KINDS: Mapping[type, Callable[[Any], SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}
+
+
+def kind_of(surface: object) -> SurfaceKind:
+    """Return a surface as transforms see it.
+
+    Raises:
+        InputError: It is no surface of a known kind.
+    """
+    for surface_type, kind in _KINDS.items():
+        if isinstance(surface, surface_type):
+            return kind(surface)
+    raise InputError(
+        "a surface must be a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), "
+        f"found {type(surface).__name__}"
+    )
