@@ -53,10 +53,10 @@ from .results.report.build import report as report
 from .results.status import Status as Status
 from .results.status import status as status
 from .results.store_accessor import StoreAccessor as StoreAccessor
+from .results.tables.convergence import smallest_below as smallest_below
 from .results.tables.convergence import table as table
 from .results.tables.evolution import evolution as evolution
 from .results.tables.matrix import matrix as matrix
-from .results.tables.smallest import smallest_below as smallest_below
 from .spectral.fields import fourier_transform as fourier_transform
 from .spectral.lattice import Lattice as Lattice
 from .spectral.metrics.norms import distance as distance

@@ -163,12 +163,12 @@ class _Steps:
 
 def _text(closeness: Closeness, scale: float) -> str:
     """Return the numbers on one line, lengths in the files' unit."""
-    from sobolev_batch.results.tables.formatting import Digits
+    from sobolev_batch.results.tables.formatting import percent, with_error
 
     if not math.isfinite(closeness.distance):
         return "not measured"
-    relative = Digits.percent(closeness.relative, closeness.relative_error).together
-    parts = [f"differs by {relative}, distance {Digits.of(closeness.distance, closeness.error).together}"]
+    relative = percent(closeness.relative, closeness.relative_error)
+    parts = [f"differs by {relative}, distance {with_error(closeness.distance, closeness.error)}"]
     if math.isfinite(closeness.hausdorff):
         parts.append(f"Hausdorff ≥ {closeness.hausdorff / scale:.3g}")
         parts.append(f"Chamfer {closeness.chamfer / scale:.3g}")

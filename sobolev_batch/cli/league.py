@@ -9,7 +9,7 @@ import click
 from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.options import format_option, location, orders_option, store_argument
 from sobolev_batch.cli.output import echo_lines
-from sobolev_batch.results.tables.defaults import Format
+from sobolev_batch.results.tables.formatting import Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location

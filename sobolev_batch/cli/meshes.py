@@ -123,7 +123,7 @@ def compare_command(
 
 def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> None:
     """Print a sentence for each order, what is as far away if that was measured, and then the numbers."""
-    from sobolev_batch.results.tables.sentences import answer, likeness
+    from sobolev_batch.results.tables.formatting import answer, likeness
 
     by_order = [results.sel(order=order) for order in results["order"].values]
     for sentence in dict.fromkeys(answer(name, reference, result, area_change) for result in by_order):
@@ -140,12 +140,12 @@ def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: 
 
 def _details(result: xr.Dataset, rtol: float | None) -> str:
     """Return the distance of one order and the parts of its error, on one line."""
-    from sobolev_batch.results.tables.formatting import Digits
+    from sobolev_batch.results.tables.formatting import with_error
 
     names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
     parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
     remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
-    distance_text = Digits.of(result["distance"].item(), result["error"].item()).together
+    distance_text = with_error(result["distance"].item(), result["error"].item())
     return f"order {result['order'].item():g}: distance {distance_text} ({parts}){remark}"
 
 

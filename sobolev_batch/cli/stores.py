@@ -23,7 +23,7 @@ from sobolev_batch.cli.options import (
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.reporter import ProgressLine
 from sobolev_batch.errors import SobolevBatchError, StoreError
-from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
+from sobolev_batch.results.tables.formatting import Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -160,7 +160,7 @@ def release_command(store: Location, force: bool) -> None:
 @click.option(
     "--factor",
     type=click.FloatRange(min=1.0, min_open=True),
-    help=f"Say for --over-time when the distance has grown by this factor. [default: {REMESHING_FACTOR:g}]",
+    help="Say for --over-time when the distance has grown by this factor. [default: 2]",
 )
 def table_command(
     store: Location,
@@ -184,10 +184,9 @@ def table_command(
             raise click.UsageError(f"{name} belongs to --over-time")
     from sobolev_batch.batch.collection_store import CollectionStore
     from sobolev_batch.results.open import open_store
-    from sobolev_batch.results.tables.convergence import format_table, format_tables
-    from sobolev_batch.results.tables.evolution import format_evolution
+    from sobolev_batch.results.tables.convergence import format_smallest, format_table, format_tables
+    from sobolev_batch.results.tables.evolution import REMESHING_FACTOR, format_evolution
     from sobolev_batch.results.tables.matrix import format_matrix
-    from sobolev_batch.results.tables.smallest import format_smallest
 
     chosen = orders or None
     collection = CollectionStore.found(store)
@@ -262,7 +261,7 @@ def plot_command(
     from sobolev_batch.results.figures.witness_plots import write_witness_plots
     from sobolev_batch.results.league.league import league
     from sobolev_batch.results.open import fields_read
-    from sobolev_batch.results.tables.sizes import EDGE_LENGTH
+    from sobolev_batch.results.tables.groups import EDGE_LENGTH
 
     written_as = Output(formats or ("png",), None if size is None else parse_size(size))
     _require_folder(output)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from sobolev_batch.html import table_html
 from sobolev_batch.machine import available, available_cores
-from sobolev_batch.results.tables.formatting import Digits, rounded_outwards
+from sobolev_batch.results.tables.formatting import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.shells import single_order
@@ -86,7 +86,7 @@ class Verdict:
     def _number(self) -> str:
         """The distance with its error, or its bounds where these are far apart."""
         if self.error <= _WIDEST * self.distance:
-            return Digits.of(self.distance, self.error).together
+            return with_error(self.distance, self.error)
         lower, upper = rounded_outwards(self.lower, self.upper)
         return f"at most {upper}" if self.outcome == "same" else f"from {lower} to {upper}"
 

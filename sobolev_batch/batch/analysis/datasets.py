@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.batch.analysis.ordering import TableOrder
 from sobolev_batch.batch.store.records import Facts, Record
@@ -17,33 +17,10 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
 from sobolev_batch.spectral.metrics.norms import Proportion
-from sobolev_batch.surfaces.sources.registry import Metadata
 
 Reals = NDArray[np.float64]
-
-
-class AnyMember(Protocol):
-    """Member, as tables of distances know it."""
-
-    @property
-    def time(self) -> float | None:
-        """Time of the surface; None without one."""
-
-    @property
-    def metadata(self) -> Metadata:
-        """Numbers and texts that the user knows of it."""
-
-
-class AnyRow(Protocol):
-    """Row, as tables of distances know it: `Row` of a plan, or a row of a stored table."""
-
-    @property
-    def label(self) -> str:
-        """Label of the mesh."""
-
-    @property
-    def member(self) -> AnyMember:
-        """Member that makes the mesh."""
+# Labels, times and other metadata of meshes, as xarray takes coordinates.
+Coordinates = Mapping[Any, Any]
 
 
 def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None], order: TableOrder) -> xr.Dataset:
@@ -75,16 +52,16 @@ def meshes_dataset(rows: Sequence[Row], records: Sequence[Record | None], order:
     return describe(xr.Dataset(variables, coords=_meshes(rows), attrs={"metadata": list(_metadata(rows))}))
 
 
-def norms_dataset(rows: Sequence[Row], orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
+def norms_dataset(meshes: Coordinates, orders: Sequence[float], norms: NormEstimate) -> xr.Dataset:
     """Return `norm` (mesh, order) with its error, from values over (orders, meshes)."""
-    return describe(xr.Dataset(_variables(norms.named("norm"), "mesh"), coords=_coordinates(rows, orders)))
+    return describe(xr.Dataset(_variables(norms.named("norm"), "mesh"), coords=_with_orders(meshes, orders)))
 
 
 def distances_dataset(
-    rows: Sequence[AnyRow], others: Sequence[AnyRow], orders: Sequence[float], distances: NormEstimate
+    meshes: Coordinates, others: ArrayLike, orders: Sequence[float], distances: NormEstimate
 ) -> xr.Dataset:
     """Return `distance` (mesh, other, order) with its error, from values over (orders, meshes, others)."""
-    coordinates = {**_coordinates(rows, orders), "other": ("other", _strings([row.label for row in others]))}
+    coordinates = {**_with_orders(meshes, orders), "other": ("other", np.array(others, dtype=object))}
     return describe(xr.Dataset(_variables(distances.named("distance"), "mesh", "other"), coords=coordinates))
 
 
@@ -106,7 +83,7 @@ class DistancesToReference:
 
 
 def convergence_dataset(
-    rows: Sequence[AnyRow],
+    meshes: Coordinates,
     orders: Sequence[float],
     to_reference: DistancesToReference,
     sizes: Reals,
@@ -116,7 +93,7 @@ def convergence_dataset(
     """Return distances to the reference, relative ones and their decomposition, and observed orders of convergence.
 
     Args:
-        rows: Rows of the meshes.
+        meshes: Labels of the meshes, with their times and other metadata: the coordinates of `meshes_dataset`.
         orders: Sobolev orders s.
         to_reference: Distances to the reference.
         sizes: Mean edge lengths (meshes,).
@@ -125,9 +102,10 @@ def convergence_dataset(
     """
     reference, proportion = to_reference.reference, to_reference.proportion
     distances, errors = to_reference.distances.values, to_reference.distances.errors
+    labels = xr.Dataset(coords=meshes)["mesh"].values
     rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
     for family in families:
-        members = [i for i in family if rows[i].label != reference]
+        members = [i for i in family if labels[i] != reference]
         for k in range(len(orders)):
             rates[k, members], rate_errors[k, members] = observed_rates(
                 distances[k, members], errors[k, members], sizes[members]
@@ -148,7 +126,7 @@ def convergence_dataset(
     }
     dataset = xr.Dataset(
         {**_variables(columns, "mesh"), "edge_length": ("mesh", sizes)},
-        coords=_coordinates(rows, orders),
+        coords=_with_orders(meshes, orders),
         attrs={"reference": reference, **({} if accuracy is None else {"rtol": accuracy.rtol})},
     )
     return describe(dataset)
@@ -159,11 +137,11 @@ def _variables(values: Mapping[str, NDArray[Any]], *dimensions: str) -> dict[str
     return {name: ((*dimensions, "order"), np.moveaxis(array, 0, -1)) for name, array in values.items()}
 
 
-def _coordinates(rows: Sequence[AnyRow], orders: Sequence[float]) -> dict[str, tuple[str, NDArray[np.generic]]]:
-    return {**_meshes(rows), "order": ("order", np.array(orders, dtype=np.float64))}
+def _with_orders(meshes: Coordinates, orders: Sequence[float]) -> dict[str, Any]:
+    return {**meshes, "order": ("order", np.array(orders, dtype=np.float64))}
 
 
-def _meshes(rows: Sequence[AnyRow]) -> dict[str, tuple[str, NDArray[np.generic]]]:
+def _meshes(rows: Sequence[Row]) -> Coordinates:
     """Return labels, and times and other metadata where any mesh has some."""
     coordinates = {"mesh": _strings([row.label for row in rows]), **_metadata(rows)}
     times = [row.member.time for row in rows]
@@ -172,7 +150,7 @@ def _meshes(rows: Sequence[AnyRow]) -> dict[str, tuple[str, NDArray[np.generic]]
     return {name: ("mesh", values) for name, values in coordinates.items()}
 
 
-def _metadata(rows: Sequence[AnyRow]) -> dict[str, NDArray[np.generic]]:
+def _metadata(rows: Sequence[Row]) -> dict[str, NDArray[np.generic]]:
     """Return the metadata of meshes by name: numbers with NaN, or texts with empty ones, where a mesh has none."""
     given = [dict(row.member.metadata) for row in rows]
     columns: dict[str, NDArray[np.generic]] = {}

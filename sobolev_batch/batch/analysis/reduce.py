@@ -203,7 +203,6 @@ def _write_tables(workspace: Workspace, results: Results) -> None:
     shown = list(order.rows)
     rows = [workspace.rows[i] for i in shown]
     is_every_pair = plan.study.pairs == "all"
-    others = rows if is_every_pair else [workspace.rows[reference]]
     distances = results.distances[..., shown, :][..., shown if is_every_pair else [0]]
     meshes = meshes_dataset(rows, [workspace.records[i] for i in shown], order)
     to_reference = DistancesToReference(
@@ -213,14 +212,17 @@ def _write_tables(workspace: Workspace, results: Results) -> None:
         NormEstimate(*results.norms[..., reference]),
     )
     sizes, families = meshes["edge_length_mean"].to_numpy(), order.families_with_rates(workspace.rows)
-    convergence = convergence_dataset(rows, orders, to_reference, sizes, families.values(), plan.study.accuracy)
+    convergence = convergence_dataset(
+        meshes.coords, orders, to_reference, sizes, families.values(), plan.study.accuracy
+    )
     tables = Tables(store)
     replaced = tables.invalidate()
     store.write_qualities([record.quality if record else "" for record in workspace.records])
     tables.write("meshes", meshes, instead_of=replaced)
-    norms = norms_dataset(rows, orders, NormEstimate(*results.norms[..., shown]))
+    norms = norms_dataset(meshes.coords, orders, NormEstimate(*results.norms[..., shown]))
     tables.write("norms", norms, instead_of=replaced)
-    pairs = distances_dataset(rows, others, orders, NormEstimate(*distances))
+    others = [row.label for row in (rows if is_every_pair else [workspace.rows[reference]])]
+    pairs = distances_dataset(meshes.coords, others, orders, NormEstimate(*distances))
     tables.write("distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are stored.
     tables.write("convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)

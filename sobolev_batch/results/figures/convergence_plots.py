@@ -24,8 +24,7 @@ from sobolev_batch.results.figures.style import (
 from sobolev_batch.results.league.league import League
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
-from sobolev_batch.results.tables.groups import finished_group, has_times
-from sobolev_batch.results.tables.sizes import is_sequence, label_of, sizes_of
+from sobolev_batch.results.tables.groups import finished_group, has_times, is_sequence, label_of, sizes_of
 
 _HEIGHT_INCHES = 3.6
 _MOST_NAMED = 3

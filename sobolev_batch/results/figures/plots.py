@@ -26,8 +26,7 @@ from sobolev_batch.results.figures.spectrum_plots import (
 from sobolev_batch.results.figures.style import Output, Plot, notes_of
 from sobolev_batch.results.league.league import League
 from sobolev_batch.results.open import AnyStore, fields_read
-from sobolev_batch.results.tables.groups import Families
-from sobolev_batch.results.tables.sizes import EDGE_LENGTH
+from sobolev_batch.results.tables.groups import EDGE_LENGTH, Families
 
 
 def _orders(selection: Selection) -> Sequence[float]:

@@ -16,6 +16,7 @@ from sobolev_batch.results.figures.style import Style, style_of
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.results.tables.groups import (
+    EDGE_LENGTH,
     Families,
     chosen_families,
     chosen_orders,
@@ -24,7 +25,6 @@ from sobolev_batch.results.tables.groups import (
     finished_group,
     reference_of,
 )
-from sobolev_batch.results.tables.sizes import EDGE_LENGTH
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.shells import Orders
 

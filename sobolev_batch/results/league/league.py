@@ -28,8 +28,7 @@ from sobolev_batch.results.league.statistics import (
 )
 from sobolev_batch.results.open import AnyStore, as_tree
 from sobolev_batch.results.tables.convergence import table, tables_of
-from sobolev_batch.results.tables.groups import finished_group, reference_of
-from sobolev_batch.results.tables.sizes import EDGE_LENGTH
+from sobolev_batch.results.tables.groups import EDGE_LENGTH, finished_group, reference_of
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.shells import Orders
 from sobolev_batch.surfaces.sources.names import quoted

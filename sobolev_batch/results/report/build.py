@@ -22,9 +22,15 @@ from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.meshes.views import Axis, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, location_of, require_unchanged
-from sobolev_batch.results.report.charts import chart_data, chart_omissions, league_data
-from sobolev_batch.results.report.limits import ReportLimits
-from sobolev_batch.results.report.pictures import league_pictures, study_pictures, unpictured
+from sobolev_batch.results.report.charts import (
+    chart_data,
+    chart_omissions,
+    league_data,
+    league_pictures,
+    study_pictures,
+    unpictured,
+)
+from sobolev_batch.results.report.elements import ReportLimits, utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.visible import visible
 
@@ -165,7 +171,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     from sobolev_batch.results.report.content import Content
 
     tree = as_tree(store)
-    content = Content.of(tree, Status.of(store), limits)
+    content = Content.from_tree(tree, Status.of(store), limits)
     selection = Selection.from_store(tree, most_spectra=limits.spectra)
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
@@ -180,7 +186,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
 def _collection_page(collection: CollectionStore, limits: ReportLimits) -> Page:
     from sobolev_batch.results.report.collection import CollectionContent
 
-    content = CollectionContent.of(collection, Status.of_collection(collection), limits)
+    content = CollectionContent.from_store(collection, Status.of_collection(collection), limits)
     charts = league_data(content.leagues, content.name, content.orders)
     return Page(_filled("league", content, charts, pictures=league_pictures(content.leagues)), content.omissions)
 
@@ -190,8 +196,6 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
     import jinja2
     import plotly.offline
     from jinja2.utils import htmlsafe_json_dumps
-
-    from sobolev_batch.results.report.content import utc_text
 
     # Two thirds of a page, if the browser were not to unpack it.
     library = plotly.offline.get_plotlyjs()

@@ -2,60 +2,53 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pandas as pd
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.league.league import League, leagues_of
+from sobolev_batch.results.league.league import League, Scores, leagues_of
 from sobolev_batch.results.league.text import (
+    LEAGUE_COLUMNS,
     LEAGUE_NOTE,
-    interval_text,
+    PAIR_COLUMNS,
     left_out,
     number_text,
     pair_lines,
     percent_text,
 )
 from sobolev_batch.results.open import open_store
-from sobolev_batch.results.report.cells import Body, Cell, Heading, PageTable, TableRow
-from sobolev_batch.results.report.content import large_count, run_facts, source_text, study_text
-from sobolev_batch.results.report.limits import ReportLimits
+from sobolev_batch.results.report.elements import (
+    PageTable,
+    ReportLimits,
+    Row,
+    large_count,
+    reasons_table,
+    run_facts,
+    source_text,
+    study_text,
+)
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import tables_of
-from sobolev_batch.results.tables.formatting import Digits, duration, minus
+from sobolev_batch.results.tables.formatting import duration, minus, percent
+from sobolev_batch.results.tables.text import Column
 
-_LEAGUE_HEADINGS = (
-    Heading("method", "method", "label"),
-    Heading("relative", "relative"),
-    Heading("95 % interval", "low", second="high"),
-    Heading("rank", "rank", second="last_rank"),
-    Heading("rate", "rate"),
-    Heading("95 % interval", "rate_low", second="rate_high"),
-    Heading("objects", "objects"),
+_OBJECT_COLUMNS = (
+    Column("object", "object", kind="label"),
+    Column("best", "best method", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("next", "next", kind="text"),
+    Column("ratio", "times as far", number_text, is_marked=True),
+    Column("meshes", "meshes", "{:,}".format),
+    Column("missing", "missing", "{:,}".format),
+    Column("above_rtol", "above rtol", "{:,}".format),
 )
-_PAIR_HEADINGS = (
-    Heading("method", "method", "label"),
-    Heading("other", "other", "text"),
-    Heading("ratio", "ratio"),
-    Heading("95 % interval", "low", second="high"),
-    Heading("p", "p"),
-    Heading("nearer", "nearer", "text"),
-)
-_OBJECT_HEADINGS = (
-    Heading("object", "object", "label"),
-    Heading("best method", "best", "text"),
-    Heading("relative", "relative", second="relative_error"),
-    Heading("next", "next", "text"),
-    Heading("times as far", "ratio"),
-    Heading("meshes", "meshes"),
-    Heading("missing", "missing"),
-    Heading("above rtol", "above_rtol"),
-)
+# The relative distance comes first: a narrow screen shows no more without scrolling.
+_LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
 
 _NO_LEAGUE = "Methods cannot be compared over the objects."
 # Methods that a sentence names.
@@ -109,7 +102,7 @@ class CollectionContent:
     omissions: tuple[str, ...]
 
     @classmethod
-    def of(cls, collection: CollectionStore, status: Status, limits: ReportLimits) -> Self:
+    def from_store(cls, collection: CollectionStore, status: Status, limits: ReportLimits) -> Self:
         """Return the content for the store of a collection.
 
         Raises:
@@ -121,8 +114,9 @@ class CollectionContent:
         except InputError as error:
             leagues, no_league = (), str(error)
         orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
-        objects = tuple(Body(_object_rows(tables, s, _at(leagues, s)), s) for s in orders)
-        pairs = tuple(Body(_pair_rows(one), one.order) for one in leagues)
+        objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
+        at_orders = [league.order for league in leagues]
+        ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
         shown, failures = limits.reasons, status.failed
         return cls(
             title=collection.title,
@@ -133,11 +127,11 @@ class CollectionContent:
             differences=tuple(tuple(pair_lines(one)) for one in leagues),
             note=LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
             orders=tuple(minus(f"{s:g}") for s in orders),
-            league=PageTable("league", _LEAGUE_HEADINGS, tuple(Body(_league_rows(one), one.order) for one in leagues)),
-            pairs=PageTable("pairs", _PAIR_HEADINGS, pairs) if any(body.rows for body in pairs) else None,
-            objects=PageTable("objects", _OBJECT_HEADINGS, objects),
-            failed=PageTable.of_reasons("failed", "mesh", dict(list(failures.items())[:shown])),
-            not_compared=PageTable.of_reasons("lacking", "mesh", dict(list(status.not_compared.items())[:shown])),
+            league=PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
+            pairs=PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
+            objects=PageTable("objects", _OBJECT_COLUMNS, objects, orders),
+            failed=reasons_table("failed", "mesh", dict(list(failures.items())[:shown])),
+            not_compared=reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:shown])),
             summary=dict(_summary(tables, orders)),
             settings=dict(_settings(collection.table)),
             run=dict(run_facts(status)),
@@ -170,86 +164,52 @@ def sentence_of(league: League) -> str:
     return f"The intervals do not separate {names} {over} {at_order}. {first} has the smallest mean, {amount}."
 
 
-def _league_rows(league: League) -> tuple[TableRow, ...]:
-    return tuple(
-        TableRow(
-            row.method,
-            (
-                Cell.of_number(row.relative, percent_text(row.relative)),
-                _interval(row.low, row.high, interval_text(row.low, row.high, percent_text)),
-                _ranks(row.rank, row.last_rank),
-                Cell.of_number(row.rate, number_text(row.rate)),
-                _interval(row.rate_low, row.rate_high, interval_text(row.rate_low, row.rate_high, number_text)),
-                Cell.of_count(row.objects),
-            ),
-            league.scores.methods.index(row.method),
-        )
-        for row in league.table.itertuples()
-    )
+def _rows(league: League, name: Literal["table", "pairs"]) -> list[Row]:
+    """Return the rows of a table of a league, with the colours of the methods."""
+    frame: pd.DataFrame = getattr(league, name)
+    colors = frame["method"].map(league.scores.methods.index)
+    return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
 
 
-def _pair_rows(league: League) -> tuple[TableRow, ...]:
-    return tuple(
-        TableRow(
-            row.method,
-            (
-                Cell.of_text(row.other),
-                Cell.of_number(row.ratio, number_text(row.ratio)),
-                _interval(row.low, row.high, interval_text(row.low, row.high, number_text)),
-                Cell.of_number(row.p, f"{row.p:.2g}"),
-                Cell.of_text(row.nearer),
-            ),
-            league.scores.methods.index(row.method),
-        )
-        for row in league.pairs.itertuples()
-    )
-
-
-def _ranks(first: int, last: int) -> Cell:
-    return Cell(f"{first}" if first == last else f"{first}–{last}", first, second=last)
-
-
-def _interval(low: float, high: float, text: str) -> Cell:
-    """Return the cell of an interval, of which an end may be infinite."""
-    return Cell("") if math.isnan(low) else Cell(text, low, second=high)
-
-
-def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> tuple[TableRow, ...]:
-    """Return the objects with their best methods at one order."""
-    rows = []
+def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[Row]:
+    """Yield the objects with their best methods at one order."""
     for name, frame in tables.items():
         meshes = frame[frame["order"] == order]
         known = meshes[meshes["distance"].notna()]
-        counts = (
-            Cell.of_count(len(known)),
-            Cell.of_count(len(meshes) - len(known)),
-            Cell.of_count(int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())),
-        )
+        row = {
+            "order": order,
+            "object": name,
+            "meshes": len(known),
+            "missing": len(meshes) - len(known),
+            "above_rtol": int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum()),
+        }
         if league is None or name not in league.scores.objects:
             reason = league.scores.left_out.get(name, "no distances") if league else "methods cannot be compared"
-            rows.append(TableRow(name, (Cell(f"left out: {reason}"),)))
+            yield {**row, "absent": f"left out: {reason}"}
         else:
-            rows.append(TableRow(name, (*_best_cells(league, league.scores.objects.index(name)), *counts)))
-    return tuple(rows)
+            yield {**row, **_best(league.scores, league.scores.objects.index(name))}
 
 
-def _best_cells(league: League, number: int) -> tuple[Cell, ...]:
-    """Return the cells of the best method of an object, and of the next one."""
-    scores = league.scores
+def _best(scores: Scores, number: int) -> Row:
+    """Return the best method of an object, and the next one."""
     values, errors = scores.values[number], scores.errors[number]
     first, *others = np.argsort(values, kind="stable").tolist()
     relative = float(np.exp(values[first]))
-    error = relative * float(np.expm1(errors[first]))
-    best = (
-        Cell.of_text(scores.methods[first]),
-        Cell.of_number(relative, Digits.percent(relative, error).together, second=error),
-    )
+    row = {
+        "best": scores.methods[first],
+        "relative": relative,
+        "relative_error": relative * float(np.expm1(errors[first])),
+    }
     if not others:
-        return (*best, Cell(""), Cell(""))
-    second, ratio = others[0], float(np.exp(values[others[0]] - values[first]))
+        return {**row, "next": "", "ratio": None}
+    second = others[0]
     is_open = values[second] - errors[second] < values[first] + errors[first]
-    mark = "within errors" if is_open else ""
-    return (*best, Cell.of_text(scores.methods[second]), Cell.of_number(ratio, number_text(ratio), mark))
+    return {
+        **row,
+        "next": scores.methods[second],
+        "ratio": float(np.exp(values[second] - values[first])),
+        "mark": "within errors" if is_open else "",
+    }
 
 
 def _summary(tables: Mapping[str, pd.DataFrame], orders: Sequence[float]) -> Iterator[tuple[str, str]]:

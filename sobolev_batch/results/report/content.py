@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import tomli_w
 import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
-from sobolev_batch.results.report.cells import Body, Cell, Heading, PageTable, TableRow
-from sobolev_batch.results.report.limits import ReportLimits
+from sobolev_batch.results.report.elements import (
+    PageTable,
+    ReportLimits,
+    large_count,
+    reasons_table,
+    run_facts,
+    source_text,
+    study_text,
+    utc_text,
+)
 from sobolev_batch.results.report.verdict import StudyVerdict
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import ERRORS, Column, shown_columns, shown_rows, table
-from sobolev_batch.results.tables.doubts import doubts_of
+from sobolev_batch.results.tables.convergence import page_columns, table, with_remarks
 from sobolev_batch.results.tables.formatting import duration, minus
-from sobolev_batch.results.tables.groups import finished_group, has_proximity
+from sobolev_batch.results.tables.groups import finished_group, has_proximity, placement_doubts
+from sobolev_batch.results.tables.text import Column
 from sobolev_batch.spectral.lattice import Lattice
-
-_LONGEST_VALUE = 300
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Content:
     study_text: str
 
     @classmethod
-    def of(cls, tree: xr.DataTree, status: Status, limits: ReportLimits) -> Content:
+    def from_tree(cls, tree: xr.DataTree, status: Status, limits: ReportLimits) -> Content:
         """Return the content for an open store.
 
         Raises:
@@ -87,12 +91,12 @@ class Content:
             settings=dict(_settings(attributes, meshes)),
             summary=dict(_summary(meshes, convergence, orders)),
             orders=orders,
-            verdict=StudyVerdict.of(frame, failed),
+            verdict=StudyVerdict.from_table(frame, failed),
             convergence=convergence_table(tree, frame, families, limits.convergence_rows // len(orders)),
             meshes=_meshes_table(meshes, families, limits.mesh_rows),
-            failed=PageTable.of_reasons("failed", "mesh", failed),
-            not_compared=PageTable.of_reasons("lacking", "mesh", status.not_compared),
-            doubtful=PageTable.of_reasons("doubtful", "mesh", doubts_of(tree)),
+            failed=reasons_table("failed", "mesh", failed),
+            not_compared=reasons_table("lacking", "mesh", status.not_compared),
+            doubtful=reasons_table("doubtful", "mesh", placement_doubts(tree)),
             rtol=convergence.attrs.get("rtol"),
             has_proximity=has_proximity(tree),
             run=dict(run_facts(status)),
@@ -108,94 +112,42 @@ class Content:
         return (*cut, *([f"verdict: only {self.verdict.omitted} are shown"] if self.verdict.omitted else []))
 
 
-def utc_text(time: str) -> str:
-    """Return a time of a record, in UTC, for people."""
-    return time.replace("T", " ").removesuffix("Z")
-
-
-def study_text(table: Mapping[str, Any]) -> str:
-    """Return the study file of a study, without its comments and layout."""
-    return tomli_w.dumps(_without_nulls(table))
-
-
-def _without_nulls(value: Any) -> Any:
-    """TOML has no null; keys without a value are left out."""
-    if isinstance(value, Mapping):
-        return {key: _without_nulls(entry) for key, entry in value.items() if entry is not None}
-    return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
-
-
 def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:
     """Return the convergence table of an open store, from the rows of `table`, with so many of each order."""
-    # The relative distance comes first: a narrow screen shows no more without scrolling.
-    columns = sorted(shown_columns(tree), key=lambda column: not column.is_marked)
-    headings = (
-        Heading("mesh", "mesh", "label"),
-        *(Heading(column.header, column.name, second=ERRORS.get(column.name, "")) for column in columns),
+    orders, most = frame["order"].drop_duplicates().tolist(), max(1, most)
+    longest = int(frame.groupby("order").size().max())
+    rows = with_remarks(frame).groupby("order", sort=False).head(most)
+    rows = rows.assign(color=rows["family"].map(families.index), reasons="failed")
+    return PageTable(
+        "convergence", page_columns(tree), rows.to_dict(orient="records"), orders, omitted=max(0, longest - most)
     )
-    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
-    most = max(1, most)
-    bodies = tuple(
-        Body(tuple(_convergence_row(row, columns, families) for row in shown_rows(rows[:most])), order)
-        for order, rows in groups
-    )
-    longest = max(len(rows) for _, rows in groups)
-    return PageTable("convergence", headings, bodies, omitted=max(0, longest - most))
 
 
-def _convergence_row(row: Mapping[str, Any], columns: Sequence[Column], families: Sequence[str]) -> TableRow:
-    family = families.index(row["family"])
-    if row["status"] != "complete":
-        return TableRow(row["mesh"], (Cell(row["status"]),), family, reasons="failed")
-    cells = (
-        Cell.of_number(
-            row[column.name],
-            column.cell(row),
-            row["mark"].page if column.is_marked else "",
-            row.get(ERRORS.get(column.name, ""), math.nan),
-        )
-        for column in columns
-    )
-    return TableRow(row["mesh"], tuple(cells), family)
+_COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
+_MESH_COLUMNS = (
+    Column("mesh", "mesh", kind="label"),
+    Column("vertices", "vertices", "{:,}".format),
+    Column("triangles", "triangles", "{:,}".format),
+    Column("seconds", "seconds", "{:.2f}".format),
+    Column("backend", "backend", kind="text"),
+    Column("area", "area", "{:.4g}".format),
+    Column("boundary_edges", "boundary edges", "{:,}".format),
+    Column("nonmanifold_edges", "non-manifold", "{:,}".format),
+    Column("points", "quadrature points", "{:,}".format),
+    Column("worker", "worker", kind="text"),
+    Column("finished", "finished, UTC", kind="text"),
+)
 
 
 def _meshes_table(meshes: xr.Dataset, families: Sequence[str], most: int) -> PageTable:
-    headings = (
-        Heading("mesh", "mesh", "label"),
-        Heading("vertices", "vertices"),
-        Heading("triangles", "triangles"),
-        Heading("seconds", "seconds"),
-        Heading("backend", "backend", "text"),
-        Heading("area", "area"),
-        Heading("boundary edges", "boundary_edges"),
-        Heading("non-manifold", "nonmanifold_edges"),
-        Heading("quadrature points", "points"),
-        Heading("worker", "worker", "text"),
-        Heading("finished, UTC", "finished", "text"),
-    )
     frame = meshes.reset_coords().to_dataframe().reset_index()
-    rows = tuple(_mesh_row(row, families) for row in frame[:most].to_dict(orient="records"))
-    return PageTable("meshes", headings, (Body(rows),), omitted=len(frame) - len(rows))
-
-
-def _mesh_row(row: Mapping[str, Any], families: Sequence[str]) -> TableRow:
-    counts = {
-        name: Cell.of_count(row[name]) if row["triangles"] > 0 else Cell("")
-        for name in ("vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges")
-    }
-    cells = (
-        counts["vertices"],
-        counts["triangles"],
-        Cell.of_number(row["seconds"], f"{row['seconds']:.2f}"),
-        Cell.of_text(row["backend"]),
-        Cell.of_number(row["area"]),
-        counts["boundary_edges"],
-        counts["nonmanifold_edges"],
-        counts["points"],
-        Cell.of_text(row["worker"]),
-        Cell.of_text(utc_text(row["finished"])),
+    # Surfaces in closed form have no counts.
+    rows = frame[:most].assign(
+        **{name: frame[name].astype(object).where(frame["triangles"] > 0, None) for name in _COUNTS},
+        color=frame["family"].map(families.index),
+        finished=frame["finished"].map(utc_text),
     )
-    return TableRow(row["mesh"], cells, families.index(row["family"]))
+    return PageTable("meshes", _MESH_COLUMNS, rows.to_dict(orient="records"), omitted=len(frame) - len(rows))
 
 
 def _failures(meshes: xr.Dataset) -> dict[str, str]:
@@ -213,14 +165,6 @@ def _summary(meshes: xr.Dataset, convergence: xr.Dataset, orders: tuple[str, ...
     yield "orders" if len(orders) > 1 else "order", ", ".join(orders) if len(orders) < 5 else f"{len(orders)}"
     yield "triangles in all", large_count(int(meshes["triangles"].values.sum()))
     yield "computing time", duration(float(np.nansum(meshes["seconds"].values)))
-
-
-def large_count(count: int) -> str:
-    """Return a count in words where it is large."""
-    for size, unit in ((1e9, "billion"), (1e6, "million")):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count:,}"
 
 
 def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[str, str]]:
@@ -263,31 +207,3 @@ def _similarity_text(similarity: Mapping[str, Any]) -> str:
         return "none: lengths are in the meshes' own unit"
     point = ", ".join(f"{x:.6g}" for x in origin)
     return minus(f"x ↦ {scale:.6g} (x - ({point})): one unit of length is {1 / scale:.6g} of the meshes' own")
-
-
-def source_text(entry: Mapping[str, Any]) -> str:
-    """Return a source and its parameters on one line."""
-    parameters = [f"{key} {_value_text(value)}" for key, value in entry.items() if key not in ("name", "source")]
-    text = ", ".join([str(entry.get("source", "")), *parameters])
-    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
-
-
-def _value_text(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"({source_text(value)})"
-    if isinstance(value, list):
-        return ", ".join(map(_value_text, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def run_facts(status: Status) -> Iterator[tuple[str, str]]:
-    """Yield facts about the latest run, by keyword."""
-    yield "store", status.store
-    yield "surfaces", f"{status.complete} of {status.total} complete, {len(status.failed)} failed"
-    if status.run is not None:
-        yield "state", status.run.state
-        yield "driver", status.run.driver
-        yield "begun", utc_text(status.run.started)
-        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", utc_text(status.run.seen)
-        if status.run.error:
-            yield "error", status.run.error

@@ -9,10 +9,10 @@ from typing import Any, Self
 import pandas as pd
 
 from sobolev_batch.results.figures.selection import spread
-from sobolev_batch.results.report.cells import Body, Cell, Heading, PageTable, TableRow
-from sobolev_batch.results.tables.convergence import nearest
-from sobolev_batch.results.tables.formatting import Digits, minus
-from sobolev_batch.results.tables.smallest import smallest_of
+from sobolev_batch.results.report.elements import PageTable, Row
+from sobolev_batch.results.tables.convergence import nearest, smallest_of
+from sobolev_batch.results.tables.formatting import count, minus, percent
+from sobolev_batch.results.tables.text import Column
 
 _BOUNDS = (0.05, 0.01)
 # Meshes whose numbers of triangles differ by no more than this factor are of one size.
@@ -22,12 +22,12 @@ _MOST_SIZES = 8
 _MOST_FAMILIES = 6
 _MOST_NAMED = 3
 
-_HEADINGS = (
-    Heading("verdict", "verdict", "label"),
-    Heading("mesh", "mesh", "text"),
-    Heading("relative", "relative", second="relative_error"),
-    Heading("triangles", "triangles"),
-    Heading("remark", "remark", "text"),
+_COLUMNS = (
+    Column("verdict", "verdict", kind="label"),
+    Column("mesh", "mesh", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("triangles", "triangles", count),
+    Column("remark", "remark", kind="text"),
 )
 
 
@@ -46,7 +46,7 @@ class StudyVerdict:
     omitted: str
 
     @classmethod
-    def of(cls, frame: pd.DataFrame, failed: Mapping[str, str]) -> Self:
+    def from_table(cls, frame: pd.DataFrame, failed: Mapping[str, str]) -> Self:
         """Return the verdict on the rows of `table`.
 
         Args:
@@ -57,11 +57,12 @@ class StudyVerdict:
         sizes = _sizes(groups[0][1])
         shown_sizes = spread(sizes, _MOST_SIZES)
         sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
-        bodies = []
+        lines: list[Row] = []
         for order, rows in groups:
             at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
-            found = (*_nearest_rows(rows, at_sizes), *_smallest_rows(rows, sized[:_MOST_FAMILIES]))
-            bodies.append(Body((*found, *_short_rows(rows), *_missing_rows(failed)), order))
+            nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
+            of_order = (*nearest_rows, *smallest_rows, *_imprecise_rows(rows), *_missing_rows(failed))
+            lines += [{**line, "order": order} for line in of_order]
         omitted = [
             f"{shown} of {total} {things}"
             for shown, total, things in (
@@ -72,7 +73,7 @@ class StudyVerdict:
         ]
         return cls(
             tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups),
-            PageTable("verdict", _HEADINGS, tuple(bodies), is_sortable=False),
+            PageTable("verdict", _COLUMNS, lines, [order for order, _ in groups], is_sortable=False),
             " and ".join(omitted),
         )
 
@@ -80,18 +81,18 @@ class StudyVerdict:
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
     """Return a sentence on one order."""
     name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
-    found, count = nearest(rows), int(rows["distance"].notna().sum())
-    if count == 0:
+    closest, compared = nearest(rows), int(rows["distance"].notna().sum())
+    if compared == 0:
         return f"No mesh could be compared with {name}."
-    if found is None:
+    if closest is None:
         return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
-    best, rivals = found.mesh, found.rivals
+    best, rivals = closest.mesh, closest.rivals
     # On one line, in a sentence.
-    amount = Digits.percent(best["relative"], best["relative_error"]).together.replace(" ", "\N{NO-BREAK SPACE}")
+    amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
     doubt = f", and the errors leave open whether {rivals[0]} is nearer" if rivals else ""
-    if count == 1:
+    if compared == 1:
         return f"{best['mesh']} differs from {name} by {amount} {at_order}."
-    return f"Of {count:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
+    return f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
 
 
 def _sizes(rows: pd.DataFrame) -> list[list[str]]:
@@ -105,7 +106,7 @@ def _sizes(rows: pd.DataFrame) -> list[list[str]]:
     return [size["mesh"].tolist() for size in sizes if size["family"].nunique() > 1]
 
 
-def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[TableRow]:
+def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[Row]:
     """Yield the nearest mesh of all, and those of each size."""
     yield _nearest_row("nearest of all", rows)
     for members in at_sizes:
@@ -114,12 +115,12 @@ def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Itera
         yield _nearest_row(f"{counts} triangles", members)
 
 
-def _nearest_row(label: str, members: pd.DataFrame) -> TableRow:
-    found = nearest(members)
-    if found is None:
+def _nearest_row(label: str, members: pd.DataFrame) -> Row:
+    closest = nearest(members)
+    if closest is None:
         is_known = members["distance"].notna().any()
-        return TableRow(label, (Cell("no distance is above its error" if is_known else "no distance is known"),))
-    best, rivals = found.mesh, found.rivals
+        return _absent(label, "no distance is above its error" if is_known else "no distance is known")
+    best, rivals = closest.mesh, closest.rivals
     return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
 
 
@@ -133,7 +134,7 @@ def _lead(best: pd.Series, members: pd.DataFrame) -> str:
     return f"{ratio:.3g} times nearer than {second['mesh']}" if ratio < 100 else f"far nearer than {second['mesh']}"
 
 
-def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[TableRow]:
+def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]:
     """Yield the smallest mesh of each family below each bound."""
     for bound in _BOUNDS:
         frame = smallest_of(rows, bound)
@@ -143,32 +144,31 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Tabl
             if row["mesh"]:
                 yield _row(label, row, open_ones)
             else:
-                amount = Digits.percent(row["nearest_relative"], row["nearest_relative_error"]).together
+                amount = percent(row["nearest_relative"], row["nearest_relative_error"])
                 closest = f"{row['nearest']} has {amount}" if row["nearest"] else ""
-                yield TableRow(label, (Cell("; ".join(filter(None, ("none", closest, open_ones)))),))
+                yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
 
 
-def _short_rows(rows: pd.DataFrame) -> Iterator[TableRow]:
+def _imprecise_rows(rows: pd.DataFrame) -> Iterator[Row]:
     """Yield the meshes whose distances have larger errors than the study asks for."""
     short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
     if len(short):
-        yield TableRow("above rtol", (Cell(_names(short["mesh"].tolist())),))
+        yield _absent("above rtol", _names(short["mesh"].tolist()))
 
 
-def _missing_rows(failed: Mapping[str, str]) -> Iterator[TableRow]:
+def _missing_rows(failed: Mapping[str, str]) -> Iterator[Row]:
     if failed:
-        yield TableRow("missing", (Cell(_names(list(failed))),), reasons="failed")
+        yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
 
 
-def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> TableRow:
-    relative, error = float(mesh["relative"]), float(mesh["relative_error"])
-    cells = (
-        Cell.of_text(mesh["mesh"]),
-        Cell.of_number(relative, Digits.percent(relative, error).together, second=error),
-        Cell.of_count(int(mesh["triangles"])) if mesh["triangles"] > 0 else Cell(""),
-        Cell.of_text(remark),
-    )
-    return TableRow(label, cells)
+def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> Row:
+    numbers = {name: mesh[name] for name in ("mesh", "relative", "relative_error", "triangles")}
+    return {"verdict": label, **numbers, "remark": remark}
+
+
+def _absent(label: str, text: str) -> Row:
+    """Return a row with a text in place of numbers."""
+    return {"verdict": label, "absent": text}
 
 
 def _names(labels: Sequence[str]) -> str:

@@ -1,26 +1,35 @@
-"""Convergence tables: for each family and level, the distance to the reference and the observed rate."""
+"""Tables of distances to the reference, with observed rates; and the smallest mesh of each family near enough."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import fraction
 from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables.defaults import Format
-from sobolev_batch.results.tables.doubts import doubts_of
-from sobolev_batch.results.tables.formatting import Digits
-from sobolev_batch.results.tables.groups import finished_group, has_proximity, metadata_of
-from sobolev_batch.results.tables.orders import convergence_at, order_note
-from sobolev_batch.results.tables.sizes import with_rates
-from sobolev_batch.results.tables.text import machine_table, printed_table, prose
+from sobolev_batch.results.tables.formatting import Format, count, percent, with_error
+from sobolev_batch.results.tables.groups import (
+    EDGE_LENGTH,
+    convergence_at,
+    finished_group,
+    has_proximity,
+    is_sequence,
+    metadata_of,
+    order_note,
+    placement_doubts,
+    sizes_of,
+)
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, printed_table, prose
+from sobolev_batch.spectral.metrics.datasets import observed_rates
 from sobolev_batch.spectral.shells import Orders
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -60,13 +69,6 @@ The study asks for an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
 
 
-class Mark(NamedTuple):
-    """A remark about a distance, in a text table and on the page of a report."""
-
-    text: str = ""
-    page: str = ""
-
-
 @dataclass(frozen=True, eq=False)
 class Nearest:
     """The mesh that is nearest to the reference.
@@ -80,50 +82,40 @@ class Nearest:
     rivals: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of the text table and of the page of a report, beside the meshes; see `shown_rows` for its rows.
+_RELATIVE = ["relative", "relative_error"]
+_SMALLEST = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
+_SMALLEST_NOTE = """\
+A mesh is below the bound if its relative distance and the error of that are together.
+Meshes that are smaller, and that the errors leave open, are named as undecided."""
 
-    Attributes:
-        name: Number of a row that the column shows. Its cell is empty where that is NaN.
-        header: Header of the column.
-        template: Template of its cells.
-        is_marked: True where the mark of the distance follows the number.
-        group: Group of the store that has the number; the column is shown if the store has the group.
-    """
-
-    name: str
-    header: str
-    template: str
-    is_marked: bool = False
-    group: str = "convergence"
-
-    def cell(self, row: Mapping[str, Any]) -> str:
-        """Return the cell of a mesh that is complete, without its mark."""
-        return "" if math.isnan(row[self.name]) else self.template.format_map(row)
-
-    def text_cell(self, row: Mapping[str, Any]) -> str:
-        """Return the cell of a text table."""
-        if row["status"] != "complete":
-            return "missing"
-        return self.cell(row) + row["mark"].text if self.is_marked else self.cell(row)
-
-
+_UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
+_MESH = Column("mesh", "mesh", kind="label")
+_TRIANGLES = Column("triangles", "triangles", count)
 _COLUMNS = (
-    Column("triangles", "triangles", "{triangles:,}"),
-    Column("edge_length", "edge", "{edge_length:.4g}"),
-    Column("relative", "relative", "{digits[relative].together}", is_marked=True),
-    Column("distance", "distance", "{digits[distance].together}"),
-    Column("rate", "rate", "{digits[rate].together}"),
-    Column("area_fraction", "area", "{area_percent:.0f} %"),
-    Column("hausdorff", "Hausdorff ≥", "{hausdorff:.3g}", group="proximity"),
-    Column("chamfer", "Chamfer ± s.e.", "{digits[chamfer].together}", group="proximity"),
+    _MESH,
+    _TRIANGLES,
+    Column("edge_length", "edge", "{:.4g}".format),
+    Column("relative", "relative", percent, "relative_error", is_marked=True),
+    Column("distance", "distance", with_error, "error"),
+    Column("rate", "rate", with_error, "rate_error"),
+    Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
 )
-# Errors that cells show beside their numbers, by the names of both.
-ERRORS = {"distance": "error", "relative": "relative_error", "rate": "rate_error", "chamfer": "chamfer_error"}
+_PROXIMITY_COLUMNS = (
+    Column("hausdorff", "Hausdorff ≥", "{:.3g}".format),
+    Column("chamfer", "Chamfer ± s.e.", with_error, "chamfer_error"),
+)
+_SMALLEST_COLUMNS = (
+    Column("family", "family"),
+    _MESH,
+    _TRIANGLES,
+    Column("relative", "relative", percent, "relative_error"),
+    Column("remark", "remark"),
+)
+# Of distances, in texts.
+_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
 
 
-def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length") -> pd.DataFrame:
+def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> pd.DataFrame:
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
@@ -190,7 +182,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = "edge_length
     frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
-    return frame if x == "edge_length" else with_rates(frame, x)
+    return frame if x == EDGE_LENGTH else _with_rates(frame, x)
 
 
 def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -199,7 +191,7 @@ def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def tables_of(
-    stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = "edge_length"
+    stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
 ) -> dict[str, pd.DataFrame]:
     """Return the rows of `table` of each object that has any, by its name.
 
@@ -216,15 +208,14 @@ def tables_of(
 
 
 def format_table(
-    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, x: str = "edge_length"
+    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, x: str = EDGE_LENGTH
 ) -> str:
     """Return the convergence table of an open store as text; see `table`."""
     frame = table(tree, orders, x=x)
     if style in ("csv", "json"):
         return machine_table(frame, style)
-    return "\n\n".join(
-        [*_tables(tree, frame, style), prose(_notes(tree, frame, x), style), *_remarks(tree, frame, style)]
-    )
+    notes = [*_notes([tree], [frame], x), *_order_notes(tree, frame)]
+    return "\n\n".join([*_tables(tree, frame, style), prose(notes, style), *_remarks(tree, frame, style)])
 
 
 def format_tables(
@@ -238,8 +229,10 @@ def format_tables(
     sections: list[str] = []
     for name, frame in frames.items():
         tree = trees[name]
-        sections += [prose([f"Object {name}"], style), *_tables(tree, frame, style), *_remarks(tree, frame, style)]
-    return "\n\n".join([*sections, prose(_notes(tree, frame, x), style)])
+        sections += [prose([f"Object {name}"], style), *_tables(tree, frame, style)]
+        sections += filter(None, [prose(_order_notes(tree, frame), style), *_remarks(tree, frame, style)])
+    notes = _notes([trees[name] for name in frames], list(frames.values()), x)
+    return "\n\n".join([*sections, prose(notes, style)])
 
 
 def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
@@ -247,30 +240,37 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
     sections = []
     for order, rows in frame.groupby("order", sort=False):
         caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        sections.append(_section(caption, rows, "convergence", style, _nearest(rows)))
+        sections.append(_section(caption, rows, _COLUMNS, style, _nearest(rows)))
     if has_proximity(tree):
         once = frame[frame["order"] == frame["order"].iloc[0]]
-        sections.append(_section("Other distances, the same at all orders", once, "proximity", style))
+        sections.append(_section("Other distances, the same at all orders", once, (_MESH, *_PROXIMITY_COLUMNS), style))
     return sections
 
 
 def _remarks(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
     """Return what failed and what is doubtful, as one paragraph, or nothing."""
-    remarks = [*_failures(tree, frame), *(f"{mesh}: {doubt}" for mesh, doubt in doubts_of(tree).items())]
+    remarks = [*_failures(tree, frame), *(f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items())]
     return [prose(remarks, style)] if remarks else []
 
 
-def _section(caption: str, frame: pd.DataFrame, group: str, style: Format, sentence: str = "") -> str:
-    """Return a caption, the table of one order with the columns of a group, and a sentence."""
-    columns = [column for column in _COLUMNS if column.group == group]
-    headers = ["mesh", *(column.header for column in columns)]
-    cells = [[row["mesh"], *(column.text_cell(row) for column in columns)] for row in shown_rows(frame)]
+def _section(caption: str, frame: pd.DataFrame, columns: Sequence[Column], style: Format, sentence: str = "") -> str:
+    """Return a caption, the table of some columns of one order, and a sentence."""
+    cells = [
+        [row["mesh"], *(_cell(column, row) for column in columns[1:])]
+        for row in with_remarks(frame).to_dict(orient="records")
+    ]
     parts = [
         prose([caption], style),
-        printed_table(cells, headers, style),
+        printed_table(cells, [column.header for column in columns], style),
         prose([sentence] if sentence else [], style),
     ]
     return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
+def _cell(column: Column, row: Mapping[Any, Any]) -> str:
+    if row["absent"]:
+        return "missing"
+    return column.text(row) + (_MARKS[row["mark"]] if column.is_marked else "")
 
 
 def nearest(frame: pd.DataFrame) -> Nearest | None:
@@ -287,41 +287,44 @@ def nearest(frame: pd.DataFrame) -> Nearest | None:
 
 def _nearest(frame: pd.DataFrame) -> str:
     """Return a sentence about the mesh that is nearest to the reference at one order."""
-    found = nearest(frame)
-    if found is None:
+    closest = nearest(frame)
+    if closest is None:
         return ""
-    best, rivals = found.mesh, found.rivals
-    amount = Digits.percent(best["relative"], best["relative_error"]).together
+    best, rivals = closest.mesh, closest.rivals
+    amount = percent(best["relative"], best["relative_error"])
     doubt = f"; its errors leave open whether {rivals[0]} is nearer" if rivals else ""
     return f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."
 
 
-def shown_columns(tree: xr.DataTree) -> list[Column]:
-    """Return the columns of which an open store has the numbers."""
-    return [column for column in _COLUMNS if column.group in tree.children]
+def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
+    """Return the columns of which an open store has the numbers, for a page, which may be narrow."""
+    columns = [*_COLUMNS, *(_PROXIMITY_COLUMNS if has_proximity(tree) else ())]
+    return tuple(sorted(columns, key=lambda column: (column is not _MESH, not column.is_marked)))
 
 
-def shown_rows(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows of `table` with their marks, fractions of area and `Digits`, and NaN for no triangles."""
-    rows: list[dict[str, Any]] = frame.to_dict(orient="records")
-    for row in rows:
-        fraction = _area_fraction(row)
-        row.update(triangles=row["triangles"] or math.nan, area_fraction=fraction, area_percent=100 * fraction)
-        row["mark"] = _mark(row)
-        row["digits"] = {name: Digits.of(row[name], row[error]) for name, error in ERRORS.items() if name in row}
-        row["digits"]["relative"] = Digits.percent(row["relative"], row["relative_error"])
-    return rows
+def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of `table` with fractions of area, a mark of each distance, and why a mesh is absent."""
+    resolved, within = (frame[name].astype(bool) for name in ("resolved", "within"))
+    shares = (frame["area_part"] / frame["distance"].where(frame["distance"] > 0)) ** 2
+    return frame.assign(
+        area_fraction=shares.where(resolved),
+        mark=np.where(~resolved, "below its error", np.where(within, "", "above rtol")),
+        absent=frame["status"].where(frame["status"] != "complete", ""),
+    )
 
 
-def _notes(tree: xr.DataTree, frame: pd.DataFrame, x: str) -> list[str]:
-    notes = [*_NOTE.splitlines(), *([] if x == "edge_length" else [f"Rates are those of distance ~ ({x})^-rate."])]
-    if has_proximity(tree):
+def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
+    """Return what the numbers of all tables mean."""
+    notes = [*_NOTE.splitlines(), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
+    if any(map(has_proximity, trees)):
         notes += _PROXIMITY_NOTE.splitlines()
-    if "rtol" in frame.attrs:
-        notes += _ACCURACY_NOTE.format(rtol=frame.attrs["rtol"]).splitlines()
-    if "computed" in frame.attrs:
-        notes += order_note(tree, frame.attrs["computed"])
+    for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
+        notes += _ACCURACY_NOTE.format(rtol=rtol).splitlines()
     return notes
+
+
+def _order_notes(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+    return order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
 
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
@@ -333,13 +336,111 @@ def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     return failures
 
 
-def _area_fraction(row: dict[str, Any]) -> float:
-    """Return the fraction of the squared distance that a change of area explains, NaN if that is not resolved."""
-    has_fraction = row["resolved"] and row["distance"]
-    return (row["area_part"] / row["distance"]) ** 2 if has_fraction else math.nan
+def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
+    """Return rows of `table` with rates in another size, in place of those in the edge length.
+
+    Raises:
+        InputError: See `sizes_of`.
+    """
+    sizes = sizes_of(frame, x) if x == EDGE_LENGTH else 1 / sizes_of(frame, x)
+    rates, errors = np.full(len(frame), np.nan), np.full(len(frame), np.nan)
+    numbered = frame.reset_index(drop=True)
+    for _, rows in numbered.groupby(["order", "family"], sort=False):
+        if is_sequence(rows):
+            places = rows.index.to_numpy()
+            distances, bounds = rows["distance"].to_numpy(), rows["error"].to_numpy()
+            rates[places], errors[places] = observed_rates(distances, bounds, sizes[places])
+    return numbered.assign(rate=rates, rate_error=errors)
 
 
-def _mark(row: dict[str, Any]) -> Mark:
-    if not row["resolved"]:
-        return Mark("*", "below its error")
-    return Mark() if row["within"] else Mark("!", "above rtol")
+def smallest_below(store: AnyStore, relative: float | str, order: Orders | None = None) -> pd.DataFrame:
+    """Return the mesh with the fewest triangles in each family whose relative distance is certainly below a bound.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        relative: Bound on the relative distance with its error, such as 0.01 or "1%".
+        order: One of the store's orders, or several; default all.
+
+    Returns:
+        One row for each order and family with meshes of triangles: order, family, mesh (empty if none is below the
+        bound), its triangles, relative and relative_error (missing likewise); nearest (the mesh of the family with the
+        smallest distance), nearest_relative and nearest_relative_error; undecided (meshes with fewer triangles of
+        which the errors leave open whether they are below the bound, separated by commas). The frame's ``attrs`` have
+        the reference's label and the bound.
+
+    Raises:
+        InputError: The store has no tables yet, lacks an order, or has no meshes of triangles, or the bound is not
+            positive.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> frame = sb.smallest_below("storage/icosphere.zarr", "5%", order=-10)
+    >>> frame[["family", "mesh", "triangles"]].values.tolist()
+    [['icosphere', 'icosphere/2', 320]]
+    """
+    most = fraction(relative)
+    frame = table(as_tree(store), order)
+    if not (frame["triangles"] > 0).any():
+        raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
+    smallest = smallest_of(frame, most)
+    return smallest.assign(undecided=smallest["undecided"].map(", ".join))
+
+
+def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
+    """Return the smallest mesh of each family below a bound, of rows of `table`; see `smallest_below`.
+
+    The labels in `undecided` are tuples here. There are no rows for families without meshes of triangles.
+    """
+    with_triangles = frame[frame["triangles"] > 0]
+    rows = [
+        {"order": s, "family": family, **_smallest(members, most)}
+        for (s, family), members in with_triangles.groupby(["order", "family"], sort=False)
+    ]
+    smallest = pd.DataFrame(rows, columns=["order", "family", *_SMALLEST]).astype({"triangles": "Int64"})
+    smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
+    return smallest
+
+
+def format_smallest(
+    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
+) -> str:
+    """Return the smallest meshes below a bound as text; see `smallest_below`."""
+    frame = smallest_below(tree, below, orders)
+    if style in ("csv", "json"):
+        return machine_table(frame, style)
+    sections = []
+    for order, rows in frame.groupby("order", sort=False):
+        amount = f"{100 * frame.attrs['below']:g} %"
+        caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
+        cells = [
+            {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
+        ]
+        separator = "\n" if style == "latex" else "\n\n"
+        sections.append(separator.join([prose([caption], style), column_table(_SMALLEST_COLUMNS, cells, style)]))
+    return "\n\n".join([*sections, prose(_SMALLEST_NOTE.splitlines(), style)])
+
+
+def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
+    """Return the row of one family at one order."""
+    lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
+    below = members[highest < most].sort_values(["triangles", "relative"])
+    best = _UNKNOWN if below.empty else below.iloc[0]
+    # An unknown error leaves everything open.
+    is_open = members["relative"].notna() & ~(highest < most) & ~(lowest >= most)
+    is_fewer = True if below.empty else members["triangles"] < best["triangles"]
+    nearest = members.loc[members["relative"].idxmin()] if members["relative"].notna().any() else _UNKNOWN
+    return {
+        **{name: best[name] for name in ("mesh", "triangles", *_RELATIVE)},
+        "nearest": nearest["mesh"],
+        **{f"nearest_{name}": nearest[name] for name in _RELATIVE},
+        "undecided": tuple(members.loc[is_open & is_fewer, "mesh"]),
+    }
+
+
+def _remark(row: Mapping[Any, Any]) -> str:
+    """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
+    remarks = []
+    if not row["mesh"]:
+        nearest_text = f"nearest: {row['nearest']}, {percent(row['nearest_relative'], row['nearest_relative_error'])}"
+        remarks.append(nearest_text if row["nearest"] else "no distance is known")
+    return "; ".join([*remarks, *([f"undecided: {row['undecided']}"] if row["undecided"] else [])])

@@ -12,15 +12,15 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
 from sobolev_batch.results.store_accessor import StoreAccessor
-from sobolev_batch.results.tables.defaults import REMESHING_FACTOR, Format
-from sobolev_batch.results.tables.formatting import concise
-from sobolev_batch.results.tables.groups import complete_meshes, finished_group, reference_of
-from sobolev_batch.results.tables.orders import convergence_at
+from sobolev_batch.results.tables.formatting import Format, concise
+from sobolev_batch.results.tables.groups import complete_meshes, convergence_at, finished_group, reference_of
 from sobolev_batch.results.tables.text import machine_table, printed_table, prose
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import quoted
 
+# A mesh that is so many times as far away as at its first time is worth a new one.
+REMESHING_FACTOR = 2.0
 _NUMBERS = ("distance", "error", "relative", "relative_error")
 _NOTE = """\
 Digits in brackets are the error in units of the last digit. If a new mesh of as many

@@ -1,10 +1,18 @@
-"""Numbers and durations as people read them; a number has the digits that its error leaves it."""
+"""Numbers, durations and answers as people read them; a number has the digits that its error leaves it."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, get_args
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Formats of tables; commands list them without importing what makes tables.
+Format = Literal["text", "csv", "json", "markdown", "latex"]
+FORMATS: tuple[Format, ...] = get_args(Format)
 
 # More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7
@@ -14,52 +22,54 @@ _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
 _LARGEST_BRACKETED = 3
 _POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+# Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
+_ROUNDING = 1e-10
+# A share of area is told if its error is no larger, and to whole per cents.
+_LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
+# Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
+_LEAST_CHANGE = 0.5
 _PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
 
 
-@dataclass(frozen=True)
-class Digits:
-    """A number and its error as text, which is empty for NaN.
+def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
 
-    Attributes:
-        value: Number with as many digits as the error leaves it.
-        error: Error with one digit, rounded up, so that it stays a bound.
-        together: Both, in units of the same power of ten.
+    The error has one digit and is rounded up, so that it stays a bound; it may be unknown (NaN). NaN gives an empty
+    text.
+
+    >>> with_error(0.04733, 4.6e-4), with_error(2.0123e-5, 1.23e-8)
+    ('0.0473 ± 0.0005', '(2.012 ± 0.002) × 10⁻⁵')
     """
+    if not math.isfinite(value):
+        return ""
+    shown = rounded(value, error, unit)
+    if not math.isfinite(error) or error == 0:
+        return f"{shown} ± {'0' if error == 0 else '?'}"
+    above, last = _rounded_up(error, 1), _last_digit(value, error)
+    if _POWER in shown and above < value * 1e3 and _magnitude(above) >= last:
+        power = _magnitude(round(value, -last))
+        size, decimals = 10.0**power, max(0, power - last)
+        return f"({value / size:.{decimals}f} ± {above / size:.{decimals}f}){_power(power)}{unit}"
+    return f"{shown} ± {_shown(above, _magnitude(above))}{unit}"
 
-    value: str
-    error: str = ""
-    together: str = ""
 
-    @classmethod
-    def of(cls, value: float, error: float = math.nan, unit: str = "") -> Digits:
-        """Return the digits of a value whose error may be unknown (NaN), followed by a unit."""
-        if not math.isfinite(value):
-            return cls("")
-        if not math.isfinite(error) or error == 0:
-            digits, shown_error = (_MOST_DIGITS, "0") if error == 0 else (_DIGITS_WITHOUT_ERROR, "")
-            shown = f"{_shown(value, _magnitude(value) - digits + 1)}{unit}"
-            return cls(shown, shown_error, f"{shown} ± {shown_error or '?'}")
-        rounded = _rounded_up(error, 1)
-        # A value below its error keeps a digit, to be told from zero.
-        top = _magnitude(value or rounded)
-        last = min(top, max(_magnitude(rounded), top - _MOST_DIGITS + 1))
-        shown, shown_error = f"{_shown(value, last)}{unit}", f"{_shown(rounded, _magnitude(rounded))}{unit}"
-        together = f"{shown} ± {shown_error}"
-        if _POWER in shown and rounded < value * 1e3 and _magnitude(rounded) >= last:
-            power = _magnitude(round(value, -last))
-            size, decimals = 10.0**power, max(0, power - last)
-            together = f"({value / size:.{decimals}f} ± {rounded / size:.{decimals}f}){_power(power)}{unit}"
-        return cls(shown, shown_error, together)
+def rounded(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it; see `with_error`."""
+    return f"{_shown(value, _last_digit(value, error))}{unit}" if math.isfinite(value) else ""
 
-    @classmethod
-    def percent(cls, fraction: float, error: float = math.nan) -> Digits:
-        """Return the digits of a fraction in per cent.
 
-        >>> Digits.percent(0.010203, 0.000094).together
-        '1.02 % ± 0.01 %'
-        """
-        return cls.of(100 * fraction, 100 * error, " %")
+def percent(fraction: float, error: float = math.nan) -> str:
+    """Return a fraction in per cent with its error.
+
+    >>> percent(0.010203, 0.000094)
+    '1.02 % ± 0.01 %'
+    """
+    return with_error(100 * fraction, 100 * error, " %")
+
+
+def count(number: int) -> str:
+    """Return a number of things; nothing for none."""
+    return f"{number:,}" if number else ""
 
 
 def bound(fraction: float) -> str:
@@ -82,13 +92,13 @@ def rounded_outwards(lower: float, upper: float) -> tuple[str, str]:
     return _shown(low, _magnitude(low) - 1), _shown(high, _magnitude(high) - 1)
 
 
-def count_text(count: float, error: float) -> str:
+def count_text(number: float, error: float) -> str:
     """Return a large number of things with the digits that its error leaves it.
 
     >>> count_text(2312.4, 36.0)
     '2,310'
     """
-    return "" if math.isnan(count) else f"{round(count, -max(0, _magnitude(_rounded_up(error, 1)))):,.0f}"
+    return "" if math.isnan(number) else f"{round(number, -max(0, _magnitude(_rounded_up(error, 1)))):,.0f}"
 
 
 def second_digit(value: float) -> float:
@@ -164,6 +174,90 @@ def minus(text: str) -> str:
 def middle_cut(label: str, longest: int) -> str:
     """Return a label that is cut in its middle: labels of one family differ at their ends."""
     return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
+
+
+def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return a sentence that says how much a surface differs from the reference at one order.
+
+    Args:
+        name: Name of the surface.
+        reference: Name of the reference.
+        result: Variables of `distance` at one order, and the order.
+        area_change: Area of the surface over that of the reference, minus one.
+
+    >>> numbers = {"distance": 0.3, "error": 0.003, "relative": 0.0102, "relative_error": 0.0001}
+    >>> shares = {"area_share": 0.561, "area_share_error": 0.02, "excess": -0.007}
+    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares}, area_change=-0.008)
+    'small.obj differs from large.obj by 1.02 % ± 0.01 % at order -2; 56 % of it is lost area.'
+    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares, "distance": 1e-3}, area_change=-0.008)
+    'small.obj differs from large.obj by less than 1.1 % at order -2: not resolved.'
+    """
+    numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
+    at_order = f"at order {float(result['order']):g}"
+    if numbers["distance"] == numbers["error"] == 0:
+        return f"{name} and {reference} are identical: they have the same triangles."
+    if numbers["distance"] > numbers["error"]:
+        amount = percent(numbers["relative"], numbers["relative_error"])
+        return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
+    most = numbers["relative"] + numbers["relative_error"]
+    if most < _ROUNDING:
+        return f"{name} and {reference} are equal up to rounding {at_order}: they differ by less than {bound(most)}."
+    amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
+    return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
+
+
+def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]) -> str:
+    """Return a sentence that says which changes of the reference bring it as far from itself as a surface is.
+
+    Args:
+        name: Name of the surface.
+        reference: Name of the reference.
+        result: Variables of `yardsticks` at one order, and the order.
+
+    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
+    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
+    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}))
+    At order -2, small.obj is as far from large.obj as
+      large.obj moved by 0.81 % of its radius,
+      large.obj with noise of 0.32 % of its radius,
+      large.obj decimated to 2,300 triangles.
+    """
+    amounts = {kind: float(result[kind]) for kind in ("moved", "noise", "decimated")}
+    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
+    texts = {
+        "moved": f"moved by {rounded(100 * amounts['moved'], 100 * errors['moved'], ' %')} of its radius",
+        "noise": f"with noise of {rounded(100 * amounts['noise'], 100 * errors['noise'], ' %')} of its radius",
+        "decimated": f"decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles",
+    }
+    known = [f"  {reference} {text}" for kind, text in texts.items() if not math.isnan(amounts[kind])]
+    at_order = f"At order {float(result['order']):g}, "
+    if not known:
+        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
+    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(known) + "."
+
+
+def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return which share of a squared distance is a change of area; nothing where that is not known."""
+    share, error, excess = (float(result[key]) for key in ("area_share", "area_share_error", "excess"))
+    if not error <= _LARGEST_SHARE_ERROR:
+        return ""
+    if share + error < _WHOLE_PERCENT:
+        return "; less than 1 % of it is a change of area"
+    # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
+    if share <= error or not area_change / excess >= _LEAST_CHANGE:
+        return ""
+    amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
+    return f"; {amount} of it is {'lost' if excess < 0 else 'gained'} area"
+
+
+def _last_digit(value: float, error: float) -> int:
+    """Return the power of ten of the last digit that an error leaves a number."""
+    if not math.isfinite(error) or error == 0:
+        return _magnitude(value) - (_MOST_DIGITS if error == 0 else _DIGITS_WITHOUT_ERROR) + 1
+    above = _rounded_up(error, 1)
+    # A value below its error keeps a digit, to be told from zero.
+    top = _magnitude(value or above)
+    return min(top, max(_magnitude(above), top - _MOST_DIGITS + 1))
 
 
 def _magnitude(value: float) -> int:

@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables.defaults import Format
-from sobolev_batch.results.tables.formatting import concise, middle_cut
-from sobolev_batch.results.tables.groups import chosen_orders, complete_meshes, finished_group, reference_of
-from sobolev_batch.results.tables.orders import distances_at, order_note, reference_norm_at
+from sobolev_batch.results.tables.formatting import Format, concise, middle_cut
+from sobolev_batch.results.tables.groups import (
+    chosen_orders,
+    complete_meshes,
+    distances_at,
+    finished_group,
+    order_note,
+    reference_norm_at,
+    reference_of,
+)
 from sobolev_batch.results.tables.text import LINE_LENGTH, machine_table, printed_table, prose
 from sobolev_batch.spectral.errors.budget import quotients
 from sobolev_batch.spectral.shells import check_orders

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import pandas as pd
 from tabulate import tabulate
 
-from sobolev_batch.results.tables.defaults import Format
-from sobolev_batch.results.tables.formatting import latex_powers, middle_cut
+from sobolev_batch.results.tables.formatting import Format, latex_powers, middle_cut
 from sobolev_batch.visible import visible
 
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
@@ -28,6 +29,40 @@ _FORMULA_SIGNS = tuple("=+-@＝＋－＠")
 _MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
 # After the end of a row, LaTeX takes these for options of that end.
 _LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: of a text, and of a page.
+
+    Attributes:
+        name: Column of the frame that has its values, and its name in the CSV of a page.
+        header: Header of the column.
+        format: Function that returns the text of a value, and of the error where there is one.
+        error: Column of the frame with the errors, or with other second numbers; empty where there are none.
+        kind: "label" for the first column of a page, else what the cells hold.
+        is_marked: True where the mark of a row follows the number.
+    """
+
+    name: str
+    header: str
+    format: Callable[..., str] = str
+    error: str = ""
+    kind: Literal["number", "text", "label"] = "number"
+    is_marked: bool = False
+
+    def text(self, row: Mapping[Any, Any]) -> str:
+        """Return the cell of a row of the frame; it is empty where the value is missing."""
+        value = row[self.name]
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return ""
+        return self.format(value, row[self.error]) if self.error else self.format(value)
+
+
+def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], style: Format) -> str:
+    """Return rows of a frame as a table for people; see `printed_table`."""
+    cells = [[column.text(row) for column in columns] for row in rows]
+    return printed_table(cells, [column.header for column in columns], style)
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:

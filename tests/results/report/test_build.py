@@ -24,9 +24,9 @@ from sobolev_batch.batch.store.tables import Tables
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.meshes.views import make_views
-from sobolev_batch.results.report import build, pictures
+from sobolev_batch.results.report import build, charts
 from sobolev_batch.results.report.build import make_report
-from sobolev_batch.results.report.limits import ReportLimits
+from sobolev_batch.results.report.elements import ReportLimits
 from sobolev_batch.results.status import Status
 from tests.support.browser import Browser, browser
 
@@ -318,7 +318,7 @@ def test_a_page_without_rendered_pictures_says_why(
     def nothing(*_: object) -> None:
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
-    monkeypatch.setattr(pictures, "render", nothing)
+    monkeypatch.setattr(charts, "render", nothing)
     page_without = make_report(store, folder=folder)
     assert page_without.text.count(note) == 1
     assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in page_without.omissions

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, smallest_below
-from sobolev_batch.results.tables.smallest import format_smallest
+from sobolev_batch.results.tables.convergence import format_smallest
 
 
 def of(tree: xr.DataTree, below: float | str, order: float = -10.0) -> dict[str, object]:
