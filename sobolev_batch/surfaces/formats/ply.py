@@ -76,6 +76,8 @@ def _checked_header(data: bytes) -> _Header:
     # The library would reserve memory for any count.
     if header.least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
+    if header.text and data.find(b"_", start + len(_END)) >= 0:
+        raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
     entries = sum(counts.values())
     lines = _line_count(data, start) if header.text else entries
     if lines != entries:
