@@ -26,7 +26,8 @@ The public names by subject:
 - Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
 - Test suites: `assert_same_surface`, or `same_surface` for its `Verdict`.
 - For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
-- Studies: `Study`, `plan` and its `StudyPlan`, `run` and its `Summary`, `submit` and its `Submission`.
+- Studies: `Study`, `StudyCollection`; `plan` and its `StudyPlan` or `CollectionPlan`, `run` and its `Summary`,
+  `submit` and its `Submission`.
 - Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.
 - Results of a store: `table`, `matrix`, `evolution` (over time), `report`, `write_witness`; plots on Matplotlib axes:
   `plot_convergence`, `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_energy`, `plot_transform`, `plot_evolution`,

@@ -47,6 +47,7 @@ from .results.league.league import compare_studies as compare_studies
 from .results.league.league import league as league
 from .results.meshes.export import write_witness as write_witness
 from .results.open import open_store as open_store
+from .results.plan import CollectionPlan as CollectionPlan
 from .results.plan import StudyPlan as StudyPlan
 from .results.plan import plan as plan
 from .results.report.build import report as report

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.hierarchy import ROOT, require_intact, sealed
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.store.store import COLLECTION, Store
 from sobolev_batch.batch.study.collection import StudyCollection
-from sobolev_batch.errors import StoreError
+from sobolev_batch.batch.study.study import Study
+from sobolev_batch.errors import InputError, StoreError
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,30 @@ class CollectionStore:
     def stores(self) -> dict[str, Location]:
         """Location of the store of each object, by its name."""
         return {name: self.location.below(name) for name in self.objects}
+
+
+def for_each_object(
+    collection: StudyCollection, location: Location, act: Callable[[Study, Location], Result]
+) -> tuple[dict[str, Result], dict[str, str]]:
+    """Act on the study of each object and its store. An object that cannot be carried out stops no other.
+
+    Returns:
+        Results by the name of the object, and the reason for each object that has none.
+
+    Raises:
+        StoreError: A store cannot be used; that of the next object would not fare better.
+    """
+    results: dict[str, Result] = {}
+    refused: dict[str, str] = {}
+    stores = CollectionStore.of(location, collection).stores
+    for name, study in collection.studies.items():
+        try:
+            results[name] = act(study, stores[name])
+        except StoreError:
+            raise
+        except InputError as error:
+            refused[name] = str(error)
+    return results, refused
 
 
 def _parsed(content: bytes) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -17,12 +17,14 @@ from sobolev_batch.batch.cluster import GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.cluster.workers import prepare_workers
+from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
+from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import Workspace
@@ -41,6 +43,8 @@ class Submission:
         store: Path or URL of the store.
         surfaces: Number of surfaces of the study.
         missing: Number of surfaces whose fields are to be computed.
+        objects: Submission of each object of a collection, by its name.
+        refused: Reason for each object that cannot be carried out, by its name.
 
     >>> import sobolev_batch as sb
     >>> submission = sb.Submission("s3://bucket/results.zarr", surfaces=6, missing=4)
@@ -51,10 +55,12 @@ class Submission:
     store: str
     surfaces: int
     missing: int
+    objects: Mapping[str, Submission] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 def submit(
-    study: Study,
+    study: Study | StudyCollection,
     store: str | Path | Location,
     client: Client,
     *,
@@ -64,10 +70,11 @@ def submit(
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
-    another one takes over from what is stored. ``sobolev-batch status`` shows the progress.
+    another one takes over from what is stored. ``sobolev-batch status`` shows the progress. The objects of a
+    collection are handed over one after another; one that cannot be carried out stops no other.
 
     Args:
-        study: Study to carry out.
+        study: Study to carry out, of one object or of several.
         store: Path or URL of a new or existing store, which this process and all workers reach under this name.
         client: Client of the cluster; it may be closed afterwards.
         timeout_seconds: Time within which the scheduler has to take the study.
@@ -95,6 +102,21 @@ def submit(
     """
     require_give_up_after(give_up_after)
     location = Location.parse(store).absolute()
+    if isinstance(study, Study):
+        return _submit(study, location, client, timeout_seconds, give_up_after)
+    CollectionStore.prepared(location, study)
+    objects, refused = for_each_object(
+        study, location, lambda one, place: _submit(one, place, client, timeout_seconds, give_up_after)
+    )
+    surfaces, missing = (
+        sum(getattr(submission, name) for submission in objects.values()) for name in ("surfaces", "missing")
+    )
+    return Submission(str(location), surfaces, missing, objects, refused)
+
+
+def _submit(
+    study: Study, location: Location, client: Client, timeout_seconds: float, give_up_after: float
+) -> Submission:
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)

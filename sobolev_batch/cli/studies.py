@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
     from sobolev_batch.batch.study.collection import StudyCollection
     from sobolev_batch.batch.study.study import Study
+
+Result = TypeVar("Result")
 
 # Lines about distances that are less accurate than asked for.
 _MOST_IMPRECISE = 10
@@ -166,23 +168,23 @@ def submit_command(
     The cluster computes it without this process. The objects of a study are handed over one after another.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.collection_store import CollectionStore
     from sobolev_batch.batch.study.study import Study
-    from sobolev_batch.batch.submit import submit
+    from sobolev_batch.batch.submit import Submission, submit
 
     parsed = _parsed(study, best_effort=best_effort)
     location = (store or _made_default_store(parsed)).absolute()
     with remote_client(scheduler, trust_network) as client:
-        if not isinstance(parsed, Study):
-            CollectionStore.prepared(location, parsed)
+        submission = submit(parsed, location, client, give_up_after=give_up_after)
 
-        def hand_over(one: Study, place: Location) -> None:
-            submission = submit(one, place, client, give_up_after=give_up_after)
-            echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
+    def show(one: Submission) -> None:
+        echo(f"{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
 
-        refused = _for_each_object(parsed, location, hand_over, "submitted")
+    if isinstance(parsed, Study):
+        show(submission)
+    else:
+        _show_objects(parsed, submission.objects, submission.refused, show, "submitted")
     echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
-    if refused:
+    if submission.refused:
         context.exit(EXIT_SOME_FAILED)
 
 
@@ -211,23 +213,18 @@ def plan_command(
     stored, and the number of surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.parameters import format_bytes
-    from sobolev_batch.results.plan import StudyPlan, default_store, plan
-    from sobolev_batch.results.tables.formatting import duration
+    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.results.plan import plan
 
     parsed = _parsed(study, best_effort=best_effort)
-    plans: list[StudyPlan] = []
-
-    def show(one: Study, place: Location) -> None:
-        plans.append(plan(one, place, client=client))
-        echo_lines(plans[-1])
-
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
-        refused = _for_each_object(parsed, store or default_store(parsed), show, "planned")
-    if len(plans) > 1:
-        seconds, stored = sum(one.seconds for one in plans), sum(one.total_bytes for one in plans)
-        echo(f"{len(plans)} objects: about {duration(seconds, digits=2)}, {format_bytes(stored)} of fields")
-    if refused:
+        if isinstance(parsed, Study):
+            echo_lines(plan(parsed, store, client))
+            return
+        made = plan(parsed, store, client)
+    _show_objects(parsed, made.objects, made.refused, echo_lines, "planned")
+    echo(made.total)
+    if made.refused:
         context.exit(EXIT_SOME_FAILED)
 
 
@@ -245,31 +242,20 @@ def _is_best_effort(study: Study | StudyCollection) -> bool:
     return any(one.accuracy is not None and one.accuracy.best_effort for one in studies)
 
 
-def _for_each_object(
-    study: Study | StudyCollection, place: Location, act: Callable[[Study, Location], None], done: str
-) -> bool:
-    """Act on the study of each object and its store; a study of one object has the place itself.
-
-    As in `run`, an object that cannot be carried out stops no other. Return whether there was one.
-    """
-    from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.batch.study.study import Study
-    from sobolev_batch.errors import InputError, StoreError
-
-    if isinstance(study, Study):
-        act(study, place)
-        return False
-    stores, is_refused = CollectionStore.of(place, study).stores, False
-    for name, one in study.studies.items():
+def _show_objects(
+    collection: StudyCollection,
+    results: Mapping[str, Result],
+    refused: Mapping[str, str],
+    show: Callable[[Result], None],
+    done: str,
+) -> None:
+    """Print what was done for each object of a collection, or why it was not."""
+    for name in collection.studies:
         echo(f"{name}:")
-        try:
-            act(one, stores[name])
-        except StoreError:
-            raise
-        except InputError as error:
-            echo(f"not {done}: {error}", err=True)
-            is_refused = True
-    return is_refused
+        if name in results:
+            show(results[name])
+        else:
+            echo(f"not {done}: {refused[name]}", err=True)
 
 
 def _print_league(place: Location) -> None:

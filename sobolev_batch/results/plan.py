@@ -6,10 +6,12 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import overload
 
 from distributed import Client
 
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers
+from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.memory import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
@@ -23,6 +25,7 @@ from sobolev_batch.html import table_html
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.results.forecast import Forecast
+from sobolev_batch.results.tables.formatting import duration
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
 from sobolev_batch.visible import visible
@@ -219,15 +222,72 @@ class StudyPlan:
             yield "doubtful", f"and {len(self.doubtful) - _MOST_DOUBTS} more"
 
 
+@dataclass(frozen=True)
+class CollectionPlan:
+    """Forecast of a run of a collection; ``print(plan)`` shows the plan of each object.
+
+    Attributes:
+        objects: Plan of each object that can be carried out, by its name.
+        refused: Reason for each other object, by its name.
+
+    >>> import sobolev_batch as sb
+    >>> plan = sb.CollectionPlan({}, {"cow": "the reference cannot be made: cow.ply: it is empty"})
+    >>> print(plan)
+    cow: the reference cannot be made: cow.ply: it is empty
+    0 objects: about 0 s, 0B of fields
+    """
+
+    objects: Mapping[str, StudyPlan]
+    refused: Mapping[str, str]
+
+    @property
+    def seconds(self) -> float:
+        """Time that a run will take; see `StudyPlan.seconds`."""
+        return sum(one.seconds for one in self.objects.values())
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes of all stored fields."""
+        return sum(one.total_bytes for one in self.objects.values())
+
+    @property
+    def total(self) -> str:
+        """Number of objects, time and bytes, as a line."""
+        return (
+            f"{len(self.objects)} objects: about {duration(self.seconds, digits=2)}, "
+            f"{format_bytes(self.total_bytes)} of fields"
+        )
+
+    def __str__(self) -> str:
+        lines = [f"{visible(name)}:\n{one}" for name, one in self.objects.items()]
+        lines += [visible(f"{name}: {reason}") for name, reason in self.refused.items()]
+        return "\n".join([*lines, self.total])
+
+
+@overload
+def plan(
+    study: StudyCollection, store: str | Path | Location | None = None, client: Client | None = None
+) -> CollectionPlan: ...
+
+
+@overload
 def plan(
     study: Study | str | Path, store: str | Path | Location | None = None, client: Client | None = None
-) -> StudyPlan:
+) -> StudyPlan: ...
+
+
+def plan(
+    study: Study | StudyCollection | str | Path,
+    store: str | Path | Location | None = None,
+    client: Client | None = None,
+) -> StudyPlan | CollectionPlan:
     """Return what running a study would do, without computing anything.
 
-    The reference is loaded, and a few other surfaces where the study asks for an accuracy.
+    The reference is loaded, and a few other surfaces where the study asks for an accuracy. An object of a collection
+    that cannot be carried out stops no other.
 
     Args:
-        study: Study, or the path of a study file.
+        study: Study of one object or of several, or the path of a study file of one object.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
 
@@ -247,8 +307,14 @@ def plan(
     surfaces:      5 in 1 family, reference reference
     ...
     """
-    study = study if isinstance(study, Study) else Study.from_toml(study)
+    study = study if isinstance(study, Study | StudyCollection) else Study.from_toml(study)
     location = default_store(study) if store is None else Location.parse(store)
+    if isinstance(study, StudyCollection):
+        return CollectionPlan(*for_each_object(study, location, lambda one, place: _plan(one, place, client)))
+    return _plan(study, location, client)
+
+
+def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
     workers.require_accuracy(study.accuracy)
     earlier_choice, started = stored_choice(location), time.process_time()

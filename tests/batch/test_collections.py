@@ -127,8 +127,14 @@ def test_what_is_wrong_with_a_question_is_said_as_it_is(store: Path) -> None:
 @pytest.mark.slow
 def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
-    table = collection([*spheres(a=1.0), GONE, *spheres(b=1.1)]).table
-    path.write_text(tomli_w.dumps(table))
+    made = collection([*spheres(a=1.0), GONE, *spheres(b=1.1)])
+    plan = sb.plan(made, tmp_path / "s.zarr")
+    assert list(plan.objects) == ["a", "b"]
+    assert plan.objects["b"].store == str(tmp_path / "s.zarr" / "b")
+    assert plan.total_bytes == 2 * plan.objects["a"].total_bytes
+    assert "the reference cannot be made" in plan.refused["gone"]
+    assert str(plan).startswith("a:\nstudy:")
+    path.write_text(tomli_w.dumps(made.table))
     done = call("plan", path, "--store", tmp_path / "s.zarr")
     assert done.returncode == 3
     assert [line for line in done.stdout.splitlines() if line in {"a:", "gone:", "b:"}] == ["a:", "gone:", "b:"]

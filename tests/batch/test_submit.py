@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-from sobolev_batch import ClusterError, Study, StudyError, submit
+from sobolev_batch import ClusterError, Study, StudyCollection, StudyError, submit
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
@@ -89,6 +89,20 @@ def test_the_objects_of_a_collection_are_handed_over_one_after_another(study_pat
     assert "gone: it has no results; run the study again to see why" in followed.stdout
     league = call("league", store, "--method", "ico")
     assert "League at order -3, over 1 object" in league.stdout, league.stderr
+
+
+@pytest.mark.process
+def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -> None:
+    objects = [
+        {"name": "ball", "reference": {"source": "sphere"}},
+        {"name": "gone", "reference": {"source": "files", "paths": ["no.ply"]}},
+    ]
+    collection = StudyCollection.from_table(small_table(object=objects), folder=tmp_path)
+    submission = submit(collection, tmp_path / "all.zarr", client)
+    assert (submission.surfaces, submission.missing) == (5, 5)
+    assert submission.objects["ball"].store == str(tmp_path / "all.zarr" / "ball")
+    assert list(submission.refused) == ["gone"]
+    assert call("status", tmp_path / "all.zarr", "--follow").returncode == 3
 
 
 def test_what_is_wrong_is_said_before_anything_is_handed_over(

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, ValidationError
 from sobolev_batch.batch.study.refusals import joined, refusals
 from sobolev_batch.batch.study.schema import Name, Section, read_toml, require_modest, without_frames
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, filled, holds, names_of
+from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, ObjectTemplate, filled, holds, names_of
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.surfaces.sources.mesh_lists import ListedMesh, checked_list, number_as_text, read_mesh_list
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
@@ -109,7 +109,9 @@ class StudyCollection:
         Raises:
             StudyError: It has a lattice instead of an accuracy.
         """
-        return replace(self, studies={name: study.with_best_effort() for name, study in self.studies.items()})
+        studies = {name: study.with_best_effort() for name, study in self.studies.items()}
+        accuracy = {**self.table["accuracy"], "best_effort": True}
+        return replace(self, studies=studies, table={**self.table, "accuracy": accuracy})
 
     @classmethod
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
@@ -131,7 +133,9 @@ class StudyCollection:
             raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
         studies, lacking = {}, {}
         for one in objects:
-            part = _Part(common, one, listed, folder)
+            # Their files match the templates of this object, too.
+            longer = [other.name for other in objects if one.name in other.name and other.name != one.name]
+            part = _Part(common, one, longer, listed, folder)
             try:
                 studies[one.name] = Study.from_table(part.table(), folder=folder)
             except StudyError as error:
@@ -240,22 +244,24 @@ class _Part:
     Attributes:
         common: Sections that all objects share.
         object: Section of the object.
+        longer: Names of other objects that hold the name of this one.
         listed: Meshes that a list gives.
         folder: Folder in which relative paths start.
     """
 
     common: Mapping[str, Any]
     object: _ObjectSection
+    longer: Sequence[str]
     listed: _Listed
     folder: Path
 
     def table(self) -> dict[str, Any]:
         """Return the study as nested tables."""
         name = self.object.name
-        common = filled(self.common, OBJECT, name)
+        common = filled({key: value for key, value in self.common.items() if key != "family"}, OBJECT, name)
         reference = self.object.reference or self.listed.reference(name) or common.get("reference")
         header = dict(common.get("study", {}))
-        families = [table for family in common.get("family", []) for table in self._families(family)]
+        families = [table for family in self.common.get("family", []) for table in self._families(family)]
         return {
             **common,
             "study": {**header, "name": f"{header.get('name', '')} {name}"},
@@ -266,24 +272,23 @@ class _Part:
 
     def _families(self, family: Any) -> list[Any]:
         """Return a family for each method among its files, or none where no file matches."""
-        paths = family.get("paths") if isinstance(family, Mapping) else None
+        others = filled({key: value for key, value in family.items() if key != "paths"}, OBJECT, self.object.name)
+        paths = family.get("paths")
         if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-            return [family]
+            return [filled(family, OBJECT, self.object.name)]
         if not holds(family.get("name"), METHOD):
-            return [family]
+            return [{**others, "paths": [own for path in paths for own in self._template(path).paths()]}]
         methods: dict[str, list[str]] = {}
         for path in paths:
-            try:
-                names = names_of(path, METHOD, self.folder) if METHOD in path else []
-            except StudyError:
-                # An object that a method has not been run on.
-                continue
-            for method in names:
-                methods.setdefault(method, []).append(filled(path, METHOD, method))
-        others = {key: value for key, value in family.items() if key != "paths"}
+            template = self._template(path)
+            for method in template.methods() if METHOD in path else []:
+                methods.setdefault(method, []).extend(template.paths(method))
         return [
             {**filled(others, METHOD, method), "paths": methods[method]} for method in sorted(methods, key=natural_key)
         ]
+
+    def _template(self, path: str) -> ObjectTemplate:
+        return ObjectTemplate(path, self.object.name, self.longer, self.folder)
 
 
 def _require_sections(table: Mapping[str, Any]) -> None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.sources.files import expand
+from sobolev_batch.surfaces.sources.names import quoted
 
 OBJECT, METHOD = "{object}", "{method}"
 # Characters of globs and templates, which the names of objects and methods cannot have.
@@ -36,7 +40,72 @@ def filled(value: Any, placeholder: str, name: str) -> Any:
     return [filled(entry, placeholder, name) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def names_of(template: str, placeholder: str, folder: Path) -> list[str]:
+@dataclass(frozen=True)
+class ObjectTemplate:
+    """A path or glob of a family, for one object.
+
+    Attributes:
+        text: Path or glob with placeholders.
+        name: Name of the object.
+        longer: Names of other objects that hold this name. A file is of the object with the longest name that fits.
+        folder: Folder where relative paths start.
+    """
+
+    text: str
+    name: str
+    longer: Sequence[str]
+    folder: Path
+
+    @property
+    def own(self) -> str:
+        """The template with the name of the object."""
+        return self.text.replace(OBJECT, self.name)
+
+    @cached_property
+    def others(self) -> set[Path]:
+        """Files of the objects with longer names."""
+        if OBJECT not in self.text:
+            return set()
+        globs = [self.text.replace(OBJECT, name).replace(METHOD, "*") for name in self.longer]
+        return {path for glob in globs for path in self._files(glob)}
+
+    def methods(self) -> list[str]:
+        """Return the methods that have files of the object, in their natural order; none where no file matches."""
+        try:
+            return names_of(self.own, METHOD, self.folder, self.others)
+        except StudyError:
+            return []
+
+    def paths(self, method: str = "") -> list[str]:
+        """Return the path or glob of a method, or the files that match it where others are of another object.
+
+        Raises:
+            StudyError: All files that match are those of another object.
+        """
+        text = self.own.replace(METHOD, method)
+        if not self.others or not has_magic(text):
+            return [text]
+        files = self._files(text)
+        if self.others.isdisjoint(files):
+            return [text]
+        own = [_as_written(path, self.folder) for path in files if path not in self.others]
+        if not own:
+            raise StudyError(
+                f"{quoted(text)} matches files of other objects alone, such as {quoted(str(files[0]))}; "
+                f"put files of {quoted(self.name)} there, or correct it"
+            )
+        return own
+
+    def _files(self, glob: str) -> list[Path]:
+        if not has_magic(glob):
+            return [self.folder / glob]
+        try:
+            return expand(self.folder, glob)
+        except StudyError:
+            return []
+
+
+def names_of(template: str, placeholder: str, folder: Path, others: Container[Path] = ()) -> list[str]:
     """Return the names that a placeholder has among the files that match a template, in their natural order.
 
     The placeholder stands for as many characters as it can, of one part of the path.
@@ -45,11 +114,13 @@ def names_of(template: str, placeholder: str, folder: Path) -> list[str]:
         template: Path or glob with one or more placeholders.
         placeholder: Placeholder to look for.
         folder: Folder where relative paths start.
+        others: Files that do not count.
 
     Raises:
         StudyError: No file matches, or one outside the folder that the template names.
     """
-    paths = expand(folder, template.replace(OBJECT, "*").replace(METHOD, "*"))
+    files = expand(folder, template.replace(OBJECT, "*").replace(METHOD, "*"))
+    paths = [path for path in files if path not in others]
     match = re.compile(_pattern(template)).fullmatch
     group = placeholder.strip("{}")
     found = {matched[group] for path in paths if (matched := match(_as_written(path, folder))) is not None}

@@ -22,6 +22,9 @@ def table(**changes: Any) -> dict[str, Any]:
     return small_table(**{**own, **changes})
 
 
+ICO = [{"name": "ico", "source": "icosphere", "levels": [0]}]
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     made = [
@@ -50,9 +53,41 @@ def test_files_give_objects_and_methods(folder: Path) -> None:
     assert methods(found)["cow_2"] == ["even", "quick"]
     assert methods(found)["bee10"] == ["quick"]
     assert found.lacking == {"bee10": ("even",)}
-    # One object's name begins with that of another: the glob takes what follows.
-    assert files(found, folder, "cow", "quick") == ["cow_100", "cow_200", "cow_2_100"]
+    # One object's name begins with that of another: a file is of the longest name that fits.
+    assert files(found, folder, "cow", "quick") == ["cow_100", "cow_200"]
     assert files(found, folder, "cow_2", "quick") == ["cow_2_100"]
+
+
+@pytest.mark.parametrize("template", ["{object}_{method}_*.ply", "{method}_{object}.ply"])
+def test_a_file_is_of_the_object_with_the_longest_name_that_fits(tmp_path: Path, template: str) -> None:
+    names = ["cow", "cow_big"] if template.startswith("{object}") else ["cow", "big_cow"]
+    for name in names:
+        sb.write_mesh(sb.icosphere(0), tmp_path / f"{name}.off")
+        sb.write_mesh(sb.icosphere(0), tmp_path / template.format(object=name, method="quick").replace("*", "80"))
+    family = [{"name": "{method}", "source": "files", "paths": [template]}]
+    objects = [{"name": name} for name in names]
+    references = {"source": "files", "paths": ["{object}.off"]}
+    found = sb.StudyCollection.from_table(table(object=objects, family=family, reference=references), folder=tmp_path)
+    assert methods(found) == {name: ["quick"] for name in names}
+    for name in names:
+        expected = Path(template.format(object=name, method="quick").replace("*", "80")).stem
+        assert files(found, tmp_path, name, "quick") == [expected]
+
+
+def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
+    (folder / "out/quick/cow_100.ply").unlink()
+    (folder / "out/quick/cow_200.ply").unlink()
+    family = [{"name": "quick", "source": "files", "paths": ["out/quick/{object}_*.ply"]}]
+    objects = [{"name": "cow"}, {"name": "cow_2"}]
+    with pytest.raises(sb.StudyError, match=r"object 'cow': .*matches files of other objects alone, .*cow_2_100"):
+        sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
+
+
+def test_the_best_effort_of_a_collection_is_in_its_table() -> None:
+    own = table(accuracy={"rtol": 1e-2}, object=[{"name": "ball"}], reference={"source": "sphere"}, family=ICO)
+    del own["lattice"]
+    best = sb.StudyCollection.from_table(own).with_best_effort()
+    assert best.table["accuracy"] == best.studies["ball"].table["accuracy"] == {"rtol": 1e-2, "best_effort": True}
 
 
 def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
@@ -60,8 +95,7 @@ def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder:
         {"name": "cow"},
         {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}},
     ]
-    family = [{"name": "ico", "source": "icosphere", "levels": [0]}]
-    found = sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
+    found = sb.StudyCollection.from_table(table(object=objects, family=ICO), folder=folder)
     assert [study.scaling.mode for study in found.studies.values()] == ["reference", "none"]
     assert [study.name for study in found.studies.values()] == ["small cow", "small ball"]
 
