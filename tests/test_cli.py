@@ -263,7 +263,7 @@ def test_a_fit_that_is_asked_to_end_writes_the_best_so_far(folder: Path, request
 # What is refused in one line, and a part of it that names what was found.
 REFUSED = [
     ("run no.toml", "no.toml: cannot be read"),
-    ("run broken.toml", "[lattice]: unknown key m: did you mean M?"),
+    ("run broken.toml", "[lattice]: m is unknown; did you mean M?"),
     ("run study.toml --store taken", "not empty and holds no store"),
     ("run study.toml --store /proc/x.zarr", "/proc/x.zarr: the store cannot be written"),
     (f"run other.toml --store {STORE}", "a store of another study is there"),

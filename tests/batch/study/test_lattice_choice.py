@@ -162,7 +162,7 @@ def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Pat
         ({"accuracy": {"rtol": "small"}}, "accuracy.: rtol must be a number"),
         ({"accuracy": {"rtol": 1e-3, "memory": 0}}, "accuracy.: memory: memory must be a positive number of bytes"),
         ({"accuracy": {"rtol": 1e-3, "memory": "much"}}, "accuracy.: memory: memory must be .*, found 'much'"),
-        ({"accuracy": {"rtol": 1e-3, "atol": 1}}, "accuracy.: unknown key atol: did you mean rtol"),
+        ({"accuracy": {"rtol": 1e-3, "atol": 1}}, "accuracy.: atol is unknown; did you mean rtol"),
         ({"transform": {"eps": 1e-9}}, "an .accuracy. chooses eps and quadrature"),
     ],
 )
