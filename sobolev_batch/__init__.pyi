@@ -1,7 +1,7 @@
 # The public API: each name is imported from its module when it is first asked for.
 from .batch.run import Summary as Summary
 from .batch.run import run as run
-from .batch.store.release import release as release
+from .batch.store.heartbeat import release as release
 from .batch.study.collection import StudyCollection as StudyCollection
 from .batch.study.draft.init import StudyDraft as StudyDraft
 from .batch.study.draft.init import init_study as init_study

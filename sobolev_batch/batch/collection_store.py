@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.hierarchy import ROOT, require_intact, sealed
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import COLLECTION, Store
+from sobolev_batch.batch.store.store import COLLECTION, ROOT, Store
 from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, StoreError
@@ -50,7 +49,6 @@ class CollectionStore:
         table = document.get("attributes", {}).get(COLLECTION)
         if not isinstance(table, dict):
             return None
-        require_intact(str(location), document)
         return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
 
     @classmethod
@@ -82,7 +80,7 @@ class CollectionStore:
         }
         attributes = {"title": collection.title, "schema_version": SCHEMA_VERSION, COLLECTION: entry}
         root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-        location.write({ROOT: json.dumps(sealed(root)).encode()})
+        location.write({ROOT: json.dumps(root).encode()})
         return cls.of(location, collection)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +13,9 @@ from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.hierarchy import RECORDS
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.store import LABELS, QUALITY, RECORDS, ROOT, Store
+from sobolev_batch.batch.store.tables import damaged_tables, rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.html import reasons, table_html
@@ -38,8 +37,8 @@ class Verification:
         total: Number of surfaces of the study.
         fields: Damage of fields and their records, by the label of the surface.
         tables: Damage of tables and coordinates, by the name of the array.
-        withdrawn: True if the damaged records, and the tables if anything is damaged, were withdrawn, so that the
-            next run computes them again.
+        withdrawn: True if the records of damaged fields were withdrawn, so that the next run makes them again, as it
+            does damaged tables.
         objects: Verification of each object of a collection, by its name; none for a single study. The total of an
             object without a store is 0.
 
@@ -144,24 +143,32 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
 def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
     """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
     tasks = (
-        Task(_damage_of, (workspace.store, i, record), row=i, label=workspace.labels[i])
+        Task(workspace.store.damage_of_field, (i, record), row=i, label=workspace.labels[i])
         for i, record in workspace.complete.items()
     )
     return sorted(task.row for task, damage in cluster.results(tasks) if damage)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
-    labels, complete = store.labels(), complete_records(store.records())
-    damaged = {row: f"its completion record is damaged ({what})" for row, what in store.record_table.damaged().items()}
-    documents = store.differing_documents() | _damaged_run(store)
-    tables = Tables(store).damaged() | documents
-    if not tables:
-        lost = Tables(store).without_records(store.records())
-        damaged |= {row: "its completion record is missing" for row in lost if row not in damaged}
+    records, unread = store.examine_records()
+    complete = complete_records(records)
+    damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
+    tables = damaged_tables(store)
+    if not tables and not store.has_digest():
+        tables[ROOT] = "tables, coordinates or metadata are not what was written together"
+    try:
+        store.read_run()
+    except StoreError as error:
+        tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
+    if table_attributes(store, "convergence") is not None:
+        if not {"meshes/row", "meshes/status", "meshes/key"} & tables.keys():
+            damaged = rows_unlike_tables(store, records) | damaged
+        if QUALITY not in tables and _have_other_qualities(records, store.read_strings(QUALITY)):
+            tables[QUALITY] = "it is not what records have"
     whole = store.rows_with_complete_fields() if complete else set()
 
     def damage_of(row: int) -> str:
-        return _damage_of(store, row, complete[row]) if row in whole else "it is not there, or of another length"
+        return store.damage_of_field(row, complete[row]) if row in whole else "it is not there, or of another length"
 
     with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
         for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
@@ -169,51 +176,23 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
-    withdraw = lock is not None and bool(damaged or tables)
-    if lock is not None and withdraw:
+    if lock is not None and damaged:
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
-        store.restore_documents(documents)
-        _withdraw(store, damaged)
+        for row in damaged:
+            store.write_record(row, None)
+    labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
     return Verification(
         store.path,
         len(complete),
         len(labels),
         {labels[row]: damaged[row] for row in sorted(damaged)},
         tables,
-        withdraw,
+        lock is not None and bool(damaged or tables),
     )
 
 
-def _withdraw(store: Store, fields: Iterable[int]) -> None:
-    """Withdraw the tables, and the records of damaged fields."""
-    # From a table, as long as there are some.
-    store.repair_labels()
-    Tables(store).invalidate()
-    for row in fields:
-        store.write_record(row, None)
-
-
-def _damaged_run(store: Store) -> dict[str, str]:
-    try:
-        store.read_run()
-    except DamageError as error:
-        return {RECORDS: error.what}
-    return {}
-
-
-def _damage_of(store: Store, row: int, record: Record) -> str:
-    """Return the damage of the field of a row; empty where it is sound."""
-    places, checksums = store.block_slices(), list(record.checksums)
-    count = len(places) + store.has_octaves
-    if len(checksums) != count:
-        return f"its record knows of {len(checksums)} blocks, and the store has {count}"
-    try:
-        if store.has_octaves:
-            # Behind those of the field.
-            store.read_octaves([row], [checksums.pop()])
-        for place, checksum in zip(places, checksums, strict=True):
-            store.read_fields([row], place, [checksum])
-    except DamageError as error:
-        return error.what
-    return ""
+def _have_other_qualities(records: Sequence[Record | None], qualities: Sequence[str]) -> bool:
+    pairs = zip(records, qualities, strict=True)
+    # A run may have ended between a field and the tables.
+    return any(record is not None and quality not in ("", record.quality) for record, quality in pairs)

@@ -7,11 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.store import QUALITY, Store
+from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.batch.study.plan import Plan, Row
 
 _log = logging.getLogger(__name__)
@@ -92,10 +94,11 @@ class Workspace:
         """Withdraw the tables and qualities that follow from fields which are about to be replaced."""
         replaced = {i for i in rows if self.records[i] is not None}
         if replaced:
-            Tables(self.store).invalidate()
-            self.store.write_qualities(
-                [record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)]
-            )
+            hide_tables(self.store)
+            qualities = [
+                record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)
+            ]
+            self.store.write(QUALITY, ..., np.array(qualities, dtype=object))
 
 
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:

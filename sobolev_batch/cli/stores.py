@@ -125,7 +125,7 @@ def verify_command(context: click.Context, store: Location) -> None:
 @click.option("--force", is_flag=True, help="Release it even if its run was active a moment ago.")
 def release_command(store: Location, force: bool) -> None:
     """Remove the lock that a killed run left on STORE."""
-    from sobolev_batch.batch.store.release import release
+    from sobolev_batch.batch.store.heartbeat import release
 
     lock = release(store, force=force)
     if lock is None:

@@ -9,18 +9,18 @@ from typing import Any
 
 import xarray as xr
 
-from sobolev_batch.batch.storage.checked import document_digest
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.hierarchy import DIGEST, DIGESTS
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
-from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.batch.store.store import DIGEST, Store
+from sobolev_batch.batch.store.tables import lost_tables
+from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
 
-# Entries of the encoding of a tree: where it was opened, and the digest of the digests of its tables then.
+# Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
+# What zarr and xarray raise for metadata that nobody has written.
+_MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
 def open_store(store: str | Path | Location) -> xr.DataTree:
@@ -45,7 +45,7 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     'reference'
     """
     opened = Store.open(store)
-    lost = Tables(opened).lost()
+    lost = lost_tables(opened)
     if lost:
         # Without this check they would read as NaN, zero or nothing, like data.
         raise DamageError(
@@ -53,12 +53,16 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
             "it is missing",
         )
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
-    keys: Any = opened.zarr_store(recorded=opened.recorded_chunks)
+    keys: Any = opened.checked_keys()
     with opened.location.access("read"):
-        tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
-    tree.encoding = {**tree.encoding, _SOURCE: str(store), _STATE: document_digest(opened.digests)}
-    for name in (DIGEST, DIGESTS):
-        tree.attrs.pop(name, None)
+        try:
+            tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
+        except _MEANINGLESS as error:
+            problem = f"its metadata make no sense: {one_line(error)}"
+            raise DamageError(
+                f"{opened.path}: the store is damaged ({problem}); run the study again", problem
+            ) from error
+    tree.encoding = {**tree.encoding, _SOURCE: str(store), _STATE: tree.attrs.pop(DIGEST, None)}
     return tree
 
 
@@ -80,7 +84,7 @@ def require_unchanged(tree: xr.DataTree) -> None:
         StoreError: Its tables are not those that it had, or it is gone.
     """
     source = source_of(tree)
-    if source is not None and document_digest(Store.open(source).digests) != tree.encoding.get(_STATE):
+    if source is not None and Store.open(source).attributes().get(DIGEST) != tree.encoding.get(_STATE):
         raise StoreError(
             f"{source}: a run has changed the store while it was read; once that run has ended, open the store again, "
             "or give the same command again"

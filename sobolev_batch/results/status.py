@@ -12,7 +12,7 @@ from sobolev_batch.batch.storage.lock import Lock, age_seconds, utc_now
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.tables import rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import complete_records, failed_proximities
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.results.open import AnyStore, location_of
@@ -42,7 +42,7 @@ class Status:
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
         rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
         run_store: Path or URL of the store of the run in a collection: that of one object. Otherwise empty.
-        lost_records: Labels of surfaces that the tables list as computed, and whose completion records are gone. A run
+        lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
             that goes on computes them again.
 
     >>> import sobolev_batch as sb
@@ -80,7 +80,6 @@ class Status:
         labels = {row: label for row, label in enumerate(opened.labels()) if label not in removed}
         asks_for_proximity = opened.attributes()["study"]["table"].get("proximity") is not None
         complete = {row: record for row, record in complete_records(records).items() if row in labels}
-        tables = Tables(opened)
         return cls(
             str(place),
             len(complete),
@@ -92,10 +91,10 @@ class Status:
             },
             failed_proximities(labels, complete) if asks_for_proximity else {},
             run,
-            tables.attributes("convergence") is not None,
+            table_attributes(opened, "convergence") is not None,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
             math.nan if run is None else _rate(records, run),
-            lost_records=tuple(labels[row] for row in tables.without_records(records) if row in labels),
+            lost_records=tuple(labels[row] for row in rows_unlike_tables(opened, records) if row in labels),
         )
 
     @classmethod
@@ -200,7 +199,7 @@ class Status:
         yield (
             f"{self.store}: {self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
         )
-        lost = dict.fromkeys(self.lost_records, "its completion record is gone; run the study again")
+        lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")
         for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):
             yield f"{label}: {reason}"
         if self.run is not None:

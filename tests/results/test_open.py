@@ -12,7 +12,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch import Study
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.tables import hide_tables
 from tests.support.studies import small_table
 
 
@@ -34,7 +34,7 @@ def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Pa
     tree = sb.open_store(store_path)
     before = [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)]
     # As a run does before it replaces them.
-    Tables(Store.open(store_path)).invalidate()
+    hide_tables(Store.open(store_path))
     for function in (sb.table, sb.matrix):
         with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
             function(tree, -5.0)

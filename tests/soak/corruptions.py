@@ -41,7 +41,7 @@ levels = [0, 1]
 """
 _MESHES = 2
 BAD = ("silent", "unnamed")
-ANSWERS = ("same", "told", *BAD)
+ANSWERS = ("same", "told", "verified", *BAD)
 # Charts take most of the time. A report reads what the other ways read.
 _REPORTS_EVERY = 5
 # What a page or a status says of the moment at which it was made.
@@ -88,7 +88,8 @@ class Corruption:
         kind: What was done to it.
         keys: Keys of the files whose content changed.
         answers: What each way to read the store that was tried then did, one of `ANSWERS`: a number differs without a
-            word where it is silent, and an exception was not one of this package where it is unnamed.
+            word where it is silent, only `verify` has said so where it is verified, and an exception was not one of
+            this package where it is unnamed.
     """
 
     kind: str
@@ -114,6 +115,8 @@ def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
             for name, read in WAYS.items()
             if name != "report" or not count % _REPORTS_EVERY
         }
+        if answers["verify"] == "told":
+            answers = {name: "verified" if answer == "silent" else answer for name, answer in answers.items()}
         yield Corruption(kind, changed, answers)
         shutil.rmtree(damaged)
         shutil.copytree(stores.whole, damaged)

@@ -22,7 +22,7 @@ from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe
 from sobolev_batch.batch.fields.memory import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.tables import table_attributes, write_table
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
@@ -40,7 +40,7 @@ _GROUP = "proximity"
 
 def have_proximities(workspace: Workspace) -> bool:
     """Return True where the store has all distances that the study asks for, and readers find them."""
-    attributes = Tables(workspace.store).attributes(_GROUP)
+    attributes = table_attributes(workspace.store, _GROUP)
     if workspace.plan.study.proximity is None:
         return attributes is None
     is_listed = attributes is not None and attributes.get("digest") == _digest(workspace)
@@ -60,9 +60,8 @@ def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
     if have_proximities(workspace):
         return
     workspace.store.remove(_GROUP)
-    workspace.store.consolidate()
     if workspace.plan.study.proximity is not None:
-        Tables(workspace.store).write(_GROUP, _dataset(workspace))
+        write_table(workspace.store, _GROUP, _dataset(workspace))
         workspace.store.consolidate()
 
 

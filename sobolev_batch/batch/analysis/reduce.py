@@ -23,9 +23,10 @@ from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.store import QUALITY, Store
+from sobolev_batch.batch.store.tables import hide_tables, table_attributes, write_table
 from sobolev_batch.batch.workspace import Workspace, complete_records
+from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
@@ -215,26 +216,32 @@ def _write_tables(workspace: Workspace, results: Results) -> None:
     convergence = convergence_dataset(
         meshes.coords, orders, to_reference, sizes, families.values(), plan.study.accuracy
     )
-    tables = Tables(store)
-    replaced = tables.invalidate()
-    store.write_qualities([record.quality if record else "" for record in workspace.records])
-    tables.write("meshes", meshes, instead_of=replaced)
+    replaced = hide_tables(store)
+    store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
+    write_table(store, "meshes", meshes, instead_of=replaced)
     norms = norms_dataset(meshes.coords, orders, NormEstimate(*results.norms[..., shown]))
-    tables.write("norms", norms, instead_of=replaced)
+    write_table(store, "norms", norms, instead_of=replaced)
     others = [row.label for row in (rows if is_every_pair else [workspace.rows[reference]])]
     pairs = distances_dataset(meshes.coords, others, orders, NormEstimate(*distances))
-    tables.write("distances", pairs, instead_of=replaced)
+    write_table(store, "distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are stored.
-    tables.write("convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)
+    write_table(store, "convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)
     store.consolidate()
 
 
 def are_tabulated(workspace: Workspace) -> bool:
     """Return True where the tables of a store belong to its fields and to the plan."""
-    tables = Tables(workspace.store)
-    attributes = tables.attributes("convergence")
-    current = attributes is not None and attributes.get("digest") == _digest(workspace)
-    return current and not tables.lost()
+    attributes = table_attributes(workspace.store, "convergence")
+    if attributes is None or attributes.get("digest") != _digest(workspace):
+        return False
+    try:
+        return list(workspace.store.read_strings(QUALITY)) == _qualities(workspace)
+    except DamageError:
+        return False
+
+
+def _qualities(workspace: Workspace) -> list[str]:
+    return [record.quality if record else "" for record in workspace.records]
 
 
 def _digest(workspace: Workspace) -> str:

@@ -1,16 +1,13 @@
-"""Stores whose keys are compared with what was recorded of them, before zarr decodes them.
+"""Chunks that are checked before zarr decodes them.
 
-The checksum in a chunk says that the chunk is whole. It does not say that it is the right one: two chunks of equal
-length may trade places, and a backup may bring an old one back.
+zarr raises exceptions of many kinds for broken chunks, and takes any amount of memory for a chunk of texts whose count
+is damaged.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any, Self
 
 import google_crc32c
@@ -23,20 +20,10 @@ from zarr.storage import WrapperStore
 
 from sobolev_batch.errors import DamageError
 
-MISSING = "it is not there"
 CHANGED = "it is not what was written"
-# Of the codec of strings: the number of strings, and the length of the first one.
-_STRING_HEADER_BYTES, _CHECKSUM_BYTES = 8, 4
-
-
-def digest_of(content: bytes) -> str:
-    """Return the SHA-256 of the content of a key."""
-    return hashlib.sha256(content).hexdigest()
-
-
-def document_digest(document: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a JSON document, however it is spelled."""
-    return digest_of(json.dumps(document, sort_keys=True, separators=(",", ":")).encode())
+CHECKSUM_BYTES = 4
+# Of the codec of texts: their number, and the length of each.
+_COUNT_BYTES = 4
 
 
 def checksum_of(values: NDArray[Any]) -> int:
@@ -47,162 +34,69 @@ def checksum_of(values: NDArray[Any]) -> int:
     return int(google_crc32c.value(data))
 
 
-@dataclass(frozen=True)
-class RecordedChunks:
-    """Array along meshes of which each record has a checksum of the values of every chunk of its row.
-
-    Attributes:
-        name: Path of the array.
-        records: Path of the array of records, one in each chunk.
-        shape: Shape of the array.
-        chunks: Shape of a chunk, which is one row long.
-        dtype: Data type.
-        first: Number of the checksum of the first chunk of a row; negative if counted from the last one.
-    """
-
-    name: str
-    records: str
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    dtype: str
-    first: int = 0
-
-    def place(self, key: str) -> tuple[int, ...] | None:
-        """Return the index of the chunk with a key; None for other keys."""
-        prefix = f"{self.name}/c/"
-        return tuple(map(int, key.removeprefix(prefix).split("/"))) if key.startswith(prefix) else None
-
-    def fits(self, place: tuple[int, ...], content: bytes | None, record: bytes | None) -> bool:
-        """Tell whether a chunk is the one that the record of its row tells of; true if that tells of none."""
-        table = _table_of(record)
-        checksums = table.get("checksums", ())
-        if not checksums:
-            return True
-        if table.get("row") != place[0]:
-            return False
-        counts = [-(-length // step) for length, step in zip(self.shape[1:], self.chunks[1:], strict=True)]
-        number = self.first + int(np.ravel_multi_index(place[1:], counts))
-        size = math.prod(self.chunks) * np.dtype(self.dtype).itemsize
-        if content is None or len(content) != size + _CHECKSUM_BYTES or number >= len(checksums):
-            return False
-        values = np.frombuffer(content, self.dtype, math.prod(self.chunks)).reshape(self.chunks[1:])
-        starts = (index * step for index, step in zip(place[1:], self.chunks[1:], strict=True))
-        within = tuple(slice(0, length - start) for length, start in zip(self.shape[1:], starts, strict=True))
-        return bool(checksum_of(np.ascontiguousarray(values[within])) == checksums[number])
-
-
 class CheckedStore(WrapperStore[ZarrStore]):
-    """zarr's store whose keys are compared with digests and with the checksums in records as they are read.
+    """zarr's store whose chunks are checked as they are read.
 
     Args:
         store: Store to read from.
         name: Path or URL of the store, for messages.
-        digests: Digest of the content of each key that has one.
-        recorded: Arrays whose chunks are held against the records of their rows.
+        documents: Metadata documents of its arrays, by their paths.
     """
 
-    def __init__(
-        self, store: ZarrStore, name: str, digests: Mapping[str, str], recorded: Sequence[RecordedChunks] = ()
-    ) -> None:
+    def __init__(self, store: ZarrStore, name: str, documents: Mapping[str, Mapping[str, Any]]) -> None:
         super().__init__(store)
-        self._name, self._digests, self._recorded = name, digests, recorded
-        # Records are read once, unless a chunk does not fit: then a run may have replaced both.
-        self._records: dict[str, bytes | None] = {}
+        self._name, self._documents = name, documents
 
     def _with_store(self, store: ZarrStore) -> Self:
-        return type(self)(store, self._name, self._digests, self._recorded)
+        return type(self)(store, self._name, self._documents)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key.
 
         Raises:
-            DamageError: They are not what was written.
+            DamageError: They cannot be a chunk of their array, or are not those that were written.
         """
-        found = await super().get(key, prototype, byte_range)
-        if byte_range is not None:
-            return found
-        if key in self._digests:
-            self._require_digest(key, found)
-        for array in self._recorded:
-            if (place := array.place(key)) is not None:
-                await self._require_recorded(array, place, found, prototype)
-        if found is not None and self._is_record(key):
-            self._require_record(key, found.to_bytes())
-        return found
-
-    def _require_digest(self, key: str, found: Buffer | None) -> None:
-        if found is None or digest_of(found.to_bytes()) != self._digests[key]:
-            problem = MISSING if found is None else CHANGED
+        content = await super().get(key, prototype, byte_range)
+        array = key.partition("/c/")[0].removesuffix("/c")
+        document = self._documents.get(array) if array != key else None
+        if content is None or byte_range is not None or document is None:
+            return content
+        problem = problem_of_chunk(content.as_numpy_array(), document)
+        if problem:
+            place = key.removeprefix(f"{array}/c").removeprefix("/")
             raise DamageError(
-                f"{self._name}: {_array_of(key)} is damaged ({problem}), or a run has replaced it since it was opened; "
-                "open the store again, and run the study again if it stays so",
+                f"{self._name}: chunk {place or '0'} of {array} is damaged ({problem}), or a run has just replaced it; "
+                "sobolev-batch verify names what is damaged, and run makes it again",
                 problem,
             )
-
-    def _is_record(self, key: str) -> bool:
-        groups = {array.records.partition("/")[0] for array in self._recorded}
-        return "/c/" in key and key.partition("/")[0] in groups
-
-    def _require_record(self, key: str, content: bytes) -> None:
-        row = int(key.rpartition("/")[2])
-        values, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
-        is_whole = google_crc32c.value(values).to_bytes(_CHECKSUM_BYTES, "little") == checksum
-        if not is_whole or _table_of(content).get("row") != row:
-            raise DamageError(
-                f"{self._name}: row {row} of {_array_of(key)} is damaged ({CHANGED}); sobolev-batch verify names the "
-                "mesh, and run computes it again",
-                CHANGED,
-                row,
-            )
-
-    async def _require_recorded(
-        self, array: RecordedChunks, place: tuple[int, ...], found: Buffer | None, prototype: BufferPrototype
-    ) -> None:
-        content = None if found is None else found.to_bytes()
-        key = f"{array.records}/c/{place[0]}"
-        for is_known in (key in self._records, False):
-            if not is_known:
-                record = await super().get(key, prototype)
-                self._records[key] = None if record is None else record.to_bytes()
-            if array.fits(place, content, self._records[key]):
-                return
-        problem = MISSING if content is None else CHANGED
-        raise DamageError(
-            f"{self._name}: row {place[0]} of {array.name} is damaged ({problem}), or a run has just replaced it; "
-            "sobolev-batch verify names the mesh, and run computes it again",
-            problem,
-            place[0],
-        )
+        return content
 
 
-class NotingStore(WrapperStore[ZarrStore]):
-    """zarr's store that notes the digest of every key that is written.
-
-    Args:
-        store: Store to write to.
-        digests: Digests by their keys, which are added to.
-    """
-
-    def __init__(self, store: ZarrStore, digests: dict[str, str]) -> None:
-        super().__init__(store)
-        self._digests = digests
-
-    def _with_store(self, store: ZarrStore) -> Self:
-        return type(self)(store, self._digests)
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """Replace a key, and note its digest."""
-        await super().set(key, value)
-        self._digests[key] = digest_of(value.to_bytes())
+def problem_of_chunk(content: NDArray[np.uint8], document: Mapping[str, Any]) -> str:
+    """Return why the bytes of a chunk (n,) are not one of an array, by its metadata; empty if they are."""
+    chunk, dtype = document["chunk_grid"]["configuration"]["chunk_shape"], document["data_type"]
+    data = content
+    if document["codecs"][-1]["name"] == "crc32c":
+        data = content[:-CHECKSUM_BYTES]
+        if len(content) < CHECKSUM_BYTES or checksum_of(data).to_bytes(4, "little") != content[len(data) :].tobytes():
+            return CHANGED
+    if dtype == "string":
+        return _problem_of_texts(data.tobytes(), math.prod(chunk))
+    size = math.prod(chunk) * np.dtype(dtype).itemsize
+    return "" if len(data) == size else f"it has {len(data)} bytes, not {size}"
 
 
-def _array_of(key: str) -> str:
-    return key.partition("/c/")[0].removesuffix("/c")
-
-
-def _table_of(record: bytes | None) -> dict[str, Any]:
-    """Return the table in the chunk of a record; an empty one if it is damaged, or there is none."""
-    try:
-        return dict(json.loads((record or b"")[_STRING_HEADER_BYTES:-_CHECKSUM_BYTES]))
-    except (ValueError, TypeError):
-        return {}
+def _problem_of_texts(data: bytes, count: int) -> str:
+    if int.from_bytes(data[:_COUNT_BYTES], "little") != count or len(data) < _COUNT_BYTES * (1 + count):
+        return f"it does not hold {count} texts"
+    start = _COUNT_BYTES
+    for _ in range(count):
+        end = start + _COUNT_BYTES + int.from_bytes(data[start : start + _COUNT_BYTES], "little")
+        if end > len(data):
+            return "a text in it is cut short"
+        try:
+            data[start + _COUNT_BYTES : end].decode()
+        except UnicodeDecodeError:
+            return "a text in it is not UTF-8"
+        start = end
+    return "" if start == len(data) else "it holds more than its texts"

@@ -1,10 +1,11 @@
-"""Preparation of a store for a run: create it, or add what the study has gained."""
+"""Preparation of a store for a run: create it, or lay it out again for what the study or its state has become."""
 
 from __future__ import annotations
 
 import json
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,21 +16,20 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import LOCK_KEYS
-from sobolev_batch.batch.store.hierarchy import (
+from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import (
     FIELD,
-    LABELS,
-    OCTAVE_LABELS,
     OCTAVES,
     OCTAVES_GROUP,
     QUALITY,
     RECORD,
-    RECORDS,
+    REMOVED,
     ROOT,
+    UNFINISHED,
+    Store,
 )
-from sobolev_batch.batch.store.layout import Layout
-from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import REMOVED, UNFINISHED, Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.tables import array_keys, dataset_keys, hide_tables
 from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
@@ -38,7 +38,6 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
 
 _log = logging.getLogger(__name__)
 
-_GROUPS_OF_FIELDS = ("fourier", OCTAVES_GROUP, RECORDS)
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
@@ -50,11 +49,11 @@ def require_usable(location: Location) -> None:
     """
     store = Store(location)
     try:
-        is_there = store.exists()
+        exists = store.exists()
     except DamageError:
         # See `prepare_store`.
         return
-    if not is_there:
+    if not exists:
         location.require_free(besides=LOCK_KEYS)
     elif not store.is_unfinished:
         store.attributes()
@@ -63,72 +62,94 @@ def require_usable(location: Location) -> None:
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     """Create the store of a plan, or open it and add rows for new meshes.
 
-    Rows of meshes that the study has lost stay. If one has come back under another name, it gets this name.
+    Rows of meshes that the study has lost stay. If one has come back under another name, it gets this name. If tables,
+    coordinates or metadata are not those that were written, all of them are made again, and the fields stay.
 
     Raises:
         StoreError: The location cannot be read or written, or holds something else or the store of another study,
             which then stays as it is.
+        DamageError: The metadata at the root are damaged, and no field of the study is found.
     """
     store = Store(location)
     try:
-        is_there = store.exists()
+        exists = store.exists()
     except DamageError as damage:
-        store, is_there = _with_new_root(store.location, plan, damage), True
-    if not is_there:
+        return _mended(store, plan, damage)
+    if not exists:
         store.location.require_free(besides=LOCK_KEYS)
         _create(store, plan)
         return store
     if store.is_unfinished:
         _replace_everything(store, plan)
         return store
+    attributes = store.attributes()
+    if not store.has_digest():
+        expected = {"name": plan.study.name, **_lattice_entry(plan)}
+        is_same = all(attributes["study"].get(name) == value for name, value in expected.items())
+        return _mended(store, plan, None if is_same else _ALTERED)
     _check_same_study(store, plan)
     store.location.remove_partial_files()
     with store.location.access("written"):
-        study = store.attributes()["study"]
-        if any(study.get(name) != value for name, value in _lattice_entry(plan).items()):
+        if any(attributes["study"].get(name) != value for name, value in _lattice_entry(plan).items()):
             done = sum(record is not None for record in store.records())
             _log.warning(
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
             )
             _replace_everything(store, plan)
-        store.repair_labels()
-        _rename(store, plan)
-        _extend(store, plan)
-        _repair_axes(store, plan)
-        if store.attributes().get("similarity") != _similarity_entry(plan.similarity):
+        _require_same_samples(store, plan, is_trusted=True)
+        stored = store.labels()
+        labels = _labels_for(plan, stored, store.records(), is_trusted=True)
+        if labels != list(stored):
+            _lay_out(store, plan, labels, store.read_strings(QUALITY))
+        if attributes.get("similarity") != _similarity_entry(plan.similarity):
             # Tables are in another unit of length, and the run may end before there are others.
-            Tables(store).invalidate()
-        store.documents[""]["attributes"].update(_attributes(plan, store.labels()))
+            hide_tables(store)
+        store.documents[""]["attributes"].update(_attributes(plan, labels))
         # Written even if nothing changed: a location that cannot be written must fail before tasks start.
         store.consolidate()
     return store
 
 
-def _with_new_root(location: Location, plan: Plan, damage: DamageError) -> Store:
-    """Return a store whose metadata at the root are damaged, with new ones that follow from its arrays and the plan.
+_ALTERED = DamageError("the metadata at the root are damaged", "they are not what was written")
 
-    Its tables are left out: they are made again.
+
+def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
+    """Return a store with new metadata, coordinates and labels, and without tables, around its fields and records.
+
+    Args:
+        store: Store whose tables, coordinates or metadata are not those that were written.
+        plan: Plan of the study.
+        damage: Reason to doubt that it is the store of the plan's study.
 
     Raises:
-        DamageError: The fields are not those of the plan's study, as far as that can be told.
+        DamageError: There is such a reason, and no field in the store is one of the study's.
     """
-    store = Store.of_nodes(location, _GROUPS_OF_FIELDS)
-    store.documents[""] = _root({})
+    stored: tuple[str, ...] = ()
+    with suppress(StoreError, ValueError, TypeError, KeyError):
+        stored = store.labels()
+    prefix = f"{RECORD}/c/"
+    numbers = [key.removeprefix(prefix) for key in store.location.sizes(prefix.rstrip("/"))]
+    count = 1 + max((int(number) for number in numbers if number.isdigit()), default=-1)
+    fresh = Store(store.location)
+    fresh.documents = _documents_of(array_keys(RECORD, str, (count,), (1,), ("mesh",)))
+    records = fresh.examine_records()[0]
     keys = {row.key for row in plan.rows}
-    field = store.documents.get(FIELD, {})
-    is_known = field and RECORD in store.documents and field["shape"][1:] == list(plan.lattice.shape)
-    if not is_known or not any(record is not None and record.key in keys for record in store.records()):
+    if damage is not None and not any(record is not None and record.key in keys for record in records):
         raise DamageError(
-            f"{location}: {ROOT}, the metadata at the root, is damaged, and no field of this study is found in the "
+            f"{store.path}: {ROOT}, the metadata at the root, is damaged, and no field of this study is found in the "
             "store to make it again from; name another store, or remove this one",
             damage.what,
         )
-    _log.warning("%s: the metadata at the root are damaged, and are made again with the tables", store.path)
-    for name in [name for name, document in store.documents.items() if document["node_type"] == "array"]:
-        if name not in (FIELD, OCTAVES) and not name.startswith(f"{RECORDS}/"):
-            store.digest_stored(name)
-    store.documents[""] = _root(_attributes(plan, store.labels()))
-    return store
+    _log.warning("%s: tables or metadata are not what was written, and are made again", store.path)
+    store.location.remove_partial_files()
+    with store.location.access("written"):
+        if plan.tail is not None:
+            fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
+        _require_same_samples(fresh, plan, is_trusted=False)
+        labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
+        _lay_out(fresh, plan, labels, ())
+        fresh.consolidate()
+    return fresh
 
 
 def _replace_everything(store: Store, plan: Plan) -> None:
@@ -147,26 +168,41 @@ def _mark_unfinished(store: Store, plan: Plan) -> None:
 
 
 def _create(store: Store, plan: Plan) -> None:
-    labels = np.array([row.label for row in plan.rows], dtype=object)
-    rows = len(labels)
-    layout = Layout()
-    layout.add_array(
-        FIELD,
-        plan.choice.dtype,
-        (rows, *plan.lattice.shape),
-        (1, *plan.blocks[0].shape),
-        ("mesh", *AXES),
-        long_name="Fourier transform of the area measure, xi_z >= 0 half",
-        # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
-        coordinates="quality",
-    )
-    layout.add_array(QUALITY, str, (rows,), (rows,), ("mesh",))
+    _mark_unfinished(store, plan)
+    store.documents = {}
+    _lay_out(store, plan, [row.label for row in plan.rows], ())
+    store.consolidate()
+
+
+def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequence[str]) -> None:
+    """Write the metadata, coordinates and labels of all arrays that tasks fill. Their chunks and the tables stay.
+
+    Args:
+        store: Store of the arrays.
+        plan: Plan of the study.
+        labels: Labels of all rows.
+        qualities: Qualities of the first rows.
+    """
+    rows, mesh = len(labels), np.array(labels, dtype=object)
+    padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
     units = {"units": "cycles per unit length"}
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
-    layout.add_dataset("fourier", xr.Dataset(coords={**axes, "mesh": labels}))
-    layout.add_array(RECORD, str, (rows,), (1,), ("mesh",))
+    keys = {
+        **array_keys(
+            FIELD,
+            plan.choice.dtype,
+            (rows, *plan.lattice.shape),
+            (1, *plan.blocks[0].shape),
+            ("mesh", *AXES),
+            long_name="Fourier transform of the area measure, xi_z >= 0 half",
+            # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
+            coordinates="quality",
+        ),
+        **dataset_keys("fourier", xr.Dataset({"quality": ("mesh", padded)}, coords={**axes, "mesh": mesh})),
+        **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
+    }
     if plan.tail is not None:
-        layout.add_array(
+        keys |= array_keys(
             OCTAVES,
             plan.choice.dtype,
             (rows, plan.tail.size),
@@ -175,12 +211,14 @@ def _create(store: Store, plan: Plan) -> None:
             long_name="Fourier transform of the area measure, beyond the lattice",
             description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
         )
-        layout.add_dataset(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": labels}))
-    _mark_unfinished(store, plan)
-    store.documents = {"": _root(_attributes(plan, labels.tolist()))}
-    groups = ("fourier", RECORDS, *([OCTAVES_GROUP] if plan.tail is not None else []))
-    store.publish({key: content for group in groups for key, content in layout.keys(group).items()})
-    store.consolidate()
+        keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
+    store.publish(keys)
+    store.documents[""] = _root(_attributes(plan, labels))
+
+
+def _documents_of(keys: dict[str, bytes]) -> dict[str, Any]:
+    ending = f"/{ROOT}"
+    return {key.removesuffix(ending): json.loads(content) for key, content in keys.items() if key.endswith(ending)}
 
 
 def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
@@ -201,31 +239,33 @@ def _root(attributes: dict[str, Any]) -> dict[str, Any]:
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 
-def _repair_axes(store: Store, plan: Plan) -> None:
-    """Write damaged coordinates of the lattice and of octaves again: nothing can be selected without them.
+def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None:
+    """Check that octaves were sampled at the frequencies that this program draws.
+
+    Args:
+        store: Store of the samples.
+        plan: Plan of the study.
+        is_trusted: False where some coordinates may be damaged: then one of three is enough.
 
     Raises:
-        StoreError: Octaves were sampled at other frequencies than this program would draw.
+        StoreError: They were sampled at others.
     """
-    axes = {f"fourier/{name}": axis for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
     columns = {} if plan.tail is None else _sample_columns(plan.tail)
-    axes |= {f"{OCTAVES_GROUP}/{name}": values for name, (_, values, _) in columns.items()}
-    for name, axis in axes.items():
+    agree = []
+    for name in AXES if columns else ():
         try:
-            stored = np.asarray(store.read(name, ...))
-        except DamageError:
-            stored = None
-        # Of a deleted array the fill values are left: NaN, or zeros for whole numbers.
-        if stored is None or np.isnan(stored).any() or not stored.any():
-            store.write(name, ..., axis)
-        elif not np.allclose(stored, axis, rtol=1e-9, atol=1e-12):
-            if name.startswith("fourier"):
-                store.write(name, ..., axis)
-                continue
-            raise StoreError(
-                f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
-                "the versions that the attributes of the store name, or name another store"
-            )
+            stored = np.asarray(store.read(f"{OCTAVES_GROUP}/{name}"))
+        except (StoreError, ValueError, TypeError, KeyError):
+            continue
+        # Of a deleted array the fill values are left.
+        if not np.isnan(stored).any():
+            expected = columns[name][1]
+            agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
+    if agree and not (all if is_trusted else any)(agree):
+        raise StoreError(
+            f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
+            "the versions that the attributes of the store name, or name another store"
+        )
 
 
 def _check_same_study(store: Store, plan: Plan) -> None:
@@ -251,37 +291,35 @@ def _check_same_study(store: Store, plan: Plan) -> None:
         )
 
 
-def _rename(store: Store, plan: Plan) -> None:
-    """Give rows of meshes that the study has lost the labels of new meshes with the same fields."""
-    labels, planned = list(store.labels()), {row.label: row for row in plan.rows}
-    lost = [i for i, label in enumerate(labels) if label not in planned]
-    added = {row.key: row.label for label, row in planned.items() if row.key and label not in set(labels)}
-    if not lost or not added:
-        return
-    records = store.records()
-    renamed = False
-    for i in lost:
-        record = records[i]
-        if record is not None and record.status == "complete" and record.key in added:
-            labels[i], renamed = added.pop(record.key), True
-    if renamed:
-        store.write_labels(labels)
+def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
+    """Return a label for each stored row, followed by the labels of new meshes.
 
+    A row whose mesh the study has lost gets the label of a new mesh with the same field.
 
-def _extend(store: Store, plan: Plan) -> None:
-    """Append rows for meshes that the study has gained."""
-    labels = store.labels()
-    existing = set(labels)
-    added = [row.label for row in plan.rows if row.label not in existing]
-    if not added:
-        return
-    rows = len(labels) + len(added)
-    of_octaves = (OCTAVES, OCTAVE_LABELS) if store.has_octaves else ()
-    for name in (RECORD, FIELD, QUALITY, LABELS, *of_octaves):
-        store.resize(name, (rows, *store.array(name).shape[1:]))
-    # Empty qualities are written too, since a missing chunk counts as lost.
-    for name, values in ((QUALITY, [""] * len(added)), *((name, added) for name in (LABELS, *of_octaves[1:]))):
-        store.write(name, slice(len(labels), None), np.array(values, dtype=object))
+    Args:
+        plan: Plan of the study.
+        stored: Stored labels; empty where they are not known.
+        records: Completion records of the rows.
+        is_trusted: False where only the key in a record is believed to say whose field it is.
+    """
+    planned = {row.label: row.key for row in plan.rows}
+    labels = [
+        label if label in planned and (is_trusted or (record is not None and record.completes(planned[label]))) else ""
+        for label, record in zip(stored, records, strict=True)
+    ]
+    taken, by_key = set(labels), dict[str, list[str]]()
+    for label, key in planned.items():
+        if key and label not in taken:
+            by_key.setdefault(key, []).append(label)
+    for row, record in enumerate(records):
+        if not labels[row] and record is not None and record.status == "complete" and by_key.get(record.key):
+            labels[row] = by_key[record.key].pop(0)
+    taken = set(labels)
+    for row, label in enumerate(stored):
+        if not labels[row]:
+            labels[row] = label if label and label not in taken else f"removed/{row}"
+            taken.add(labels[row])
+    return [*labels, *(label for label in planned if label not in taken)]
 
 
 def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:

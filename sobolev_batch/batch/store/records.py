@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self, cast
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.errors import DamageError
 
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
@@ -178,9 +178,11 @@ class RunRecord:
         """Return the record that a table holds.
 
         Raises:
-            StoreError: The table is not a record.
+            DamageError: The table is not a record.
         """
         try:
-            return cls(**table)  # type: ignore[arg-type]
-        except TypeError as error:
-            raise StoreError(f"the record of the latest run is damaged ({error}): {table}") from error
+            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
+        except ValidationError as error:
+            problem = _first_problem(error)
+            raise DamageError(f"the record of the latest run is damaged ({problem}): {table}", problem) from error
+        return record

@@ -1,124 +1,159 @@
-"""Tables: the small arrays of a store. Each group of them is written, listed and invalidated as a whole."""
+"""Tables: the small arrays of a store. Each group of them is written, listed and hidden as a whole.
+
+Keys of new arrays are made in memory and then written as a whole: zarr and xarray look at a store again and again while
+they create arrays, and on object storage each look is a request.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
+import zarr
+from zarr.abc.buffer import Buffer
+from zarr.codecs import Crc32cCodec
+from zarr.storage import MemoryStore
 
-from sobolev_batch.batch.store.hierarchy import (
-    LABELS,
-    OCTAVES,
-    OCTAVES_GROUP,
-    QUALITY,
-    RECORDS,
-    ROOT,
-    Hierarchy,
-    StoredChunks,
-)
-from sobolev_batch.batch.store.layout import Layout
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import FIELD, OCTAVES, OCTAVES_GROUP, QUALITY, RECORD, RECORDS, ROOT, Store
 from sobolev_batch.errors import DamageError
-from sobolev_batch.spectral.lattice import AXES
 
 # All other groups are tables.
 _GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS)
+# By the kind of a dtype: of strings, complex and real numbers.
+_FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
 
 
-@dataclass(frozen=True)
-class Tables:
-    """Tables of a store."""
+def array_keys(
+    name: str,
+    dtype: Any,
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dimensions: tuple[str, ...],
+    **attributes: Any,
+) -> dict[str, bytes]:
+    """Return the keys of an array without chunks, with checksums. It reads as NaN, or as empty strings."""
+    keys: dict[str, Buffer] = {}
+    zarr.create_group(MemoryStore(keys), zarr_format=3).create_array(
+        name,
+        shape=shape,
+        dtype=dtype,
+        chunks=chunks,
+        compressors=(Crc32cCodec(),),
+        fill_value=_FILL_VALUES[np.dtype(dtype).kind],
+        dimension_names=dimensions,
+        attributes=attributes,
+    )
+    return _bytes_of(keys)
 
-    store: Hierarchy
 
-    def invalidate(self) -> tuple[str, ...]:
-        """Hide the tables from readers until they are written and listed again, and return their names.
+def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
+    """Return the keys of a group with the arrays of a dataset, one chunk each, with checksums."""
+    keys: dict[str, Buffer] = {}
+    encoding = {
+        str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}
+        for name, variable in dataset.variables.items()
+        if variable.ndim
+    }
+    # A missing chunk is a lost one, and never a table of zeros.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
+    return _bytes_of(keys)
 
-        While they are written they do not fit together.
-        """
-        names = tuple(self._names())
-        if names:
-            self.store.hide(names)
-            # Errors of norms need them, and they are written before tables are listed again.
-            self.store.forget_digests(QUALITY)
-            self.store.consolidate()
-        return names
 
-    def write(self, group: str, dataset: xr.Dataset, *, instead_of: Sequence[str] = ()) -> None:
-        """Replace a group, each array in one chunk. Readers find it after `Store.consolidate`.
+def _bytes_of(keys: dict[str, Buffer]) -> dict[str, bytes]:
+    # The root is made by `Store.consolidate`.
+    return {key: value.to_bytes() for key, value in keys.items() if key != ROOT}
 
-        Args:
-            group: Name of the group.
-            dataset: New content of the group.
-            instead_of: Names of tables that were invalidated. Those that the group no longer has are removed.
-        """
-        layout = Layout()
-        layout.add_dataset(group, dataset)
-        keys = layout.keys(group)
-        for name in instead_of:
-            if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in keys:
-                self.store.location.remove(name)
-        self.store.publish(keys, last=f"{group}/{ROOT}")
 
-    def attributes(self, group: str) -> dict[str, Any] | None:
-        """Return the attributes of a group, or None if it is not listed."""
-        listed = self.store.exists() and group in self.store.documents
-        return self.store.documents[group].get("attributes", {}) if listed else None
+def hide_tables(store: Store) -> tuple[str, ...]:
+    """Hide the tables from readers until they are written and listed again, and return their names.
 
-    def lost(self) -> tuple[str, ...]:
-        """Return the arrays of tables with missing chunks. No chunk is read."""
-        names = self._names()
-        # Errors of norms need the qualities, which are written with them.
-        others = [QUALITY] if names else []
-        return tuple(self._incomplete(names, self._groups()) + self._incomplete(others, others))
+    While they are written they do not fit together.
+    """
+    names = tuple(table_names(store))
+    if names:
+        store.hide(names)
+        store.consolidate()
+    return names
 
-    def without_records(self, records: Sequence[object | None]) -> tuple[int, ...]:
-        """Return the rows that tables list as complete, and that have no record.
 
-        Args:
-            records: Record of each row, or None.
-        """
-        if self.attributes("convergence") is None:
-            return ()
-        rows, statuses = (np.asarray(self.store.read(f"meshes/{name}", ...)).tolist() for name in ("row", "status"))
-        return tuple(
-            row
-            for row, status in zip(rows, statuses, strict=True)
-            if status == "complete" and (row >= len(records) or records[row] is None)
-        )
+def write_table(store: Store, group: str, dataset: xr.Dataset, *, instead_of: Sequence[str] = ()) -> None:
+    """Replace a group, each array in one chunk. Readers find it after `Store.consolidate`.
 
-    def damaged(self) -> dict[str, str]:
-        """Return the damage of each small array, of tables and coordinates, that cannot be read."""
-        of_octaves = [name for name in self.store.documents if name.startswith(f"{OCTAVES_GROUP}/") and name != OCTAVES]
-        coordinates = [LABELS, *(f"fourier/{name}" for name in AXES), *of_octaves]
-        lost = {*self.lost(), *self._incomplete(coordinates, coordinates)}
-        damage = dict.fromkeys(sorted(lost), "it is not there, or not all of it")
-        for name in [*coordinates, QUALITY, *self._names()]:
-            if name not in damage and self._is_array(name):
-                try:
-                    self.store.read(name, ...)
-                except DamageError as error:
-                    damage[name] = error.what
-        return damage
+    Args:
+        store: Store of the table.
+        group: Name of the group.
+        dataset: New content of the group.
+        instead_of: Names of tables that were hidden. Those that the group no longer has are removed.
+    """
+    keys = dataset_keys(group, dataset)
+    for name in instead_of:
+        if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in keys:
+            store.location.remove(name)
+    store.publish(keys, last=f"{group}/{ROOT}")
 
-    def _groups(self) -> list[str]:
-        return sorted({name.split("/")[0] for name in self.store.documents if name} - set(_GROUPS_OF_TASKS))
 
-    def _names(self) -> list[str]:
-        groups = self._groups()
-        return [name for name in self.store.documents if name.split("/")[0] in groups]
+def table_attributes(store: Store, group: str) -> dict[str, Any] | None:
+    """Return the attributes of a group, or None if it is not listed."""
+    listed = store.exists() and group in store.documents
+    return store.documents[group].get("attributes", {}) if listed else None
 
-    def _is_array(self, name: str) -> bool:
-        return self.store.document(name).get("node_type") == "array"
 
-    def _incomplete(self, names: Iterable[str], prefixes: Iterable[str]) -> list[str]:
-        """Return the arrays that have missing or short chunks, given prefixes of their keys."""
-        sizes = {key: size for prefix in prefixes for key, size in self.store.location.sizes(prefix).items()}
-        incomplete = []
-        for name in filter(self._is_array, names):
-            chunks = StoredChunks(self.store, name, sizes)
-            if not chunks.are_complete(np.ndindex(*chunks.counts)):
-                incomplete.append(name)
-        return incomplete
+def table_names(store: Store) -> list[str]:
+    """Return the names of the groups and arrays of tables that are listed."""
+    return [name for name in store.documents if name and name.split("/")[0] not in _GROUPS_OF_TASKS]
+
+
+def lost_tables(store: Store) -> list[str]:
+    """Return the arrays of tables with missing chunks. No chunk is read."""
+    names = table_names(store)
+    # Errors of norms need the qualities, which are written with the tables.
+    return _incomplete(store, [*names, QUALITY] if names else [])
+
+
+def damaged_tables(store: Store) -> dict[str, str]:
+    """Return the damage of each small array, of tables and coordinates, that cannot be read."""
+    names = [name for name in filter(store.is_array, store.documents) if name not in (FIELD, OCTAVES, RECORD)]
+    if not table_names(store):
+        names.remove(QUALITY)
+    damage = dict.fromkeys(_incomplete(store, names), "it is not there, or not all of it")
+    for name in names:
+        if name not in damage:
+            try:
+                store.read(name)
+            except DamageError as error:
+                damage[name] = error.what
+    return damage
+
+
+def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[int, str]:
+    """Return how records differ from those that the tables were made from, by their rows.
+
+    Args:
+        store: Store of the tables.
+        records: Record of each row, or None.
+    """
+    if table_attributes(store, "convergence") is None:
+        return {}
+    rows, statuses, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+    unlike = {}
+    for row, status, key in zip(rows, statuses, keys, strict=True):
+        record = records[row] if row < len(records) else None
+        if record is None and status != "missing":
+            unlike[row] = "its completion record is missing"
+        elif record is not None and (record.status, record.key) != (status, key):
+            unlike[row] = "its completion record is not the one that the tables were made from"
+    return unlike
+
+
+def _incomplete(store: Store, names: Iterable[str]) -> list[str]:
+    """Return the arrays that have missing or short chunks."""
+    arrays = [name for name in names if store.is_array(name)]
+    groups = {name: name.split("/")[0] for name in arrays}
+    # Groups of tasks have the fields besides, which are many.
+    prefixes = {name if group in _GROUPS_OF_TASKS else group for name, group in groups.items()}
+    sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
+    return [name for name in arrays if store.incomplete_chunks(name, sizes)]

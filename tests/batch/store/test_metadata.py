@@ -15,7 +15,6 @@ import pytest
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.store import metadata as documents
-from sobolev_batch.batch.store.hierarchy import sealed
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
@@ -29,11 +28,10 @@ def copy(finished_store: Path, tmp_path: Path) -> Path:
 
 
 def change(store: Path, node: str, how: Callable[[Document], None]) -> None:
-    """Change what the root of a store says of a node, as somebody would who knows of its digest."""
+    """Change what the root of a store says of a node,."""
     root = json.loads((store / "zarr.json").read_text())
     how(root["consolidated_metadata"]["metadata"][node] if node else root)
-    is_whole = isinstance(root.get("attributes"), dict)
-    (store / "zarr.json").write_text(json.dumps(sealed(root) if is_whole else root))
+    (store / "zarr.json").write_text(json.dumps(root))
 
 
 def refusals(store: Path) -> set[str]:

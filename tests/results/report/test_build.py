@@ -20,7 +20,7 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.store.tables import Tables
+from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.meshes.views import make_views
@@ -375,7 +375,7 @@ def test_a_page_shows_one_state_of_a_store(
 
     def make_views_while_a_run_begins(*arguments: Any, **options: Any) -> Any:
         views = make_views(*arguments, **options)
-        Tables(Store.open(store_path)).invalidate()
+        hide_tables(Store.open(store_path))
         return views
 
     monkeypatch.setattr(build, "make_views", make_views_while_a_run_begins)
