@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sobolev_batch import InputError, Mesh, MeshError
+from sobolev_batch import Mesh, MeshError
 from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 from tests.support.shapes import (
     BOX_AREA,
@@ -39,83 +39,45 @@ def with_entry(row: int, column: int, value: float) -> Reals:
 
 
 @pytest.mark.parametrize(
-    ("vertices", "message"),
+    ("vertices", "triangles", "message"),
     [
-        (with_entry(1, 2, np.nan), "1 of 3 vertices have NaN or infinite coordinates: #1 = [3.0, 0.0, nan]"),
-        (with_entry(2, 0, np.inf), "#2 = [inf, 4.0, 0.0]"),
-        (with_entry(0, 1, -np.inf), "#0 = [0.0, -inf, 0.0]"),
-        (np.full((7, 3), np.nan), "7 of 7 vertices have NaN or infinite coordinates: #0 = [nan, nan, nan], #1 ="),
-        (np.array(VERTICES)[:, :2], "vertices must have shape (n, 3), found (3, 2)"),
-        (np.zeros((3, 4)), "found (3, 4)"),
-        (np.zeros(9), "found (9,)"),
-        (np.zeros((1, 3, 3)), "found (1, 3, 3)"),
-        (np.array(VERTICES) * 1j, "vertices must be real numbers, found dtype complex128"),
-        (np.array(VERTICES).astype(str), "vertices must be real numbers, found dtype <U"),
-        (np.array(VERTICES).astype(bool), "vertices must be real numbers, found dtype bool"),
-        (np.array(VERTICES).astype(object), "vertices must be real numbers, found dtype object"),
-        (None, "vertices must be real numbers, found dtype object"),
-        (np.array(VERTICES) * 1e200, "largest absolute coordinate 4e+200; rescale it"),
-        (np.array(VERTICES) * 4e307, "largest absolute coordinate 1.6e+308; rescale it"),
+        (with_entry(1, 2, np.nan), TRIANGLES, "1 of 3 vertices have NaN or infinite coordinates: #1 = [3.0, 0.0, nan]"),
+        (with_entry(0, 1, -np.inf), TRIANGLES, "#0 = [0.0, -inf, 0.0]"),
+        # Also where no triangle uses it.
+        (np.vstack([VERTICES, [np.nan, 0.0, 0.0]]), TRIANGLES, "1 of 4 vertices"),
+        (np.array(VERTICES)[:, :2], TRIANGLES, "vertices must have shape (n, 3), found (3, 2)"),
+        (np.zeros(9), TRIANGLES, "found (9,)"),
+        (np.array(VERTICES) * 1j, TRIANGLES, "vertices must be real numbers, found dtype complex128"),
+        (np.array(VERTICES).astype(str), TRIANGLES, "vertices must be real numbers"),
+        (np.array(VERTICES).astype(bool), TRIANGLES, "vertices must be real numbers"),
+        (None, TRIANGLES, "vertices must be real numbers"),
+        ([[0, 0, 0], [1, 0], [0, 1, 0]], TRIANGLES, "vertices"),
+        (np.array(VERTICES) * 1e200, TRIANGLES, "largest absolute coordinate 4e+200; rescale it"),
+        (np.array(VERTICES) * 4e307, TRIANGLES, "largest absolute coordinate 1.6e+308; rescale it"),
+        (VERTICES, [[0, 1, 2], [0, -1, 2]], "1 of 2 triangles have indices outside 0..2: #1 = [0, -1, 2]"),
+        (VERTICES, [[0, 1, 3]], "1 of 1 triangles have indices outside 0..2: #0 = [0, 1, 3]"),
+        (VERTICES, np.array([[0, 1, 2**63]], dtype=np.uint64), "#0 = [0, 1, 9223372036854775808]"),
+        (np.zeros((0, 3)), TRIANGLES, "#0 = [0, 1, 2]"),
+        (VERTICES, np.array([[0.0, 1.0, 2.0]]), "triangles must be integer indices, found dtype float64"),
+        (VERTICES, np.array([[False, True, True]]), "triangles must be integer indices, found dtype bool"),
+        (VERTICES, np.array([[0, 1, 2]], dtype=object), "triangles must be integer indices"),
+        (VERTICES, [[0, 1, 2], [0, 1]], "triangles"),
+        (VERTICES, [0, 1, 2], "triangles must have shape (m, 3), found (3,)"),
+        (VERTICES, [[0, 1, 2, 0]], "triangles must have shape (m, 3), found (1, 4)"),
+        (VERTICES, [], "no triangles"),
+        (VERTICES, None, "triangles must be integer indices"),
     ],
 )
-def test_bad_vertices_are_named(vertices: Any, message: str) -> None:
+def test_bad_entries_are_named(vertices: Any, triangles: Any, message: str) -> None:
     with pytest.raises(MeshError, match=re.escape(message)):
-        Mesh(vertices, TRIANGLES)
-
-
-@pytest.mark.parametrize(
-    ("triangles", "message"),
-    [
-        ([[0, 1, 2], [0, -1, 2]], "1 of 2 triangles have indices outside 0..2: #1 = [0, -1, 2]"),
-        ([[0, 1, 3]], "1 of 1 triangles have indices outside 0..2: #0 = [0, 1, 3]"),
-        (np.array([[0, 1, 2**63]], dtype=np.uint64), "#0 = [0, 1, 9223372036854775808]"),
-        (np.array([[0, 1, 255]], dtype=np.uint8), "#0 = [0, 1, 255]"),
-        (np.array([[0.0, 1.0, 2.0]]), "triangles must be integer indices, found dtype float64"),
-        (np.array([[False, True, True]]), "triangles must be integer indices, found dtype bool"),
-        (np.array([["0", "1", "2"]]), "triangles must be integer indices, found dtype <U1"),
-        (np.array([[0, 1, 2]], dtype=object), "triangles must be integer indices, found dtype object"),
-        ([0, 1, 2], "triangles must have shape (m, 3), found (3,)"),
-        ([[0, 1, 2, 0]], "triangles must have shape (m, 3), found (1, 4)"),
-        ([[0, 1]], "triangles must have shape (m, 3), found (1, 2)"),
-        ([], "the mesh has no triangles"),
-        (np.zeros((0, 3), dtype=np.int64), "the mesh has no triangles"),
-        (None, "triangles must be integer indices, found dtype object"),
-    ],
-)
-def test_bad_triangles_are_named(triangles: Any, message: str) -> None:
-    with pytest.raises(MeshError, match=re.escape(message)):
-        Mesh(VERTICES, triangles)
+        Mesh(vertices, triangles)
 
 
 def test_long_lists_of_offenders_are_cut() -> None:
-    with pytest.raises(MeshError) as caught:
+    with pytest.raises(MeshError, match=r"5 of 6 .*: #1 = .*, #2 = .*, #3 = \[7, 8, 9\], \.\.\.$") as caught:
         Mesh(VERTICES, [[0, 1, 2], *([[7, 8, 9]] * 5)])
-    assert str(caught.value) == (
-        "5 of 6 triangles have indices outside 0..2: #1 = [7, 8, 9], #2 = [7, 8, 9], #3 = [7, 8, 9], ..."
-    )
-    with pytest.raises(MeshError) as caught:
-        Mesh(VERTICES, [[7, 8, 9]] * 3)
-    assert str(caught.value).endswith("#2 = [7, 8, 9]")
-
-
-def test_a_bad_vertex_counts_even_where_no_triangle_uses_it() -> None:
-    with pytest.raises(MeshError, match=r"1 of 4 vertices .* #3 = \[nan, 0\.0, 0\.0\]"):
-        Mesh(np.vstack([VERTICES, [np.nan, 0.0, 0.0]]), TRIANGLES)
-
-
-def test_triangles_without_any_vertices_are_out_of_range() -> None:
-    with pytest.raises(MeshError, match=r"1 of 1 triangles have indices outside .*#0 = \[0, 1, 2\]"):
-        Mesh(np.zeros((0, 3)), TRIANGLES)
-
-
-@pytest.mark.parametrize(
-    ("vertices", "triangles"),
-    [([[0, 0, 0], [1, 0], [0, 1, 0]], TRIANGLES), (VERTICES, [[0, 1, 2], [0, 1]])],
-    ids=["vertices", "triangles"],
-)
-def test_rows_of_unequal_length_are_refused(vertices: Any, triangles: Any) -> None:
-    with pytest.raises(MeshError, match=r"vertices|triangles"):
-        Mesh(vertices, triangles)
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (type(again), str(again)) == (MeshError, str(caught.value))
 
 
 @pytest.mark.parametrize(
@@ -138,14 +100,6 @@ def test_coordinates_beyond_double_precision_are_refused() -> None:
     wide = np.array([[0, 0, 0], [np.longdouble("1e400"), 0, 0], [0, 1, 0]], dtype=np.longdouble)
     with pytest.raises(MeshError, match="coordinates"):
         Mesh(wide, TRIANGLES)
-
-
-def test_errors_survive_pickling_and_are_input_errors() -> None:
-    with pytest.raises(InputError) as caught:
-        Mesh(VERTICES, [[0, 1, 9]])
-    again = pickle.loads(pickle.dumps(caught.value))
-    assert type(again) is MeshError
-    assert str(again) == str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -196,15 +150,6 @@ def test_what_counts_as_zero_area_does_not_depend_on_the_unit(scale: float) -> N
     mesh = Mesh(scale * np.array(needle + flat), [[0, 1, 2], [3, 4, 5]])
     assert mesh.counts.zero_area == 1
     assert mesh.areas[0] == pytest.approx(0.5e-13 * scale**2)
-
-
-def test_a_needle_of_extreme_lengths_raises_nothing_but_mesh_errors() -> None:
-    # Its area, 1/2, can be told; the squares of its sides cannot.
-    try:
-        mesh = Mesh([[0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]], TRIANGLES)
-    except MeshError:
-        return
-    assert mesh.area == pytest.approx(0.5)
 
 
 def test_lengths_whose_squares_overflow_are_refused_whatever_else_there_is() -> None:
@@ -274,8 +219,10 @@ def test_bounds_are_those_of_the_vertices_in_use() -> None:
     assert mesh.used_vertices.tolist() == [1, 2, 3]
 
 
-@pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4", ">f4", "f2", "i1", "<u8", ">i4"])
-@pytest.mark.parametrize("index_dtype", ["<i8", ">i8", "<i4", "u1", "<u8"])
+@pytest.mark.parametrize(
+    ("dtype", "index_dtype"),
+    [("<f8", ">i8"), (">f8", "<i4"), ("<f4", "u1"), (">f4", "<u8"), ("f2", "<i8"), ("i1", "<i8"), ("<u8", "<i8")],
+)
 def test_all_real_types_make_the_same_mesh(dtype: str, index_dtype: str) -> None:
     mesh = Mesh(np.array(VERTICES, dtype=dtype), np.array(TRIANGLES, dtype=index_dtype))
     assert mesh.vertices.dtype == np.float64
@@ -291,46 +238,25 @@ def test_single_precision_is_widened_not_rounded_again() -> None:
     assert mesh.vertices[1, 0] == float(np.float32(3) * third)
 
 
-def test_arrays_are_copies() -> None:
-    vertices, triangles = np.array(VERTICES), np.array(TRIANGLES)
-    mesh = Mesh(vertices, triangles)
-    vertices[:] = 7.0
-    triangles[:] = 0
-    assert mesh.vertices.tolist() == VERTICES
-    assert mesh.triangles.tolist() == TRIANGLES
-    assert vertices.flags.writeable
-    assert not np.shares_memory(mesh.vertices, vertices)
-
-
-def test_views_of_larger_arrays_do_not_leak_later_changes() -> None:
-    store = np.zeros((6, 3))
+def test_arrays_are_copies_also_of_views() -> None:
+    store, triangles = np.zeros((6, 3)), np.array(TRIANGLES)
     store[::2] = VERTICES
-    mesh = Mesh(store[::2], TRIANGLES)
-    store[:] = np.nan
-    assert mesh.vertices.tolist() == VERTICES
+    meshes = Mesh(store[::2], triangles), Mesh(np.array(VERTICES), triangles)
+    store[:], triangles[:] = np.nan, 0
+    for mesh in meshes:
+        assert mesh.vertices.tolist() == VERTICES
+        assert mesh.triangles.tolist() == TRIANGLES
 
 
-@pytest.mark.parametrize("name", ["vertices", "triangles", "areas", "edge_lengths", "centroid_radii", "used_vertices"])
-def test_arrays_are_read_only(name: str) -> None:
+def test_meshes_are_frozen() -> None:
     mesh = tetrahedron()
-    with pytest.raises(ValueError, match="read-only"):
-        getattr(mesh, name)[0] = 0
-
-
-def test_bounds_are_read_only() -> None:
-    for array in tetrahedron().bounds:
+    names = ("vertices", "triangles", "areas", "edge_lengths", "centroid_radii", "used_vertices")
+    for array in (*(getattr(mesh, name) for name in names), *mesh.bounds):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
-
-
-@pytest.mark.parametrize("name", ["vertices", "triangles", "anything"])
-def test_attributes_cannot_be_set(name: str) -> None:
-    with pytest.raises(FrozenInstanceError):
-        setattr(tetrahedron(), name, None)
-
-
-def test_a_mesh_says_how_large_it_is() -> None:
-    assert repr(tetrahedron()) == "Mesh(4 vertices, 4 triangles)"
+    for name in (*names, "anything"):
+        with pytest.raises((FrozenInstanceError, AttributeError)):
+            setattr(mesh, name, None)
 
 
 @seeded

