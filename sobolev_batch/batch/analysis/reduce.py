@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -51,7 +51,8 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     """
     if are_tabulated(workspace):
         return None
-    complete, every_pair = list(workspace.complete), workspace.plan.study.pairs == "all"
+    order, every_pair = TableOrder.of(workspace), workspace.plan.study.pairs == "all"
+    complete = list(workspace.complete)
     reducer, threads = make_reducer(workspace), cluster.workers.threads
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
@@ -59,7 +60,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     if every_pair:
         tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(complete, threads)]
     steps = Steps(cluster.notify, "reduction", len(tasks))
-    results = Results.empty(len(workspace.plan.study.orders), len(workspace.labels), every_pair=every_pair)
+    results = Results.empty(len(workspace.plan.study.orders), order.rows, every_pair=every_pair)
     for task, outcome in cluster.results(tasks, projected_bytes):
         if task.function == reducer.norms:
             results.enter_norms(outcome, *task.arguments)
@@ -67,51 +68,64 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
             results.enter_tile(outcome, *task.arguments)
         steps.advance()
     results.enter_reference(workspace.reference)
-    _write_tables(workspace, results)
+    _write_tables(workspace, order, results)
     return NormEstimate(*results.to_reference)
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The results of a reduction, NaN where there are none.
+    """The results of a reduction in the order of tables, NaN where there are none.
+
+    The distances of all pairs are much of the memory that a run takes: no copy of them is made.
 
     Attributes:
+        places: Place of each row of the store in the tables.
         norms: (5, orders, rows), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, rows), distances to the reference.
         proportions: (3, orders, rows), decomposition of these distances.
         distances: (5, orders, rows, others), distances of all pairs, or to the reference alone.
     """
 
+    places: Mapping[int, int]
     norms: Reals
     to_reference: Reals
     proportions: Reals
     distances: Reals
 
     @classmethod
-    def empty(cls, orders: int, rows: int, *, every_pair: bool) -> Self:
-        """Return the results before any task, for numbers of orders and rows."""
-        others = rows if every_pair else 1
-        shapes = (5, orders, rows), (5, orders, rows), (3, orders, rows), (5, orders, rows, others)
-        return cls(*(np.full(shape, np.nan) for shape in shapes))
+    def empty(cls, orders: int, rows: Sequence[int], *, every_pair: bool) -> Self:
+        """Return the results before any task.
+
+        Args:
+            orders: Number of orders.
+            rows: Rows of the store, in the order of tables.
+            every_pair: True for the distances of all pairs, False for those to the reference alone.
+        """
+        count, others = len(rows), len(rows) if every_pair else 1
+        shapes = (5, orders, count), (5, orders, count), (3, orders, count), (5, orders, count, others)
+        return cls({row: place for place, row in enumerate(rows)}, *(np.full(shape, np.nan) for shape in shapes))
 
     def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.norms` for some rows."""
         norms, to_reference, proportions = outcome
-        self.norms[..., rows] = np.stack(list(norms))
-        self.to_reference[..., rows] = np.stack(list(to_reference))
-        self.proportions[..., rows] = np.stack(list(proportions))
+        places = [self.places[row] for row in rows]
+        self.norms[..., places] = np.stack(list(norms))
+        self.to_reference[..., places] = np.stack(list(to_reference))
+        self.proportions[..., places] = np.stack(list(proportions))
 
     def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
-        pairs, i, j = np.stack(list(outcome)), np.array(rows), np.array(others)
+        pairs = np.stack(list(outcome))
+        i, j = (np.array([self.places[row] for row in side]) for side in (rows, others))
         self.distances[..., i[:, None], j] = pairs
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
     def enter_reference(self, reference: int) -> None:
         """Enter the distances to the row of the reference, once all norms are there."""
-        if self.distances.shape[-1] > 1:
+        if self.distances.shape[-1] == self.distances.shape[-2]:
             # The direct sums are the more exact ones, and the same numbers in both tables.
-            self.distances[..., reference] = self.distances[..., reference, :] = self.to_reference
+            place = self.places[reference]
+            self.distances[..., place] = self.distances[..., place, :] = self.to_reference
         else:
             self.distances[..., 0] = self.to_reference
 
@@ -134,20 +148,21 @@ class StoredFields:
     tail: TailSampling | None
     reference: int
 
-    def results(self, orders: tuple[float, ...], *, every_pair: bool) -> Results:
+    def results(self, orders: tuple[float, ...], rows: Sequence[int], *, every_pair: bool) -> Results:
         """Compute norms and distances in this process, with the memory of one task.
 
         Args:
             orders: Sobolev orders s.
+            rows: Rows of the store, in the order of tables.
             every_pair: True for the distances of all pairs, False for those to the reference alone.
 
         Raises:
             DamageError: A field is not what was stored.
         """
-        reducer, complete = self.reducer(orders), list(complete_records(self.records))
-        results = Results.empty(len(orders), len(self.records), every_pair=every_pair)
-        for rows in reducer.row_batches(complete, 1):
-            results.enter_norms(reducer.norms(rows), rows)
+        reducer, results = self.reducer(orders), Results.empty(len(orders), rows, every_pair=every_pair)
+        complete = [row for row in complete_records(self.records) if row in results.places]
+        for batch in reducer.row_batches(complete, 1):
+            results.enter_norms(reducer.norms(batch), batch)
         for tile in reducer.tiles(complete, 1) if every_pair else ():
             results.enter_tile(reducer.tile(*tile), *tile)
         results.enter_reference(self.reference)
@@ -197,20 +212,16 @@ def make_reducer(workspace: Workspace) -> Reducer:
     return fields.reducer(plan.study.orders)
 
 
-def _write_tables(workspace: Workspace, results: Results) -> None:
+def _write_tables(workspace: Workspace, order: TableOrder, results: Results) -> None:
     plan, store = workspace.plan, workspace.store
     orders, reference = plan.study.orders, workspace.reference
-    order = TableOrder.of(workspace)
-    shown = list(order.rows)
-    rows = [workspace.rows[i] for i in shown]
-    is_every_pair = plan.study.pairs == "all"
-    distances = results.distances[..., shown, :][..., shown if is_every_pair else [0]]
-    meshes = meshes_dataset(rows, [workspace.records[i] for i in shown], order)
+    rows = [workspace.rows[i] for i in order.rows]
+    meshes = meshes_dataset(rows, [workspace.records[i] for i in order.rows], order)
     to_reference = DistancesToReference(
         plan.reference,
-        NormEstimate(*results.to_reference[..., shown]),
-        Proportion(*results.proportions[..., shown]),
-        NormEstimate(*results.norms[..., reference]),
+        NormEstimate(*results.to_reference),
+        Proportion(*results.proportions),
+        NormEstimate(*results.norms[..., results.places[reference]]),
     )
     sizes, families = meshes["edge_length_mean"].to_numpy(), order.families_with_rates(workspace.rows)
     convergence = convergence_dataset(
@@ -219,10 +230,10 @@ def _write_tables(workspace: Workspace, results: Results) -> None:
     replaced = hide_tables(store)
     store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
     write_table(store, "meshes", meshes, instead_of=replaced)
-    norms = norms_dataset(meshes.coords, orders, NormEstimate(*results.norms[..., shown]))
+    norms = norms_dataset(meshes.coords, orders, NormEstimate(*results.norms))
     write_table(store, "norms", norms, instead_of=replaced)
-    others = [row.label for row in (rows if is_every_pair else [workspace.rows[reference]])]
-    pairs = distances_dataset(meshes.coords, others, orders, NormEstimate(*distances))
+    others = [row.label for row in (rows if plan.study.pairs == "all" else [workspace.rows[reference]])]
+    pairs = distances_dataset(meshes.coords, others, orders, NormEstimate(*results.distances))
     write_table(store, "distances", pairs, instead_of=replaced)
     # Written last: its digest says that all tables belong to the fields that are stored.
     write_table(store, "convergence", convergence.assign_attrs(digest=_digest(workspace)), instead_of=replaced)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 
 Reals = NDArray[np.float64]
+T = TypeVar("T", Sums, Tail)
 Complexes = NDArray[np.complex128]
 
 # Others that are multiplied with the rows of a tile at a time: nearly as fast as all of them at once.
@@ -33,8 +35,27 @@ _GROUP = 32
 _READ_AT_ONCE = 8
 # For fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
 _FEWEST_ROWS = 4
+# Factor of the errors of surfaces that are not equal.
+_APART = np.ones(())
 # The others of a tile for each of its rows: they only pass through, and its rows are read but once for them.
 _TILE_LENGTH = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Parts(Generic[T]):
+    """What norms and distances are made of, on the lattice or beyond it.
+
+    Attributes:
+        own: Rows.
+        difference: Differences of the rows from the reference.
+        product: Scalar products of these differences with the reference, (orders, rows).
+        reference: Reference, as a single row.
+    """
+
+    own: T
+    difference: T
+    product: Reals
+    reference: T
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,71 +134,61 @@ class Reducer:
 
         Without the reference's field, all but the norms are NaN.
         """
+        rows = list(rows)
+        lattice = self._lattice_part(rows)
+        tail = None if self.tails is None else self._tail_part(self.tails, rows, lattice)
+        own = self._estimate(lattice.own, None if tail is None else tail.own, self.areas[rows], self.errors[:, rows])
+        if self.reference is None:
+            unknown = np.full_like(own.values, np.nan)
+            return own, NormEstimate(*[unknown] * 5), Proportion(*[unknown] * 3)
+        # The reference's distance to itself is zero, and nothing is uncertain about that.
+        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
+        areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
+        errors = errors + self.errors[:, [self.reference]]
+        difference = None if tail is None else tail.difference
+        distances = self._estimate(lattice.difference, difference, areas, errors, apart)
+        product, reference = lattice.product, lattice.reference.totals
+        if tail is not None:
+            # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+            beyond = tail.own.beyond - tail.reference.beyond - tail.difference.beyond * apart
+            product = product + tail.product + beyond / 2 * apart
+            reference = reference + tail.reference.squares
+        return own, distances, Proportion.of_totals(distances.values**2, product, reference[:, 0])
+
+    def _lattice_part(self, rows: Sequence[int]) -> Parts[Sums]:
+        """Return the sums over the lattice; zero without the reference."""
         own = np.zeros((len(rows), self.lattice.shell_count))
-        to_reference, products = np.zeros_like(own), np.zeros_like(own)
-        of_reference = np.zeros(self.lattice.shell_count)
+        differences, products, reference_sums = np.zeros_like(own), np.zeros_like(own), np.zeros_like(own[:1])
         for number, block in enumerate(self.blocks):
-            reference = None if self.reference is None else self.read([self.reference], number)[0]
+            reference = None if self.reference is None else self.read([self.reference], number)
             if reference is not None:
-                of_reference += shell_sums(reference, None, self.lattice, block)
+                reference_sums += shell_sums(reference, None, self.lattice, block)
             for batch in _slices(len(rows), self._read_at_once):
                 values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
                 if reference is not None:
                     values -= reference
-                    to_reference[batch] += shell_sums(values, None, self.lattice, block)
-                    references = np.broadcast_to(reference, values.shape)
-                    products[batch] += shell_sums(values, references, self.lattice, block)
-        of_rows = self.areas[list(rows)], self.errors[:, list(rows)]
-        if self.tails is not None:
-            sums = [sums_of_shells(one, self.weights) for one in (own, to_reference, products, of_reference[None])]
-            return self._with_tails(self.tails, rows, sums)
-        norms = self._estimate(sums_of_shells(own, self.weights), *of_rows)
-        if self.reference is None:
-            return norms, *self._unknown(norms)
-        # The reference's distance to itself is zero, and nothing is uncertain about that.
-        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
-        areas = (of_rows[0] + self.areas[self.reference]) * apart
-        errors = (of_rows[1] + self.errors[:, [self.reference]]) * apart
-        distances = self._estimate(sums_of_shells(to_reference, self.weights), areas, errors)
-        return norms, distances, Proportion.of_shells(to_reference, products, of_reference, self.weights)
+                    differences[batch] += shell_sums(values, None, self.lattice, block)
+                    products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
+        sums = [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
+        return Parts(sums[0], sums[1], sums[2].totals, sums[3])
 
-    def _with_tails(
-        self, tails: TailReducer, rows: Sequence[int], sums: Sequence[Sums]
-    ) -> tuple[NormEstimate, NormEstimate, Proportion]:
-        """Return what `norms` does, from sums of the rows, their differences, products with the reference, and it."""
-        own, to_reference, products, of_reference = sums
+    def _tail_part(self, tails: TailReducer, rows: Sequence[int], lattice: Parts[Sums]) -> Parts[Tail]:
+        """Return the tails beyond the lattice; those of the norms stand for the others without the reference."""
         reference = None if self.reference is None else tails.read(self.reference)
-        of_norms, of_pairs, of_products = [], [], []
+        own, differences, products = [], [], []
         for i, row in enumerate(rows):
             values = tails.read(row)
-            of_norms.append(tails.of_norm(row, values, own.outer[:, i]))
-            if reference is None or self.reference is None:
-                continue
-            difference = values - reference
-            of_pairs.append(tails.of_pair(row, self.reference, difference, to_reference.outer[:, i]))
-            of_products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
-        norm_tail = Tail.stacked(of_norms)
-        norms = norm_tail.estimate(own.totals, aliased(own, self.weights, self.widths), self.errors[:, list(rows)])
+            own.append(tails.of_norm(row, values, lattice.own.outer[:, i]))
+            if reference is not None and self.reference is not None:
+                difference = values - reference
+                differences.append(tails.of_pair(row, self.reference, difference, lattice.difference.outer[:, i]))
+                products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
+        norms = Tail.stacked(own)
         if reference is None or self.reference is None:
-            return norms, *self._unknown(norms)
-        # The reference's distance to itself is zero, and nothing is uncertain about that.
-        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
-        pair_tail = Tail.stacked(of_pairs).scaled(apart)
-        errors = (self.errors[:, list(rows)] + self.errors[:, [self.reference]]) * apart
-        images = aliased(to_reference, self.weights, self.widths) * apart
-        distances = pair_tail.estimate(to_reference.totals, images, errors)
-        own_tail = tails.of_norm(self.reference, reference, of_reference.outer[:, 0])
-        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-        rest = (norm_tail.beyond - own_tail.beyond[:, None] - pair_tail.beyond) / 2 * apart
-        product = products.totals + np.stack(of_products, axis=-1) + rest
-        reference_square = of_reference.totals[:, 0] + own_tail.squares
-        return norms, distances, Proportion.of_totals(distances.values**2, product, reference_square)
-
-    @staticmethod
-    def _unknown(norms: NormEstimate) -> tuple[NormEstimate, Proportion]:
-        unknown = np.full_like(norms.values, np.nan)
-        return NormEstimate(*[unknown] * 5), Proportion(*[unknown] * 3)
+            return Parts(norms, norms, norms.beyond, norms)
+        of_reference = tails.of_norm(self.reference, reference, lattice.reference.outer[:, 0])
+        return Parts(norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference]))
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances of rows to other rows, over (orders, rows, others).
@@ -201,16 +212,27 @@ class Reducer:
             for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
                 square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
-        areas = (self.areas[list(rows)][:, None] + self.areas[list(others)]) * unequal
-        errors = (self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]) * unequal
-        if self.tails is not None:
-            tail = self.tails.of_pairs(rows, others, sums.outer, shared)
-            images = aliased(sums, self.weights, self.widths) * unequal
-            return tail.estimate(sums.totals, images, errors)
-        return self._estimate(sums, areas, errors)
+        areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
+        errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
+        tail = None if self.tails is None else self.tails.of_pairs(rows, others, sums.outer, shared)
+        return self._estimate(sums, tail, areas, errors, unequal)
 
-    def _estimate(self, sums: Sums, areas: Reals, errors: Reals) -> NormEstimate:
-        return estimate_norms(sums, self.weights, Support(areas, self.widths), errors)
+    def _estimate(
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, apart: Reals = _APART
+    ) -> NormEstimate:
+        """Return norms with their errors, which are zero where surfaces are equal.
+
+        Args:
+            sums: Sums over the lattice.
+            tail: Tails beyond it; None where the fields are all there is.
+            areas: Areas of the surfaces, of both of a pair together.
+            errors: Norms of the errors of the fields, likewise.
+            apart: 0 for pairs of equal surfaces, else 1.
+        """
+        if tail is None:
+            return estimate_norms(sums, self.weights, Support(areas * apart, self.widths), errors * apart)
+        images = aliased(sums, self.weights, self.widths) * apart
+        return tail.scaled(apart).estimate(sums.totals, images, errors * apart)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

@@ -24,6 +24,8 @@ from sobolev_batch.errors import DamageError
 _GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS)
 # By the kind of a dtype: of strings, complex and real numbers.
 _FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
+# Of an array of a table in memory: distances of all pairs of many meshes are cut along the first axis.
+_LARGEST_CHUNK_BYTES = 64 << 20
 
 
 def array_keys(
@@ -50,10 +52,10 @@ def array_keys(
 
 
 def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
-    """Return the keys of a group with the arrays of a dataset, one chunk each, with checksums."""
+    """Return the keys of a group with the arrays of a dataset, with checksums, one chunk each unless they are large."""
     keys: dict[str, Buffer] = {}
     encoding = {
-        str(name): {"compressors": (Crc32cCodec(),), "chunks": variable.shape}
+        str(name): {"compressors": (Crc32cCodec(),), "chunks": (_steps(variable), *variable.shape[1:])}
         for name, variable in dataset.variables.items()
         if variable.ndim
     }
@@ -61,6 +63,11 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     with zarr.config.set({"array.write_empty_chunks": True}):
         dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
     return _bytes_of(keys)
+
+
+def _steps(variable: xr.Variable) -> int:
+    """Return the length of a chunk along the first axis."""
+    return max(1, min(variable.shape[0], _LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
 
 
 def _bytes_of(keys: dict[str, Buffer]) -> dict[str, bytes]:
@@ -81,7 +88,7 @@ def hide_tables(store: Store) -> tuple[str, ...]:
 
 
 def write_table(store: Store, group: str, dataset: xr.Dataset, *, instead_of: Sequence[str] = ()) -> None:
-    """Replace a group, each array in one chunk. Readers find it after `Store.consolidate`.
+    """Replace a group. Readers find it after `Store.consolidate`.
 
     Args:
         store: Store of the table.
@@ -89,11 +96,15 @@ def write_table(store: Store, group: str, dataset: xr.Dataset, *, instead_of: Se
         dataset: New content of the group.
         instead_of: Names of tables that were hidden. Those that the group no longer has are removed.
     """
-    keys = dataset_keys(group, dataset)
     for name in instead_of:
-        if name.startswith(f"{group}/") and f"{name}/{ROOT}" not in keys:
+        if name.startswith(f"{group}/") and name.removeprefix(f"{group}/") not in dataset.variables:
             store.location.remove(name)
-    store.publish(keys, last=f"{group}/{ROOT}")
+    last, large = f"{group}/{ROOT}", [name for name, values in dataset.items() if values.nbytes > _LARGEST_CHUNK_BYTES]
+    # One after the other, since keys are copies.
+    for array in large:
+        keys = dataset_keys(group, dataset[[array]].drop_vars(list(dataset.coords)))
+        store.publish({key: content for key, content in keys.items() if key != last})
+    store.publish(dataset_keys(group, dataset.drop_vars(large)), last=last)
 
 
 def table_attributes(store: Store, group: str) -> dict[str, Any] | None:

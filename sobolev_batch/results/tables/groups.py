@@ -189,13 +189,13 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     if not others:
         return stored.sel(order=chosen)
     fields, meshes = stored_fields(tree), finished_group(tree, "meshes")
-    results, numbers = fields.results(others, every_pair=False), meshes["row"].values.tolist()
+    results = fields.results(others, meshes["row"].values.tolist(), every_pair=False)
     require_unchanged(tree)
     to_reference = DistancesToReference(
         reference_of(tree),
-        NormEstimate(*results.to_reference[..., numbers]),
-        Proportion(*results.proportions[..., numbers]),
-        NormEstimate(*results.norms[..., fields.reference]),
+        NormEstimate(*results.to_reference),
+        Proportion(*results.proportions),
+        NormEstimate(*results.norms[..., results.places[fields.reference]]),
     )
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
     sizes, families = meshes["edge_length_mean"].to_numpy(), _sequences(meshes)
@@ -218,10 +218,9 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
         return stored.sel(order=chosen)
     fields, every_pair = stored_fields(tree), stored.sizes["other"] == stored.sizes["mesh"]
     meshes = finished_group(tree, "meshes")
-    numbers = meshes["row"].values.tolist()
-    distances = fields.results(others, every_pair=every_pair).distances[..., numbers, :]
+    results = fields.results(others, meshes["row"].values.tolist(), every_pair=every_pair)
     require_unchanged(tree)
-    estimate = NormEstimate(*distances[..., numbers if every_pair else [0]])
+    estimate = NormEstimate(*results.distances)
     return _joined(stored, distances_dataset(meshes.coords, stored["other"].values, others, estimate), chosen)
 
 
