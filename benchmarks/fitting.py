@@ -40,7 +40,7 @@ def fits(effort: Effort) -> Iterator[Row]:
 
 def _derivative(level: int, intervals: int, effort: Effort) -> Row:
     mesh, lattice = sb.icosphere(level), sb.Lattice(2.0 if effort.quick else 5.0, intervals)
-    squared = sb.SquaredDistance.of(mesh, sb.Sphere(0.9), -2.0, lattice=lattice, threads=effort.threads)
+    squared = sb.SquaredDistance.for_mesh(mesh, sb.Sphere(0.9), -2.0, lattice=lattice, threads=effort.threads)
     vertices = np.array(mesh.vertices)
     value, both = take_turns([squared.value, squared], lambda: vertices, effort.repeats)
     what = f"T_{level}, M = {intervals}: value and derivative, against the value"

@@ -16,7 +16,7 @@ The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`, `inner_product`.
 - The causes of a distance: `proportion` (area or shape), `spectrum` (wavelengths), `witness` (places).
-- Meshes made by the metric: `fit` and `refine` give a `Fit`, with its `Closeness` before and after, and `FitProgress`
+- Meshes made by the metric: `fit` and `refine` give a `Fit`, with its `FitQuality` before and after, and `FitProgress`
   on the way; `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for
   tensors.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.

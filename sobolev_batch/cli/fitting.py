@@ -16,11 +16,10 @@ from sobolev_batch.cli.group import cli
 from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.cli.output import echo, progress_bar
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 
 if TYPE_CHECKING:
-    from sobolev_batch.fitting.closeness import Closeness
-    from sobolev_batch.fitting.optimisation.stages import FitProgress
+    from sobolev_batch.fitting.fit import FitProgress, FitQuality
     from sobolev_batch.surfaces.shapes.mesh import Mesh
     from sobolev_batch.surfaces.shapes.similarity import Similarity
 
@@ -75,8 +74,8 @@ def fit_command(
     import numpy as np
 
     from sobolev_batch.fitting.fit import fit
+    from sobolev_batch.fitting.problem import require_comparable
     from sobolev_batch.fitting.refine import refine
-    from sobolev_batch.fitting.task import require_comparable
     from sobolev_batch.surfaces.formats.objects import require_writable, write_mesh
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -161,15 +160,15 @@ class _Steps:
             self._bar.update(progress.step - self._bar.pos)
 
 
-def _text(closeness: Closeness, scale: float) -> str:
+def _text(quality: FitQuality, scale: float) -> str:
     """Return the numbers on one line, lengths in the files' unit."""
     from sobolev_batch.results.tables.formatting import percent, with_error
 
-    if not math.isfinite(closeness.distance):
+    if not math.isfinite(quality.distance):
         return "not measured"
-    relative = percent(closeness.relative, closeness.relative_error)
-    parts = [f"differs by {relative}, distance {with_error(closeness.distance, closeness.error)}"]
-    if math.isfinite(closeness.hausdorff):
-        parts.append(f"Hausdorff ≥ {closeness.hausdorff / scale:.3g}")
-        parts.append(f"Chamfer {closeness.chamfer / scale:.3g}")
-    return ", ".join([*parts, f"smallest angle {closeness.smallest_angle:.3g} degrees"])
+    relative = percent(quality.relative, quality.relative_error)
+    parts = [f"differs by {relative}, distance {with_error(quality.distance, quality.error)}"]
+    if math.isfinite(quality.hausdorff):
+        parts.append(f"Hausdorff ≥ {quality.hausdorff / scale:.3g}")
+        parts.append(f"Chamfer {quality.chamfer / scale:.3g}")
+    return ", ".join([*parts, f"smallest angle {quality.smallest_angle:.3g} degrees"])

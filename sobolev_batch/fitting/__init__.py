@@ -2,3 +2,6 @@
 
 In: meshes, and surfaces or fields as their targets. Out: gradients, fitted meshes and reports about them.
 """
+
+# Here, as the command line shows them without importing what computes.
+DEFAULT_ORDER, DEFAULT_STEPS, DEFAULT_SMOOTHING = -2.0, 150, 0.25

@@ -3,25 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.closeness import Closeness
-from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.fitting.optimisation.descent import End
-from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run
-from sobolev_batch.fitting.task import FitTask
+from sobolev_batch.errors import AccuracyError, InputError
+from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting.descent import End, Smoothing, descend, smallest_angle
+from sobolev_batch.fitting.problem import FitProblem, FitSettings, OrderWeights
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
+from sobolev_batch.spectral.metrics.norms import distance
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
+from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
+Reals = NDArray[np.float64]
+
+# Relative errors of distances that are asked for, one after the other.
+_RTOLS = (0.02, 0.1)
+# Beyond this relative distance at the coarse order, a mesh is far from its target.
+_FAR = 0.05
+# Smoothing of the stages that bring a far mesh near, and the fraction of all steps for each.
+_FAR_SMOOTHINGS, _FAR_STEPS = (16.0, 4.0), 0.25
+# After a step that would turn triangles over, smoothing is increased by this factor, so often at most.
+_SMOOTHER, _MOST_RETREATS = 4.0, 4
 # Growth of the Hausdorff distance that a user should know.
 _HAUSDORFF_GROWTH = 1.5
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """Distances of a mesh from its target, and the quality of its triangles.
+
+    Attributes:
+        distance: Sobolev distance, in the square root of a unit length.
+        error: Error of the distance.
+        hausdorff: Hausdorff distance, a lower bound in units of length; NaN without VTK or a target of triangles.
+        chamfer: Chamfer distance, in units of length; NaN likewise.
+        smallest_angle: Smallest angle of all triangles, in degrees.
+        relative: Distance over the norm of the target.
+        relative_error: Error of that.
+
+    >>> import sobolev_batch as sb
+    >>> sb.FitQuality(distance=0.5, error=0.01, smallest_angle=30.0).distance
+    0.5
+    """
+
+    distance: float
+    error: float
+    hausdorff: float = np.nan
+    chamfer: float = np.nan
+    smallest_angle: float = np.nan
+    relative: float = np.nan
+    relative_error: float = np.nan
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """The state of a fit after a step.
+
+    Attributes:
+        step: Number of steps so far.
+        steps: Largest number of steps.
+        relative: Square root of what the descent lowers, which is about 1 at the start of each stage: a weighted sum
+            of squared distances, and a small penalty for triangles that lose their shape.
+
+    >>> import sobolev_batch as sb
+    >>> sb.FitProgress(step=3, steps=150, relative=0.5).relative
+    0.5
+    """
+
+    step: int
+    steps: int
+    relative: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +89,8 @@ class Fit:
     Attributes:
         mesh: The mesh, in the start's unit of length; from `fit` with the triangles of the start.
         order: Order s of the distance that was lowered.
-        before: Closeness of the start to the target.
-        after: Closeness of the fitted mesh.
+        before: Distances of the start from the target.
+        after: Distances of the fitted mesh.
         steps: Number of steps that were taken.
         end: Why the fit ended.
         remarks: What a user should know about the mesh, as sentences.
@@ -45,8 +103,8 @@ class Fit:
 
     mesh: Mesh
     order: float
-    before: Closeness
-    after: Closeness
+    before: FitQuality
+    after: FitQuality
     steps: int
     end: str
     remarks: tuple[str, ...] = ()
@@ -85,7 +143,7 @@ def fit(
         notify: Called after each step.
 
     Returns:
-        The fitted mesh with its closeness before and after. It is never farther away than the start by more than the
+        The fitted mesh with its distances before and after. It is never farther away than the start by more than the
         reported errors.
 
     Raises:
@@ -101,55 +159,155 @@ def fit(
     """
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    task = FitTask.of(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
-    before = measured(task)
-    fitted, run = task.run(notify)
-    return concluded(mesh, before, task, fitted, run)
+    problem = FitProblem.for_target(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
+    before = start_quality(problem)
+    run = FitRun(problem, notify)
+    return conclude(mesh, before, run, run.finish())
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `fit` finds, without measures of its closeness.
+    """Return the mesh that `fit` finds, without measures of its distance.
 
     Raises:
         LatticeError: The mesh does not fit into the lattice of a field.
         InputError: See `fit`.
     """
-    task = FitTask.of(mesh, target, None, settings, execution)
-    fitted, _ = task.run()
-    return task.own(fitted)
+    problem = FitProblem.for_target(mesh, target, None, settings, execution)
+    return problem.given_mesh(FitRun(problem).finish())
 
 
-def measured(task: FitTask) -> Closeness:
-    """Return the closeness of the start.
+class FitRun:
+    """A fit that is under way.
+
+    Attributes:
+        vertices: Positions (n, 3) after the last step, in units of length.
+        taken: Number of steps so far.
+        end: Why the last descent ended.
+    """
+
+    def __init__(self, problem: FitProblem, notify: Callable[[FitProgress], None] | None = None) -> None:
+        self.problem, self.notify, self.free = problem, notify, problem.free_vertices
+        self.taken = 0
+        self.end = End.CONVERGED
+        self.vertices = np.asarray(problem.start.vertices)
+
+    def finish(self) -> Mesh:
+        """Carry the fit out, and return the prepared mesh at its end, or the start if that is nearer."""
+        start, order = self.vertices, self.problem.settings.order
+        self.descend()
+        try:
+            before, after = (self.problem.squares(vertices, [order])[0] for vertices in (start, self.vertices))
+        except KeyboardInterrupt:
+            self.end = End.INTERRUPTED
+        else:
+            if after > before:
+                self.vertices, self.end = start, End.FARTHER
+        return Mesh(self.vertices, self.problem.start.triangles)
+
+    def descend(self) -> None:
+        """Move the vertices to the end of all stages, or to the last step before an interrupt."""
+        try:
+            for shares, smoothing, steps in self._stages():
+                self._descend(shares, smoothing, steps)
+        except KeyboardInterrupt:
+            self.end = End.INTERRUPTED
+
+    def _stages(self) -> list[tuple[OrderWeights, float, int]]:
+        """Return shares of orders, smoothing and largest number of steps of each stage, from coarse to fine.
+
+        A far mesh comes near at a coarse order first.
+        """
+        settings = self.problem.settings
+        stages: list[tuple[OrderWeights, float, int]] = []
+        smoothing, left = settings.smoothing, settings.steps
+        if self.problem.relative_distance(settings.coarse_order) > _FAR:
+            part = max(1, int(_FAR_STEPS * settings.steps))
+            stages = [(((settings.coarse_order, 1.0),), amount, part) for amount in _FAR_SMOOTHINGS]
+            smoothing, left = max(smoothing, _FAR_SMOOTHINGS[-1]), left - part * len(stages)
+        return [*stages, (settings.shares, smoothing, max(1, left))]
+
+    def _descend(self, shares: OrderWeights, amount: float, steps: int) -> None:
+        """Go through a stage: descents with ever finer fields, and smoother steps where needed."""
+        problem = self.problem
+        weights = problem.relative_to(self.vertices, shares)
+        smoothing = Smoothing.from_mesh(problem.start, self.free, amount)
+        unit, retreats = problem.start.edge_length_range[0], 0
+        left = min(steps, problem.settings.steps - self.taken)
+        while left > 0:
+            objective, floor = problem.objective(self.vertices, weights)
+            descent = descend(objective, self.vertices, smoothing, left, floor, unit, self._count)
+            self.vertices, left, self.end = descent.vertices, left - descent.steps, descent.end
+            if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
+                retreats += 1
+                smoothing = replace(smoothing, amount=max(_SMOOTHER * smoothing.amount, 1.0))
+            # Finer fields may show the way on, unless they are as fine as they can be.
+            elif descent.end is not End.ERROR or not descent.steps:
+                break
+
+    def _count(self, vertices: Reals, objective: float) -> None:
+        self.vertices = vertices
+        self.taken += 1
+        if self.notify is not None:
+            self.notify(FitProgress(self.taken, self.problem.settings.steps, float(np.sqrt(objective))))
+
+
+def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
+    """Measure distances of a prepared mesh from its target.
+
+    The Sobolev distance has a relative accuracy where the target is a surface; from a field it is that on the lattice.
+    """
+    target, order = problem.target, problem.settings.order
+    result = None
+    for rtol in () if isinstance(target, xr.DataArray) else _RTOLS:
+        try:
+            result = distance(mesh, target, order, rtol=rtol)
+            break
+        except AccuracyError:
+            continue
+    if result is None:
+        result = distance(mesh, target, order, lattice=problem.lattice)
+    numbers = {name: result[name].item() for name in ("distance", "error", "relative", "relative_error")}
+    quality = FitQuality(**numbers, smallest_angle=smallest_angle(mesh))
+    if not isinstance(target, Mesh):
+        return quality
+    try:
+        near = proximity(mesh, target)
+    except InputError:
+        return quality
+    return replace(quality, hausdorff=near.hausdorff, chamfer=near.chamfer)
+
+
+def start_quality(problem: FitProblem) -> FitQuality:
+    """Measure distances of the start.
 
     Raises:
         InputError: The field cannot serve the order.
     """
-    before = task.closeness(task.start)
-    if before.error >= before.distance > 0 and isinstance(task.target, xr.DataArray):
+    before = measure_quality(problem, problem.start)
+    if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
-            f"the field ends at the frequency {task.problem.lattice.xi_max:g}: at order {task.settings.order:g} the "
+            f"the field ends at the frequency {problem.lattice.xi_max:g}: at order {problem.settings.order:g} the "
             f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
             "lower; take a more negative order, or a field on a larger lattice"
         )
     return before
 
 
-def concluded(start: Mesh, before: Closeness, task: FitTask, fitted: Mesh, run: Run) -> Fit:
+def conclude(start: Mesh, before: FitQuality, run: FitRun, fitted: Mesh) -> Fit:
     """Return a fit with its end, or with the start if that is nearer.
 
     Args:
         start: Mesh that was given.
-        before: Closeness of the start.
-        task: Last task of the fit.
+        before: Distances of the start.
+        run: Last run of the fit.
         fitted: Prepared mesh at its end.
-        run: Its run.
     """
-    mesh, remarks, end = task.own(fitted), [], run.end
+    problem = run.problem
+    mesh, remarks, end = problem.given_mesh(fitted), [], run.end
     try:
-        after = task.closeness(fitted)
+        after = measure_quality(problem, fitted)
     except KeyboardInterrupt:
-        after, end = Closeness.unknown(), End.INTERRUPTED
+        after, end = FitQuality(np.nan, np.nan), End.INTERRUPTED
         remarks.append("it was interrupted before the mesh was measured")
     if after.distance - np.nan_to_num(after.error) > before.distance + np.nan_to_num(before.error):
         remarks.append("no nearer mesh was found: this is the start")
@@ -161,4 +319,4 @@ def concluded(start: Mesh, before: Closeness, task: FitTask, fitted: Mesh, run: 
             f"the Hausdorff distance grew {after.hausdorff / before.hausdorff:.2g} times: the worst point lies "
             "farther away than before; take a larger smoothing or a less negative order"
         )
-    return Fit(mesh, task.settings.order, before, after, run.taken, end.value, tuple(remarks))
+    return Fit(mesh, problem.settings.order, before, after, run.taken, end.value, tuple(remarks))

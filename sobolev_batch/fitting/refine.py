@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.defaults import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.fitting.fit import Fit, concluded, measured
-from sobolev_batch.fitting.optimisation.descent import End
-from sobolev_batch.fitting.optimisation.stages import FitProgress, FitSettings, Run
-from sobolev_batch.fitting.task import FitTask, welded
+from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting.descent import End
+from sobolev_batch.fitting.fit import Fit, FitProgress, FitRun, conclude, start_quality
+from sobolev_batch.fitting.problem import FitProblem, FitSettings, welded
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
@@ -69,7 +68,7 @@ def refine(
         notify: Called after each step.
 
     Returns:
-        The finer mesh with the closeness of the start and of itself. It is never farther away than the start by more
+        The finer mesh with the distances of the start and of itself. It is never farther away than the start by more
         than the reported errors.
 
     Raises:
@@ -85,26 +84,26 @@ def refine(
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     refinement = _Refinement(target, lattice, settings, Execution(threads=thread_count(threads)), triangles)
-    task = refinement.begun(mesh)
-    before = measured(task)
-    found = concluded(mesh, before, *refinement.carried_out(task, notify))
-    count = len(found.mesh.triangles)
-    if count >= triangles or found.end == End.INTERRUPTED.value:
-        return found
+    problem = refinement.first_problem(mesh)
+    before = start_quality(problem)
+    refined = conclude(mesh, before, *refinement.run(problem, notify))
+    count = len(refined.mesh.triangles)
+    if count >= triangles or refined.end == End.INTERRUPTED.value:
+        return refined
     remark = f"it has {count:,} triangles instead of {triangles:,}, as splits come in groups"
-    return replace(found, remarks=(*found.remarks, remark))
+    return replace(refined, remarks=(*refined.remarks, remark))
 
 
 def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `refine` finds, without measures of its closeness.
+    """Return the mesh that `refine` finds, without measures of its distance.
 
     Raises:
         LatticeError: The mesh does not fit into the lattice of a field.
         InputError: See `refine`.
     """
     refinement = _Refinement(target, None, settings, execution, triangles)
-    task, fitted, _ = refinement.carried_out(refinement.begun(mesh))
-    return task.own(fitted)
+    last, fitted = refinement.run(refinement.first_problem(mesh))
+    return last.problem.given_mesh(fitted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +124,8 @@ class _Refinement:
     execution: Execution
     triangles: int
 
-    def begun(self, mesh: Mesh) -> FitTask:
-        """Return the first task.
+    def first_problem(self, mesh: Mesh) -> FitProblem:
+        """Return the problem of the first round.
 
         Raises:
             InputError: See `refine`.
@@ -136,41 +135,40 @@ class _Refinement:
             raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
         if count >= goal:
             raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")
-        return self._task(welded(mesh)[0])
+        return self._problem(welded(mesh)[0])
 
-    def carried_out(
-        self, task: FitTask, notify: Callable[[FitProgress], None] | None = None
-    ) -> tuple[FitTask, Mesh, Run]:
-        """Return the last task, the prepared mesh at its end and its run, with the steps of all rounds."""
+    def run(self, problem: FitProblem, notify: Callable[[FitProgress], None] | None = None) -> tuple[FitRun, Mesh]:
+        """Return the last run, with the steps of all rounds, and the prepared mesh at its end."""
         between = replace(self.settings, steps=min(_STEPS_BETWEEN, self.settings.steps))
-        goals, taken = _goals(len(task.start.triangles), self.triangles), 0
+        goals, taken = _goals(len(problem.start.triangles), self.triangles), 0
         total = between.steps * len(goals) + self.settings.steps
 
-        def counted(progress: FitProgress) -> None:
+        def count(progress: FitProgress) -> None:
             if notify is not None:
                 notify(FitProgress(taken + progress.step, total, progress.relative))
 
         for goal in goals:
-            fitted, run = replace(task, settings=between).run(counted)
+            run = FitRun(replace(problem, settings=between), count)
+            fitted = run.finish()
             taken += run.taken
             run.taken = taken
             if run.end is not End.INTERRUPTED:
                 try:
-                    task = self._task(self._split(task, fitted, goal))
+                    problem = self._problem(self._split(problem.given_mesh(fitted), goal))
                     continue
                 except KeyboardInterrupt:
                     run.end = End.INTERRUPTED
-            return task, fitted, run
-        fitted, run = task.run(counted)
+            return run, fitted
+        run = FitRun(problem, count)
+        fitted = run.finish()
         run.taken += taken
-        return task, fitted, run
+        return run, fitted
 
-    def _task(self, mesh: Mesh) -> FitTask:
-        return FitTask.of(mesh, self.target, self.lattice, self.settings, self.execution)
+    def _problem(self, mesh: Mesh) -> FitProblem:
+        return FitProblem.for_target(mesh, self.target, self.lattice, self.settings, self.execution)
 
-    def _split(self, task: FitTask, fitted: Mesh, triangles: int) -> Mesh:
-        """Return the fitted mesh, at the place that was given, with the edges split where that helps most."""
-        mesh = task.own(fitted)
+    def _split(self, mesh: Mesh, triangles: int) -> Mesh:
+        """Return a fitted mesh with the edges split where that helps most."""
         edges = Edges.from_mesh(mesh)
         if triangles >= 4 * len(mesh.triangles):
             return edges.split(np.ones(len(edges.ends), dtype=bool))
@@ -181,11 +179,11 @@ class _Refinement:
 
     def _derivatives(self, edges: Edges) -> NDArray[np.float64]:
         """Return the derivative with respect to a vertex at the middle of each edge, (e, 3)."""
-        task = self._task(edges.split(np.ones(len(edges.ends), dtype=bool)))
-        vertices = np.asarray(task.start.vertices)
-        weighting = task.problem.weighting(vertices, self.settings.shares)
-        _, gradient = task.problem.objective(vertices, weighting)[0](vertices)
-        return np.asarray(gradient[task.place][len(edges.mesh.vertices) :])
+        problem = self._problem(edges.split(np.ones(len(edges.ends), dtype=bool)))
+        vertices = np.asarray(problem.start.vertices)
+        weights = problem.relative_to(vertices, self.settings.shares)
+        _, gradient = problem.objective(vertices, weights)[0](vertices)
+        return np.asarray(gradient[problem.place][len(edges.mesh.vertices) :])
 
 
 def largest_while_refining(count: int, triangles: int) -> int:
@@ -196,7 +194,7 @@ def largest_while_refining(count: int, triangles: int) -> int:
         triangles: Number of triangles to reach.
     """
     *before, last = [count, *_goals(count, triangles)]
-    return max([last, *(4 * one for one in before)])
+    return max([last, *(4 * number for number in before)])
 
 
 def _goals(count: int, triangles: int) -> list[int]:

@@ -14,10 +14,8 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.optimisation.descent import End, descend
-from sobolev_batch.fitting.optimisation.smoothing import Smoothing
-from sobolev_batch.fitting.optimisation.stages import Run
-from sobolev_batch.fitting.task import FitTask
+from sobolev_batch.fitting import fit as module
+from sobolev_batch.fitting.descent import End, Smoothing, descend
 
 
 def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:
@@ -160,23 +158,23 @@ def test_a_mesh_at_its_target_stays() -> None:
 
 @pytest.mark.slow
 def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(run: Any, stages: Any) -> np.ndarray:
-        return np.asarray(run.problem.mesh.vertices) * 1.1
+    def move_away(run: Any) -> None:
+        run.vertices = run.vertices * 1.1
 
-    monkeypatch.setattr(Run, "carried_out", away)
+    monkeypatch.setattr(module.FitRun, "descend", move_away)
     fitted = sb.fit(START, TARGET, -4.0)
     np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
     assert fitted.after == fitted.before
     assert fitted.end == "no nearer mesh was found"
 
 
-def measuring(*found: sb.Closeness | type[BaseException]) -> Any:
+def measuring(*found: sb.FitQuality | type[BaseException]) -> Any:
     """A stand-in for measures of the start and of the result."""
     answers = iter(found)
 
-    def measure(task: Any, mesh: sb.Mesh) -> sb.Closeness:
+    def measure(problem: Any, mesh: sb.Mesh) -> sb.FitQuality:
         answer = next(answers)
-        if isinstance(answer, sb.Closeness):
+        if isinstance(answer, sb.FitQuality):
             return answer
         raise answer
 
@@ -186,14 +184,14 @@ def measuring(*found: sb.Closeness | type[BaseException]) -> Any:
 @pytest.mark.parametrize(
     ("after", "remark"),
     [
-        (sb.Closeness(0.5, 0.01, hausdorff=3.1), "the Hausdorff distance grew 1.6 times"),
-        (sb.Closeness(0.5, 0.6), "the distance is not larger than its error"),
-        (sb.Closeness(1.5, 0.1), "no nearer mesh was found: this is the start"),
+        (sb.FitQuality(0.5, 0.01, hausdorff=3.1), "the Hausdorff distance grew 1.6 times"),
+        (sb.FitQuality(0.5, 0.6), "the distance is not larger than its error"),
+        (sb.FitQuality(1.5, 0.1), "no nearer mesh was found: this is the start"),
         (KeyboardInterrupt, "interrupted before the mesh was measured"),
     ],
 )
 def test_what_one_should_know_is_remarked(monkeypatch: pytest.MonkeyPatch, after: Any, remark: str) -> None:
-    monkeypatch.setattr(FitTask, "closeness", measuring(sb.Closeness(1.0, 0.1, hausdorff=2.0), after))
+    monkeypatch.setattr(module, "measure_quality", measuring(sb.FitQuality(1.0, 0.1, hausdorff=2.0), after))
     fitted = sb.fit(START, TARGET, -4.0, steps=2)
     assert len(fitted.remarks) == 1
     assert remark in fitted.remarks[0]
@@ -224,7 +222,7 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
             return self.value(vertices), gradient
 
     objective: Any = Drawn()
-    smoothing = Smoothing.of(sb.Mesh(fan, triangles), np.arange(7), 0.0)
+    smoothing = Smoothing.from_mesh(sb.Mesh(fan, triangles), np.arange(7), 0.0)
     found = descend(objective, fan, smoothing, 20, 0.0, 1.0, lambda vertices, value: None)
     assert found.end is End.TURNED
     assert found.vertices[0, 0] < 1
@@ -272,7 +270,7 @@ def test_a_field_must_be_whole_and_on_the_lattice() -> None:
         sb.fit(START, field, -4.0, lattice=sb.Lattice(2.0, 18))
     broken = field.copy(deep=True)
     broken[3, 4, 5] = np.nan
-    for use in (sb.fit, sb.gradient, sb.SquaredDistance.of):
+    for use in (sb.fit, sb.gradient, sb.SquaredDistance.for_mesh):
         with pytest.raises(sb.InputError, match="the field has 1 values that are NaN or infinite"):
             use(START, broken, -4.0)
 

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.derivative.transform import MeshTransform
+from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral.backends import backends
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from tests.support.fake_device import Device
@@ -66,7 +66,7 @@ def test_it_is_the_derivative_of_plain_sums(name: str) -> None:
     mesh, orders = MESHES[name], [-0.75, -2.0, -6.0]
     vertices, sums = np.array(mesh.vertices), PlainSums(0.7, np.array(SPHERE.center), SMALL.xi_max, SMALL.M, orders)
     for order, square, expected in zip(orders, *sums.value_and_derivative(vertices, mesh.triangles), strict=True):
-        value, found = sb.SquaredDistance.of(mesh, SPHERE, order, lattice=SMALL, eps=1e-12)(vertices)
+        value, found = sb.SquaredDistance.for_mesh(mesh, SPHERE, order, lattice=SMALL, eps=1e-12)(vertices)
         assert value == pytest.approx(square, rel=1e-9)
         assert np.linalg.norm(found - expected) <= 1e-9 * np.linalg.norm(expected)
 
@@ -74,8 +74,8 @@ def test_it_is_the_derivative_of_plain_sums(name: str) -> None:
 @pytest.mark.parametrize("tolerance", [0.1, 1e-3, 1e-8])
 def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> None:
     mesh, lattice = sb.icosphere(2), sb.Lattice(4.0, 40)
-    fine = sb.SquaredDistance.of(mesh, SPHERE, -2.0, lattice=lattice)
-    transform = MeshTransform.of(mesh, lattice, TransformSettings(1e-13, tolerance=tolerance))
+    fine = sb.SquaredDistance.for_mesh(mesh, SPHERE, -2.0, lattice=lattice)
+    transform = MeshTransform.from_mesh(mesh, lattice, TransformSettings(1e-13, tolerance=tolerance))
     squared = sb.SquaredDistance(transform, fine.target, fine.factors)
     rng = np.random.default_rng(0)
     direction, vertices, step = rng.normal(size=mesh.vertices.shape), np.array(mesh.vertices), 1e-5
@@ -86,14 +86,14 @@ def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> 
 
 def test_the_value_is_the_squared_distance() -> None:
     lattice = sb.Lattice(4.0, 40)
-    squared = sb.SquaredDistance.of(sb.icosphere(2), SPHERE, -2.0, lattice=lattice)
+    squared = sb.SquaredDistance.for_mesh(sb.icosphere(2), SPHERE, -2.0, lattice=lattice)
     expected = sb.distance(sb.icosphere(2), SPHERE, -2.0, lattice=lattice)["distance"].item() ** 2
     assert squared.value(sb.icosphere(2).vertices) == pytest.approx(expected, rel=1e-8)
     assert squared(sb.icosphere(2).vertices)[0] == pytest.approx(expected, rel=1e-8)
 
 
 def test_flat_vertices_give_a_flat_derivative() -> None:
-    squared = sb.SquaredDistance.of(sb.icosphere(1), SPHERE, -2.0, lattice=SMALL)
+    squared = sb.SquaredDistance.for_mesh(sb.icosphere(1), SPHERE, -2.0, lattice=SMALL)
     value, gradient = squared(sb.icosphere(1).vertices)
     flat_value, flat = squared(sb.icosphere(1).vertices.ravel())
     assert (flat_value, flat.shape) == (value, (126,))
@@ -195,13 +195,13 @@ def test_a_gpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_wrong_arguments_are_named(arguments: tuple[sb.Mesh, sb.Sphere, float], message: str) -> None:
-    for function in (sb.gradient, sb.SquaredDistance.of):
+    for function in (sb.gradient, sb.SquaredDistance.for_mesh):
         with pytest.raises(sb.SobolevBatchError, match=re.escape(message)):
             function(*arguments, lattice=SMALL)
 
 
 def test_positions_are_checked() -> None:
-    squared = sb.SquaredDistance.of(sb.icosphere(0), SPHERE, -2.0, lattice=SMALL)
+    squared = sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, -2.0, lattice=SMALL)
     with pytest.raises(sb.InputError, match=r"the mesh has 12 vertices: pass positions \(12, 3\), or 36 numbers"):
         squared(np.zeros((11, 3)))
     with pytest.raises(sb.InputError, match="must be finite: found NaN or infinity"):
@@ -214,4 +214,4 @@ def test_a_lattice_is_needed() -> None:
     with pytest.raises(sb.InputError, match="needs a lattice"):
         sb.gradient(sb.icosphere(0), SPHERE, -2.0)
     with pytest.raises(sb.InputError, match="one order is needed, found 2"):
-        sb.SquaredDistance.of(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
+        sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.Mo
     refined = results["refined"]
     assert 620 < len(refined.mesh.triangles) <= 640
     assert refined.after.distance < fitted.after.distance
-    squared = sb.SquaredDistance.of(start, target, -4.0, lattice=sb.Lattice(8.0, 80))
+    squared = sb.SquaredDistance.for_mesh(start, target, -4.0, lattice=sb.Lattice(8.0, 80))
     assert results["found"]["squared_distance"].sel(order=-4.0) == pytest.approx(
         squared.value(start.vertices), rel=1e-6
     )

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.optimisation.shapes import ShapePenalty, smallest_angle
-from sobolev_batch.fitting.optimisation.smoothing import Smoothing
+from sobolev_batch.fitting.descent import ShapePenalty, Smoothing, smallest_angle
 
 
 def test_shapes_that_hardly_change_cost_nothing() -> None:
     ball, rng = sb.icosphere(2), np.random.default_rng(0)
-    penalty = ShapePenalty.of(np.array(ball.vertices), ball.triangles)
+    penalty = ShapePenalty.from_shapes(np.array(ball.vertices), ball.triangles)
     value, gradient = penalty.value_and_gradient(ball.vertices + 0.01 * rng.normal(size=ball.vertices.shape))
     assert value == 0
     assert not gradient.any()
@@ -20,14 +19,14 @@ def test_shapes_that_hardly_change_cost_nothing() -> None:
 
 def test_triangles_that_were_bad_before_may_stay_so() -> None:
     sliver = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0]])
-    penalty = ShapePenalty.of(sliver, np.array([[0, 1, 2]]))
+    penalty = ShapePenalty.from_shapes(sliver, np.array([[0, 1, 2]]))
     assert penalty.value_and_gradient(sliver)[0] == 0
     assert penalty.value_and_gradient(sliver * [1, 0.25, 1])[0] == pytest.approx(0.25, rel=1e-3)
 
 
 def test_the_penalty_grows_to_one_for_a_triangle_without_an_area() -> None:
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.8, 0]])
-    penalty = ShapePenalty.of(corners, np.array([[0, 1, 2]]))
+    penalty = ShapePenalty.from_shapes(corners, np.array([[0, 1, 2]]))
     values = [penalty.value_and_gradient(corners * [1, factor, 1])[0] for factor in (0.3, 0.2, 0.1, 1e-9)]
     assert values == sorted(values)
     assert values[-1] == pytest.approx(1.0, abs=1e-6)
@@ -35,7 +34,7 @@ def test_the_penalty_grows_to_one_for_a_triangle_without_an_area() -> None:
 
 def test_its_derivative_is_that_of_differences() -> None:
     ball, rng, step = sb.icosphere(1), np.random.default_rng(1), 1e-6
-    penalty = ShapePenalty.of(np.array(ball.vertices), ball.triangles)
+    penalty = ShapePenalty.from_shapes(np.array(ball.vertices), ball.triangles)
     vertices = ball.vertices + 0.3 * rng.normal(size=ball.vertices.shape)
     direction = rng.normal(size=vertices.shape)
     value, gradient = penalty.value_and_gradient(vertices)
@@ -72,7 +71,7 @@ def dense(mesh: sb.Mesh) -> np.ndarray:
 def test_smoothing_solves_with_the_graph_laplacian() -> None:
     mesh, rng = sb.Mesh(sb.icosphere(1).vertices, sb.icosphere(1).triangles[:60]), np.random.default_rng(2)
     free = np.array([0, 2, 3, 5, 8, 13, 21])
-    smoothing = Smoothing.of(mesh, free, 3.0)
+    smoothing = Smoothing.from_mesh(mesh, free, 3.0)
     steps, slopes = rng.normal(size=(7, 3)), rng.normal(size=mesh.vertices.shape)
     matrix = np.eye(7) + 3.0 * dense(mesh)[np.ix_(free, free)]
     movement = smoothing.movement(steps)
@@ -82,5 +81,5 @@ def test_smoothing_solves_with_the_graph_laplacian() -> None:
 
 
 def test_without_smoothing_steps_are_movements() -> None:
-    smoothing = Smoothing.of(sb.icosphere(0), np.array([1, 4]), 0.0)
+    smoothing = Smoothing.from_mesh(sb.icosphere(0), np.array([1, 4]), 0.0)
     np.testing.assert_array_equal(smoothing.movement(np.ones((2, 3)))[[1, 4]], 1.0)

@@ -15,7 +15,7 @@ BALL = sb.icosphere(1)
 
 @pytest.fixture(scope="module")
 def squared() -> sb.SquaredDistance:
-    return sb.SquaredDistance.of(BALL, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    return sb.SquaredDistance.for_mesh(BALL, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

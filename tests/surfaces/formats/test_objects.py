@@ -174,8 +174,10 @@ USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "accessor": lambda mesh, target: target.sobolev.distance(mesh, -2.0)["distance"].item(),
     "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10).hausdorff,
     "gradient": lambda mesh, target: sb.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
-    "objective": lambda mesh, target: sb.SquaredDistance.of(mesh, target, -2.0, threads=1).value(1.1 * BALL.vertices),
-    "target": lambda mesh, _: sb.SquaredDistance.of(BALL, mesh, -2.0, lattice=LATTICE).value(BALL.vertices),
+    "objective": lambda mesh, target: sb.SquaredDistance.for_mesh(mesh, target, -2.0, threads=1).value(
+        1.1 * BALL.vertices
+    ),
+    "target": lambda mesh, _: sb.SquaredDistance.for_mesh(BALL, mesh, -2.0, lattice=LATTICE).value(BALL.vertices),
     "fit": lambda mesh, target: sb.fit(mesh, target, -4.0, steps=1, threads=1).mesh.area,
     "refine": lambda mesh, target: sb.refine(mesh, target, -4.0, triangles=21, steps=1, threads=1).mesh.area,
 }

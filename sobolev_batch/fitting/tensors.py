@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.derivative.objective import SquaredDistance
+from sobolev_batch.fitting.gradient import SquaredDistance
 
 
 def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
@@ -27,7 +27,7 @@ def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
 
     >>> import sobolev_batch as sb
     >>> ball = sb.icosphere(1)
-    >>> squared = sb.SquaredDistance.of(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
     >>> function = sb.torch_function(squared)  # doctest: +SKIP
     >>> function(torch.tensor(ball.vertices, requires_grad=True)).backward()  # doctest: +SKIP
     """
@@ -73,7 +73,7 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
 
     >>> import sobolev_batch as sb
     >>> ball = sb.icosphere(1)
-    >>> squared = sb.SquaredDistance.of(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
     >>> function = sb.jax_function(squared)  # doctest: +SKIP
     >>> gradient = jax.grad(function)(jax.numpy.asarray(ball.vertices))  # doctest: +SKIP
     """

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, vstack
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.arrays import Complexes
@@ -26,8 +26,6 @@ Indices = NDArray[np.int64]
 
 # Fraction of eps that the coefficients which are left out may carry together.
 _NEGLIGIBLE = 0.1
-
-
 # The corners of the four similar triangles of a triangle, in its barycentric coordinates.
 _QUARTERS: Reals = np.array(
     [
@@ -45,27 +43,41 @@ class MeshTransform:
 
     Attributes:
         triangles: Indices of the corners of each triangle, int64 (m, 3).
-        count: Number n of vertices.
-        nodes: Quadrature nodes.
+        of_vertices: Matrix (nodes, vertices): its product with the vertices (n, 3) is the quadrature nodes.
+        of_areas: Matrix (nodes, triangles): its product with the areas is their weights.
         lattice: Lattice of the frequencies.
         eps: Accuracy of nonuniform FFTs.
         execution: Backend and threads.
     """
 
-    triangles: NDArray[np.int64]
-    count: int
-    nodes: MovingNodes
+    triangles: Indices
+    of_vertices: csr_array
+    of_areas: csr_array
     lattice: Lattice
     eps: float
     execution: Execution = ON_CPU
 
     @classmethod
-    def of(cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU) -> Self:
+    def from_mesh(
+        cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU
+    ) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
         rules = RuleAssignment.for_mesh(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
-        nodes = MovingNodes.of(mesh, rules)
+        of_vertices, of_areas = zip(*(_node_matrices(mesh, batch) for batch in rules.batches()), strict=True)
         triangles = np.asarray(mesh.triangles, dtype=np.int64)
-        return cls(triangles, len(mesh.vertices), nodes, lattice, settings.eps, execution)
+        return cls(
+            triangles,
+            vstack(of_vertices, format="csr"),
+            vstack(of_areas, format="csr"),
+            lattice,
+            settings.eps,
+            execution,
+        )
+
+    @property
+    def count(self) -> int:
+        """Number n of vertices."""
+        return int(self.of_vertices.shape[1])
 
     def at(self, vertices: Reals) -> PlacedMesh:
         """Return the mesh with its vertices at positions (n, 3), in units of length.
@@ -79,12 +91,12 @@ class MeshTransform:
                 f"the mesh has {self.count} vertices: pass positions ({self.count}, 3), or "
                 f"{3 * self.count} numbers; found the shape {vertices.shape}"
             )
-        coordinates = np.ascontiguousarray((self.nodes.of_vertices @ vertices).T)
+        coordinates = np.ascontiguousarray((self.of_vertices @ vertices).T)
         if not np.isfinite(coordinates).all():
             raise InputError("positions of vertices must be finite: found NaN or infinity")
         require_points_inside(coordinates, self.lattice)
         areas = _Areas(vertices, self.triangles)
-        return PlacedMesh(self, WeightedPoints(coordinates, self.nodes.of_areas @ areas.values), areas)
+        return PlacedMesh(self, WeightedPoints(coordinates, self.of_areas @ areas.values), areas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,19 +104,19 @@ class PlacedMesh:
     """A mesh with its vertices at given positions.
 
     Attributes:
-        of: Transform that the mesh belongs to.
+        mesh: Transform of the mesh at any positions.
         points: Quadrature nodes with their weights.
         areas: Areas of the triangles.
     """
 
-    of: MeshTransform
+    mesh: MeshTransform
     points: WeightedPoints
     areas: _Areas
 
     def transform(self) -> Complexes:
         """Return the transform on the half lattice, complex128."""
-        lattice, backend = self.of.lattice, self._backend
-        spec = NufftSpec(lattice.shape, self.of.eps, threads=self.of.execution.threads)
+        lattice, backend = self.mesh.lattice, self._backend
+        spec = NufftSpec(lattice.shape, self.mesh.eps, threads=self.mesh.execution.threads)
         points = WeightedPoints(backend.upload(self.points.coordinates), backend.upload(self.points.weights))
         values, _ = transform_points([points], lattice, lattice.half, spec, backend)
         return np.asarray(backend.download(values))
@@ -119,9 +131,8 @@ class PlacedMesh:
             coefficients: c, complex128 on the half lattice.
         """
         values, slopes = self._evaluated(coefficients)
-        nodes = self.of.nodes
-        gradient = nodes.of_vertices.T @ (self.points.weights[:, None] * slopes)
-        return np.asarray(gradient + self.areas.pulled_back(nodes.of_areas.T @ values, self.of.count))
+        gradient = self.mesh.of_vertices.T @ (self.points.weights[:, None] * slopes)
+        return np.asarray(gradient + self.areas.pulled_back(self.mesh.of_areas.T @ values, self.mesh.count))
 
     def _evaluated(self, coefficients: Complexes) -> tuple[Reals, Reals]:
         """Return the function of the coefficients (k,) and its gradient (k, 3) at the nodes.
@@ -129,13 +140,13 @@ class PlacedMesh:
         Each NUFFT gives two real functions, as real and imaginary part: the coefficients of f + i g on the whole
         lattice are F + i G with those of f and g.
         """
-        lattice, backend, eps = self.of.lattice, self._backend, self.of.eps
+        lattice, backend, eps = self.mesh.lattice, self._backend, self.mesh.eps
         most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * eps)
         middle, axis = lattice.M // 2, 2 * np.pi * lattice.spacing * np.arange(-most, most + 1)
         inner = slice(middle - most, middle + most + 1)
         whole = _whole(coefficients[inner, inner, : most + 1])
         x, y, z = np.ix_(axis, axis, axis)
-        spec = NufftSpec(whole.shape, eps, threads=self.of.execution.threads)
+        spec = NufftSpec(whole.shape, eps, threads=self.mesh.execution.threads)
         points = self.points.coordinates
         plan = backend.evaluation_plan(backend.costs.with_oversampling(spec, points.shape[1]))
         # setpts keeps references, not copies: the angles live until both functions are evaluated.
@@ -147,7 +158,7 @@ class PlacedMesh:
 
     @property
     def _backend(self) -> Backend:
-        return self.of.execution.backend
+        return self.mesh.execution.backend
 
 
 def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:
@@ -200,82 +211,27 @@ class _Areas:
         return gradient
 
 
-@dataclass(frozen=True, eq=False)
-class MovingNodes:
-    """Quadrature nodes of a mesh for any positions of its vertices.
-
-    Attributes:
-        of_vertices: Matrix (nodes, vertices): its product with the vertices (n, 3) is the nodes.
-        of_areas: Matrix (nodes, triangles): its product with the areas is the weights.
-    """
-
-    of_vertices: csr_array
-    of_areas: csr_array
-
-    @classmethod
-    def of(cls, mesh: Mesh, assignment: RuleAssignment) -> Self:
-        """Return the nodes of a mesh by the rules of its triangles; nodes that triangles share are merged."""
-        parts = [_nodes_of(mesh, batch) for batch in assignment.batches()]
-        starts = np.cumsum([0, *(part.count for part in parts)])
-        shape = int(starts[-1])
-        vertices = _joined([part.of_vertices for part in parts], starts, (shape, len(mesh.vertices)))
-        areas = _joined([part.of_areas for part in parts], starts, (shape, len(mesh.triangles)))
-        return cls(vertices, areas)
-
-    def __len__(self) -> int:
-        return int(self.of_vertices.shape[0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Entries:
-    """Entries of a matrix."""
-
-    rows: Indices
-    columns: Indices
-    values: Reals
-
-
-@dataclass(frozen=True, eq=False)
-class _Nodes:
-    """Nodes of some triangles, and the entries of their rows of both matrices."""
-
-    count: int
-    of_vertices: _Entries
-    of_areas: _Entries
-
-
-def _joined(parts: list[_Entries], starts: Indices, shape: tuple[int, int]) -> csr_array:
-    rows = np.concatenate([part.rows + start for part, start in zip(parts, starts, strict=False)])
-    columns = np.concatenate([part.columns for part in parts])
-    return coo_array((np.concatenate([part.values for part in parts]), (rows, columns)), shape=shape).tocsr()
-
-
-def _nodes_of(mesh: Mesh, batch: TriangleBatch) -> _Nodes:
+def _node_matrices(mesh: Mesh, batch: TriangleBatch) -> tuple[csr_array, csr_array]:
+    """Return the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
     triangles = np.asarray(mesh.triangles[batch.members], dtype=np.int64)
-    if not batch.splits and batch.rule in (corner_rule(), midpoint_rule()):
-        return _shared(triangles, batch.members, is_midpoint=batch.rule is midpoint_rule())
     barycentric, weights = batch.rule.barycentric, batch.rule.weights
-    for _ in range(batch.splits):
-        barycentric = np.concatenate([barycentric @ quarter for quarter in _QUARTERS])
-        weights = np.tile(weights / 4, 4)
-    each, count = len(weights), len(triangles)
-    nodes = np.arange(each * count, dtype=np.int64)
-    columns = np.repeat(triangles, each, axis=0)
-    return _Nodes(
-        each * count,
-        _Entries(np.repeat(nodes, 3), columns.ravel(), np.tile(barycentric, (count, 1)).ravel()),
-        _Entries(nodes, np.repeat(batch.members, each), np.tile(weights, count)),
-    )
-
-
-def _shared(triangles: Indices, members: Indices, *, is_midpoint: bool) -> _Nodes:
-    """Return the corners of triangles, or the midpoints of their edges, each with a third of the areas around it."""
-    of_triangle = np.repeat(members, 3)
-    if not is_midpoint:
+    if not batch.splits and batch.rule is corner_rule():
         used, nodes = np.unique(triangles, return_inverse=True)
-        of_vertices = _Entries(np.arange(len(used)), used, np.ones(len(used)))
-    else:
+        of_vertices = np.arange(len(used)), used, np.ones(len(used))
+    elif not batch.splits and batch.rule is midpoint_rule():
         edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
         used, nodes = np.unique(edges, axis=0, return_inverse=True)
-        of_vertices = _Entries(np.repeat(np.arange(len(used)), 2), used.ravel(), np.full(2 * len(used), 0.5))
-    return _Nodes(len(used), of_vertices, _Entries(nodes.ravel(), of_triangle, np.full(len(of_triangle), 1 / 3)))
+        of_vertices = np.repeat(np.arange(len(used)), 2), used.ravel(), np.full(2 * len(used), 0.5)
+    else:
+        for _ in range(batch.splits):
+            barycentric = np.concatenate([barycentric @ quarter for quarter in _QUARTERS])
+            weights = np.tile(weights / 4, 4)
+        nodes = np.arange(len(weights) * len(triangles), dtype=np.int64)
+        columns = np.repeat(triangles, len(weights), axis=0).ravel()
+        of_vertices = np.repeat(nodes, 3), columns, np.tile(barycentric, (len(triangles), 1)).ravel()
+    of_areas = nodes.ravel(), np.repeat(batch.members, len(weights)), np.tile(weights, len(triangles))
+    return _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+
+
+def _matrix(rows: Indices, columns: Indices, values: Reals, width: int) -> csr_array:
+    return coo_array((values, (rows, columns)), shape=(int(rows.max()) + 1, width)).tocsr()

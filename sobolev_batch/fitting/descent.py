@@ -1,0 +1,298 @@
+"""Descent of a squared distance by L-BFGS, on smooth steps that turn no triangle over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, minimize
+from scipy.sparse import coo_array, csc_array, eye_array
+from scipy.sparse.csgraph import laplacian
+from scipy.sparse.linalg import splu
+
+from sobolev_batch.errors import LatticeError
+from sobolev_batch.fitting.gradient import SquaredDistance
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+
+Reals = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Notify = Callable[[Reals, float], None]
+
+# Pairs of steps and gradients that L-BFGS remembers.
+_MEMORY = 20
+# Cost of a triangle that loses its area, relative to the squared distance at the start.
+_SHAPE_WEIGHT = 1e-3
+# A descent ends when the distance has fallen by less than this fraction over so many steps.
+_LEAST_PROGRESS, _PATIENCE = 0.01, 10
+# A triangle may lose this fraction of its quality freely, and any down to this quality.
+_FREE_LOSS, _GOOD = 0.5, 0.3
+_EQUILATERAL = 4 * np.sqrt(3.0)
+
+
+class End(Enum):
+    """Why a descent ended."""
+
+    STEPS = "all steps are taken"
+    CONVERGED = "the distance hardly falls any more"
+    STUCK = "no nearer mesh was found along the last direction"
+    ERROR = "the distance is down to the error of its fields"
+    FARTHER = "no nearer mesh was found"
+    TURNED = "a step would turn triangles over"
+    LEFT = "a step would leave the lattice's period"
+    INTERRUPTED = "it was interrupted"
+
+
+# By the status of scipy's L-BFGS-B; any other is that of a failed line search.
+_END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Vertices after a descent.
+
+    Attributes:
+        vertices: Positions (n, 3), in units of length.
+        objective: Weighted squared distances there, with the penalty of shapes.
+        steps: Number of steps.
+        end: Why it ended.
+    """
+
+    vertices: Reals
+    objective: float
+    steps: int
+    end: End
+
+
+def descend(
+    objective: SquaredDistance,
+    vertices: Reals,
+    smoothing: Smoothing,
+    steps: int,
+    floor: float,
+    unit: float,
+    notify: Notify,
+) -> Descent:
+    """Lower a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
+
+    Args:
+        objective: Squared distance, or a weighted sum of several.
+        vertices: Positions (n, 3) to start from.
+        smoothing: Smoothing of the steps.
+        steps: Largest number of steps.
+        floor: Squared distance below which nothing is left to gain.
+        unit: Length of a long step, such as that of an edge.
+        notify: Called with the positions and the objective after each step.
+
+    Returns:
+        The last positions that were accepted. A step that leaves the lattice's period ends the descent before it.
+
+    Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
+    (1995), doi:10.1137/0916069; by scipy.
+    """
+    path = _Path(objective, vertices, smoothing, floor, unit, notify)
+    if path.value <= floor:
+        return Descent(vertices, path.value, 0, End.ERROR)
+    try:
+        result = minimize(
+            path.scaled,
+            np.zeros(3 * len(smoothing.free)),
+            jac=True,
+            method="L-BFGS-B",
+            callback=path.accept,
+            options={"maxiter": steps, "maxfun": 3 * steps, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
+        )
+    except LatticeError:
+        path.end = End.LEFT
+    else:
+        path.end = path.end or _END_OF_STATUS.get(result.status, End.STUCK)
+    return Descent(path.vertices, path.value, path.steps, path.end)
+
+
+class _Path:
+    """The accepted positions on the way down, and the functions that scipy calls."""
+
+    def __init__(
+        self,
+        objective: SquaredDistance,
+        vertices: Reals,
+        smoothing: Smoothing,
+        floor: float,
+        unit: float,
+        notify: Notify,
+    ) -> None:
+        self.objective, self.smoothing, self.floor, self.unit, self.notify = objective, smoothing, floor, unit, notify
+        self.start = self.vertices = vertices
+        self.first = self.value = objective.value(vertices)
+        self.steps = 0
+        self.end: End | None = None
+        self._history = [self.first]
+        self._normals = _normals(vertices, objective.transform.triangles)
+        self._penalty = ShapePenalty.from_shapes(vertices, objective.transform.triangles)
+
+    def positions(self, parameters: Reals) -> Reals:
+        """Return the vertices for parameters, the steps of free vertices in long steps."""
+        return self.start + self.unit * self.smoothing.movement(parameters.reshape(-1, 3))
+
+    def scaled(self, parameters: Reals) -> tuple[float, Reals]:
+        """Return the squared distance relative to the first with the penalty of shapes, and its derivative."""
+        vertices = self.positions(parameters)
+        value, gradient = self.objective(vertices)
+        penalty, slopes = self._penalty.value_and_gradient(vertices)
+        total = gradient / self.first + _SHAPE_WEIGHT * slopes
+        return value / self.first + _SHAPE_WEIGHT * penalty, (self.unit * self.smoothing.pulled_back(total)).ravel()
+
+    def accept(self, intermediate_result: OptimizeResult) -> None:
+        """Keep a step if it turns no triangle over, and end the descent where nothing more is to be gained."""
+        vertices = self.positions(intermediate_result.x)
+        normals = _normals(vertices, self.objective.transform.triangles)
+        # A triangle that lost its area could go on to any side.
+        had_area = np.any(self._normals != 0, axis=1)
+        if np.any(np.einsum("ij,ij->i", normals, self._normals)[had_area] <= 0):
+            self._stop(End.TURNED)
+        self.vertices, self._normals = vertices, normals
+        self.value = float(intermediate_result.fun) * self.first
+        self.steps += 1
+        self._history.append(self.value)
+        self.notify(vertices, self.value)
+        if self.value <= self.floor:
+            self._stop(End.ERROR)
+        before = self._history[-_PATIENCE - 1] if len(self._history) > _PATIENCE else np.inf
+        if self.value > (1 - _LEAST_PROGRESS) ** 2 * before:
+            self._stop(End.CONVERGED)
+
+    def _stop(self, end: End) -> Any:
+        self.end = end
+        raise StopIteration
+
+
+def _normals(vertices: Reals, triangles: NDArray[np.int64]) -> Reals:
+    """Return the normals of triangles (m, 3), each as long as twice its area."""
+    a, b, c = (vertices[corner] for corner in triangles.T)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothing:
+    """The map (I + λ L)⁻¹ from steps u of the free vertices to movements of all, with the graph Laplacian L.
+
+    An optimiser that takes its steps in u moves neighbouring vertices together, the farther the larger λ is.
+
+    Source: B. Nicolet, A. Jacobson, W. Jakob, "Large steps in inverse rendering of geometry" (2021),
+    doi:10.1145/3478513.3480501.
+
+    Attributes:
+        graph: Graph Laplacian of all vertices.
+        free: Indices of the vertices that may move.
+        amount: λ; zero for steps without smoothing.
+    """
+
+    graph: csc_array
+    free: Indices
+    amount: float
+
+    @classmethod
+    def from_mesh(cls, mesh: Mesh, free: Indices, amount: float) -> Self:
+        """Return the smoothing for a mesh."""
+        count = len(mesh.vertices)
+        ends = np.asarray(mesh.triangles)[:, [0, 1, 2, 1, 2, 0]].reshape(-1, 2, 3)
+        one, other = ends[:, 0].ravel(), ends[:, 1].ravel()
+        both = np.concatenate([one, other]), np.concatenate([other, one])
+        neighbours = coo_array((np.ones(len(both[0])), both), shape=(count, count)).tocsr()
+        neighbours.data[:] = 1.0
+        graph: Any = laplacian(neighbours)
+        return cls(csc_array(graph), free, amount)
+
+    def movement(self, steps: Reals) -> Reals:
+        """Return the movement of all vertices (n, 3) for steps of the free ones (k, 3); the others stay."""
+        movement = np.zeros((self.graph.shape[0], 3))
+        movement[self.free] = self._solved(steps)
+        return movement
+
+    def pulled_back(self, gradient: Reals) -> Reals:
+        """Return the derivative with respect to the steps (k, 3) from that with respect to all vertices (n, 3)."""
+        return self._solved(gradient[self.free])
+
+    def _solved(self, values: Reals) -> Reals:
+        return values if self.amount == 0 else np.asarray(self._factors.solve(np.ascontiguousarray(values)))
+
+    @cached_property
+    def _factors(self) -> Any:
+        among_free = self.graph[self.free][:, self.free]
+        return splu(csc_array(eye_array(len(self.free)) + self.amount * among_free))
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePenalty:
+    """A sum over the triangles that become much worse than they were.
+
+    The quality q of a triangle is 4√3 area / (sum of its squared edges), one for equilateral triangles and zero without
+    an area. It costs ((r - q) / r)² where it falls below a reference r, and nothing above.
+
+    Attributes:
+        triangles: Indices of corners, int64 (m, 3).
+        references: r of each triangle (m,).
+    """
+
+    triangles: NDArray[np.int64]
+    references: Reals
+
+    @classmethod
+    def from_shapes(cls, vertices: Reals, triangles: NDArray[np.int64]) -> Self:
+        """Return the penalty of triangles relative to their present shapes."""
+        quality = _Quality(vertices, triangles)
+        return cls(triangles, np.minimum(_FREE_LOSS * quality.values, _GOOD))
+
+    def value_and_gradient(self, vertices: Reals) -> tuple[float, Reals]:
+        """Return the penalty for vertices (n, 3), and its derivative with respect to them."""
+        quality = _Quality(vertices, self.triangles)
+        bad = np.flatnonzero(quality.values < self.references)
+        lacks = 1 - quality.values[bad] / self.references[bad]
+        gradient = np.zeros_like(vertices)
+        for corner, slopes in enumerate(quality.gradients(bad)):
+            terms = (-2 * lacks / self.references[bad])[:, None] * slopes
+            np.add.at(gradient, self.triangles[bad, corner], terms)
+        return float(np.sum(lacks**2)), gradient
+
+
+class _Quality:
+    """Qualities of triangles, and their derivatives."""
+
+    def __init__(self, vertices: Reals, triangles: NDArray[np.int64]) -> None:
+        self.corners = [vertices[corner] for corner in triangles.T]
+        a, b, c = self.corners
+        self.normals = np.cross(b - a, c - a)
+        self.areas = np.linalg.norm(self.normals, axis=1) / 2
+        self.squares = sum(np.einsum("ij,ij->i", side, side) for side in (b - a, c - b, a - c))
+        # A triangle that is a point has no quality to lose.
+        self.values: Reals = np.where(self.squares > 0, _EQUILATERAL * self.areas / np.maximum(self.squares, 1e-300), 0)
+
+    def gradients(self, selected: NDArray[np.intp]) -> list[Reals]:
+        """Return the derivatives of some triangles' qualities with respect to each of their corners, (k, 3)."""
+        corners = [corner[selected] for corner in self.corners]
+        units = self.normals[selected] / np.maximum(2 * self.areas[selected], 1e-300)[:, None]
+        squares, values = self.squares[selected][:, None], self.values[selected][:, None]
+        found = []
+        for corner in range(3):
+            this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
+            of_area = np.cross(units, previous - following) / 2
+            of_squares = 2 * (2 * this - following - previous)
+            found.append((_EQUILATERAL * of_area - values * of_squares) / squares)
+        return found
+
+
+def smallest_angle(mesh: Mesh) -> float:
+    """Return the smallest angle of all triangles, in degrees; zero with a triangle without an area."""
+    corners = [mesh.vertices[corner] for corner in mesh.triangles.T]
+    angles = []
+    for corner in range(3):
+        this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
+        one, other = following - this, previous - this
+        # Small angles keep their digits, unlike those by the law of cosines.
+        sines = np.linalg.norm(np.cross(one, other), axis=1)
+        angles.append(np.arctan2(sines, np.einsum("ij,ij->i", one, other)))
+    return float(np.degrees(np.min(angles)))

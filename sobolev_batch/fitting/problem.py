@@ -1,0 +1,273 @@
+"""A fit before it begins: mesh and target, checked and brought to a common centre and to one lattice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting.gradient import SquaredDistance, factors_of
+from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.backends.arrays import Complexes
+from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
+from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.errors.probe import Sample, draws_for, estimate
+from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.fields import USUAL_DEGREE, field_for
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, field_values, quality_of
+from sobolev_batch.spectral.shells import SobolevWeights, single_order
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.subdivision import Edges
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface, is_finite_number
+
+Reals = NDArray[np.float64]
+# Orders s, each with the weight of its squared distance in a sum.
+OrderWeights = tuple[tuple[float, float], ...]
+
+# Start and target whose sizes differ by this factor are in different units.
+_OTHER_UNIT = 20.0
+# Far away, very negative orders lead: their kernels are wide.
+_COARSE_ORDER = -4.0
+# The share of a squared distance at half the order, which keeps detail that the order itself hardly sees.
+_DETAIL_SHARE, _HIGHEST_DETAILED = 0.1, -1.5
+# A lattice for a fit holds waves as long as an edge, if its M permits.
+_MOST_INTERVALS = 96
+# Images of the surfaces may change a distance by this fraction, and surfaces may grow by this factor.
+_ALIASING, _ROOM = 1e-2, 1.2
+# Errors of fields, as fractions of the distance at the start and at the start of a stage.
+_TARGET_FRACTION, _MESH_FRACTION = 2e-3, 0.02
+# A distance of so many errors of its fields is not lowered any further.
+_LEAST_ERRORS = 5.0
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of a fit.
+
+    Attributes:
+        order: Order s of the distance.
+        steps: Largest number of steps.
+        smoothing: Weight λ of the mesh's Laplacian in steps.
+        keep_boundary: True if vertices of open boundaries stay where they are.
+
+    Raises:
+        OrderError: The order is not below -1/2.
+        InputError: Another setting is out of range.
+    """
+
+    order: float = DEFAULT_ORDER
+    steps: int = DEFAULT_STEPS
+    smoothing: float = DEFAULT_SMOOTHING
+    keep_boundary: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "order", single_order(self.order))
+        if not is_whole_number(self.steps) or self.steps < 1:
+            raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
+        object.__setattr__(self, "steps", int(self.steps))
+        if not is_finite_number(self.smoothing) or self.smoothing < 0:
+            raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")
+        object.__setattr__(self, "smoothing", float(self.smoothing))
+        if not isinstance(self.keep_boundary, bool):
+            raise InputError(f"keep_boundary must be True or False, found {self.keep_boundary!r}")
+
+    @property
+    def coarse_order(self) -> float:
+        """Order that brings far meshes near."""
+        return min(self.order, _COARSE_ORDER)
+
+    @property
+    def shares(self) -> OrderWeights:
+        """Orders with the share of each in the objective."""
+        detail = ((self.order / 2, _DETAIL_SHARE),) if self.order <= _HIGHEST_DETAILED else ()
+        return (self.order, 1.0), *detail
+
+
+@dataclass(frozen=True, eq=False)
+class FitProblem:
+    """A mesh and the field of its target on one lattice.
+
+    Attributes:
+        mesh: Mesh as it was given.
+        start: The same mesh, prepared: moved to the centre, in units of length; no two of its vertices coincide.
+        place: Vertex of the prepared mesh for each vertex of the given one.
+        move: Movement to the centre.
+        target: Target, moved with the mesh.
+        settings: Settings of the fit.
+        lattice: Lattice of the target's field.
+        values: Transform of the target on the half lattice.
+        quality: Quality of this field, from which its errors follow; None if unknown.
+        execution: Threads.
+    """
+
+    mesh: Mesh
+    start: Mesh
+    place: NDArray[np.int64]
+    move: Similarity
+    target: Operand
+    settings: FitSettings
+    lattice: Lattice
+    values: Complexes
+    quality: Quality | None
+    execution: Execution
+
+    @classmethod
+    def for_target(
+        cls, mesh: Mesh, target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
+    ) -> Self:
+        """Check mesh and target, and prepare them. The field of a surface is as accurate as the distance needs.
+
+        Raises:
+            LatticeError: The mesh or target does not fit into the lattice.
+            InputError: See `fit`.
+        """
+        require_comparable(mesh, target)
+        start, place = welded(mesh)
+        move = Similarity()
+        if isinstance(target, xr.DataArray):
+            given = field_of(target, common_lattice((target,), lattice), (settings.order,))
+            own, values, quality = Lattice.of(given), field_values(given), quality_of(given)
+        else:
+            if lattice is None:
+                move = _centering(start, target)
+            start, target = move.apply(start), move.apply(target)
+            orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
+            own = lattice or fit_lattice(start, target, orders)
+            draws = draws_for([start, target], own, orders, USUAL_DEGREE)
+            distances = estimate([Sample.from_surface(surface, draws) for surface in (start, target)], orders)
+            rounding = np.finfo(np.float64).eps * target.area
+            accuracy = ErrorTarget(orders, tuple(np.maximum(_TARGET_FRACTION * distances, rounding).tolist()))
+            field = field_for(target, own, accuracy, TransformSettings(), execution)
+            values, quality = np.asarray(field.values, dtype=np.complex128), field.quality
+        return cls(mesh, start, place, move, target, settings, own, values, quality, execution)
+
+    @property
+    def free_vertices(self) -> NDArray[np.int64]:
+        """Vertices that may move: those of triangles, without boundaries if these are kept.
+
+        Raises:
+            InputError: There are none.
+        """
+        free = np.asarray(self.start.used_vertices)
+        if self.settings.keep_boundary:
+            edges = Edges.from_mesh(self.start)
+            free = np.setdiff1d(free, edges.ends[edges.on_boundary])
+        if not len(free):
+            raise InputError("all vertices lie on the boundary: there is nothing to move")
+        return free
+
+    def given_mesh(self, mesh: Mesh) -> Mesh:
+        """Return a mesh with the vertices and triangles of the given one, at its place.
+
+        Args:
+            mesh: Prepared start with its vertices moved.
+        """
+        vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
+        return Mesh(vertices, self.mesh.triangles)
+
+    def squares(self, vertices: Reals, orders: Sequence[float]) -> Reals:
+        """Return the squared distances with vertices at some positions, (orders,), from coarse settings."""
+        difference = self._transform(vertices, TransformSettings(1e-4)).at(vertices).transform() - self.values
+        energies = difference.real**2 + difference.imag**2
+        return np.array([float(np.sum(factors * energies)) for factors in self._factors(orders)])
+
+    def relative_to(self, vertices: Reals, shares: OrderWeights) -> OrderWeights:
+        """Return shares of orders, each over the squared distance with vertices at some positions."""
+        orders = tuple(order for order, _ in shares)
+        squares = np.maximum(self.squares(vertices, orders), np.finfo(np.float64).tiny)
+        return tuple((order, share / square) for (order, share), square in zip(shares, squares, strict=True))
+
+    def relative_distance(self, order: float) -> float:
+        """Return the distance of the start over the norm of the target."""
+        energies = self.values.real**2 + self.values.imag**2
+        norm = float(np.sum(self._factors([order])[0] * energies))
+        return float(np.sqrt(self.squares(np.asarray(self.start.vertices), [order])[0] / norm))
+
+    def objective(self, vertices: Reals, weights: OrderWeights) -> tuple[SquaredDistance, float]:
+        """Return the weighted sum of squared distances, and the value down to which its fields can be trusted.
+
+        Quadrature and eps follow from the value at the vertices: the farther away, the coarser.
+        """
+        orders, factors = (tuple(numbers) for numbers in zip(*weights, strict=True))
+        distances = np.sqrt(np.maximum(self.squares(vertices, orders), np.finfo(np.float64).tiny))
+        target = ErrorTarget(orders, tuple((_MESH_FRACTION * distances).tolist()))
+        mesh = Mesh(vertices, self.start.triangles)
+        transform = self._transform(vertices, choose_settings(mesh, self.lattice, target, TransformSettings()))
+        own = np.array(target.norms)
+        errors = own if self.quality is None else own + self.quality.error_norms(SobolevWeights(self.lattice, orders))
+        of_samples = sum(factor * one for factor, one in zip(factors, self._factors(orders), strict=True))
+        floor = float(np.sum(np.array(factors) * (_LEAST_ERRORS * errors) ** 2))
+        return SquaredDistance(transform, self.values, np.asarray(of_samples)), floor
+
+    def _transform(self, vertices: Reals, settings: TransformSettings) -> MeshTransform:
+        return MeshTransform.from_mesh(Mesh(vertices, self.start.triangles), self.lattice, settings, self.execution)
+
+    def _factors(self, orders: Sequence[float]) -> Reals:
+        return factors_of(SobolevWeights(self.lattice, tuple(orders)))
+
+
+def require_comparable(mesh: Mesh, target: Operand) -> None:
+    """Refuse a mesh and target with which there is nothing to fit.
+
+    Raises:
+        InputError: See `fit`.
+    """
+    if isinstance(target, xr.DataArray):
+        quality = quality_of(target)
+        extent = None if quality is None else quality.extent
+    else:
+        extent = target.extent
+    if extent is not None:
+        _require_one_place(mesh.extent, extent)
+
+
+def _require_one_place(start: Extent, target: Extent) -> None:
+    ratio = float(start.widths.max() / target.widths.max())
+    if not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
+        raise InputError(
+            f"the start is {start.widths.max():.3g} units wide and the target {target.widths.max():.3g}: "
+            "are both in the same unit of length?"
+        )
+    (low, high), (other_low, other_high) = start.box, target.box
+    if np.any(low > other_high) or np.any(other_low > high):
+        raise InputError(
+            f"the start ({_corners(low, high)}) and the target ({_corners(other_low, other_high)}) do not overlap: "
+            "move one of them to the other first"
+        )
+
+
+def _corners(low: Reals, high: Reals) -> str:
+    return " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high))
+
+
+def welded(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
+    """Return a mesh without coinciding vertices, and the vertex there of each vertex of the mesh."""
+    # Zero has two signs.
+    places, place = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
+    return Mesh(places, place.reshape(-1)[mesh.triangles]), place.reshape(-1)
+
+
+def _centering(start: Mesh, target: Surface) -> Similarity:
+    low, high = Extent.union([start.extent, target.extent]).box
+    x, y, z = ((low + high) / 2).tolist()
+    return Similarity(1.0, (x, y, z))
+
+
+def fit_lattice(mesh: Mesh, target: Surface, orders: tuple[float, ...]) -> Lattice:
+    """Return a lattice for fits: it reaches to wavelengths of an edge, as far as a moderate M allows."""
+    extent = Extent.union([mesh.extent, target.extent])
+    support = Support(np.array(mesh.area + target.area), _ROOM * extent.widths, _ROOM * extent.reach)
+    period = 2 * core_lattice(support, orders, Accuracy(_ALIASING)).half_period
+    return lattice_of(1 / mesh.edge_length_range[0], period, _MOST_INTERVALS)
