@@ -1,4 +1,4 @@
-"""Subdivision: the same surface without gaps, as many triangles as wanted, none ever thinner; icospheres by definition."""
+"""Subdivision: the same surface without gaps, as many triangles as wanted, none ever thinner; icospheres."""
 
 from __future__ import annotations
 
