@@ -8,7 +8,7 @@ from pathlib import Path
 import sobolev_batch as sb
 from benchmarks.timing import Effort
 from sobolev_batch.surfaces.sources.files import FileSource
-from sobolev_batch.surfaces.sources.reduced import DecimatedMember
+from sobolev_batch.surfaces.sources.reduced import decimated
 
 _CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 
@@ -19,8 +19,7 @@ def pair_of_cortex(effort: Effort, triangles: int) -> tuple[sb.Mesh, sb.Mesh]:
         return sb.icosphere(1), sb.icosphere(3)
     (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
     fine = original.load()
-    coarse = DecimatedMember("cortex", 0, original, triangles).load()
     assert isinstance(fine, sb.Mesh)
-    assert isinstance(coarse, sb.Mesh)
+    coarse = decimated(fine, triangles)
     unit = sb.Similarity.to_unit_ball(fine)
     return coarse.moved(unit.scale, unit.origin), fine.moved(unit.scale, unit.origin)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, Similarity, Sphere
 from sobolev_batch.surfaces.sources.files import FileSource
-from sobolev_batch.surfaces.sources.reduced import DecimatedMember
+from sobolev_batch.surfaces.sources.reduced import decimated
+from sobolev_batch.surfaces.sources.registry import load_mesh
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -66,7 +67,7 @@ def placed(mesh: Mesh, sphere: Sphere) -> Mesh:
 def cortex(triangles: int) -> Mesh:
     """Return the cortical surface with a number of triangles, within the unit ball."""
     (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
-    loaded = DecimatedMember("cortex", 0, original, triangles).load()
+    loaded = decimated(load_mesh(original), triangles)
     mesh = Similarity.to_unit_ball(loaded).apply(loaded)
     assert isinstance(mesh, Mesh)
     return mesh

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,8 @@ from sobolev_batch.surfaces.shapes.surface import Point
 from sobolev_batch.surfaces.sources.generated import Triple
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
-    ExpectedSize,
     Fingerprint,
+    MadeMember,
     Member,
     NestedSource,
     Times,
@@ -63,9 +62,9 @@ class MovedSource(NestedSource):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each distance, the smallest first."""
         original = single_member(self.mesh, folder)
-        x, y, z = np.asarray(self.direction) / np.linalg.norm(self.direction)
+        direction = (np.asarray(self.direction) / np.linalg.norm(self.direction)).tolist()
         return tuple(
-            MovedMember(f"{distance:g}", -1, original, distance, (float(x), float(y), float(z)))
+            _displaced("moved", original, distance, _moved, direction, {"direction": direction})
             for distance in sorted(set(self.distances))
         )
 
@@ -86,7 +85,7 @@ class NoisySource(NestedSource):
         """Return one member for each amplitude, the smallest first."""
         original = single_member(self.mesh, folder)
         return tuple(
-            NoisyMember(f"{amplitude:g}", -1, original, amplitude, self.seed)
+            _displaced("noisy", original, amplitude, _noisy, self.seed, {"seed": self.seed})
             for amplitude in sorted(set(self.amplitudes))
         )
 
@@ -116,99 +115,50 @@ class FlowSource(NestedSource):
         """Return one member for each time, in their order."""
         start = single_member(self.mesh, folder)
         return tuple(
-            CarriedMember(repr(time), -1, start, self.period, self.strength, time=time) for time in sorted(self.times)
+            MadeMember(
+                repr(time),
+                -1,
+                _carried_mesh,
+                {"time": time, "settings": [self.period, self.strength], "version": _VERSION},
+                (time, self.period, self.strength),
+                originals={"flow": start},
+                triangle_bytes=_CARRYING_BYTES,
+                time=time,
+            )
+            for time in sorted(self.times)
         )
 
 
-@dataclass(frozen=True)
-class _DisplacedMember(Member, ABC):
-    """A mesh with other vertices.
-
-    Attributes:
-        original: Member of the mesh.
-        amount: Size of the displacement, as a fraction of the radius of the mesh's bounding sphere.
-    """
-
-    original: Member
-    amount: float
-    kind: ClassVar[str]
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the fingerprint of the mesh, and all that its displacement follows from."""
-        return {self.kind: dict(self.original.fingerprint()), "amount": self.amount, "version": _VERSION}
-
-    def expected_size(self) -> ExpectedSize:
-        """Return the size of the mesh, and the memory that it takes to make and to displace it."""
-        return _size_of_changed(self.original, _DISPLACING_BYTES)
+def _displaced(
+    kind: str, original: Member, amount: float, displace: Callable[..., Mesh], argument: Any, what: Fingerprint
+) -> Member:
+    """Return the member of a mesh displaced by a fraction of the radius of its bounding sphere."""
+    return MadeMember(
+        f"{amount:g}",
+        -1,
+        displace,
+        {"amount": amount, "version": _VERSION, **what},
+        (amount, argument),
+        originals={kind: original},
+        triangle_bytes=_DISPLACING_BYTES,
+    )
 
 
-@dataclass(frozen=True)
-class MovedMember(_DisplacedMember):
-    """A mesh moved in a direction of length one."""
-
-    direction: Point
-    kind: ClassVar[str] = "moved"
-
-    def load(self) -> Mesh:
-        """Move the mesh."""
-        mesh = load_mesh(self.original)
-        _, radius = mesh.bounding_sphere
-        return Mesh(mesh.vertices + self.amount * radius * np.asarray(self.direction), mesh.triangles)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the fingerprint of the mesh, the distance and the direction."""
-        return {**super().fingerprint(), "direction": list(self.direction)}
+def _moved(original: Member, amount: float, direction: Point) -> Mesh:
+    mesh = load_mesh(original)
+    _, radius = mesh.bounding_sphere
+    return Mesh(mesh.vertices + amount * radius * np.asarray(direction), mesh.triangles)
 
 
-@dataclass(frozen=True)
-class NoisyMember(_DisplacedMember):
-    """A mesh with noise."""
-
-    seed: int
-    kind: ClassVar[str] = "noisy"
-
-    def load(self) -> Mesh:
-        """Displace the vertices."""
-        mesh = load_mesh(self.original)
-        _, radius = mesh.bounding_sphere
-        return with_noise(mesh, self.amount * radius, self.seed)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the fingerprint of the mesh, the amplitude and the seed."""
-        return {**super().fingerprint(), "seed": self.seed}
+def _noisy(original: Member, amount: float, seed: int) -> Mesh:
+    mesh = load_mesh(original)
+    _, radius = mesh.bounding_sphere
+    return with_noise(mesh, amount * radius, seed)
 
 
-@dataclass(frozen=True)
-class CarriedMember(Member):
-    """A mesh that a flow has carried along since time 0.
-
-    Attributes:
-        start: Member of the mesh at time 0.
-        period: Period of the flow.
-        strength: Strength of the deformation.
-    """
-
-    start: Member
-    period: float
-    strength: float
-
-    def load(self) -> Mesh:
-        """Move the vertices of the mesh."""
-        mesh = load_mesh(self.start)
-        return Mesh(carried(np.asarray(mesh.vertices), self.time or 0.0, self.period, self.strength), mesh.triangles)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the fingerprint of the mesh at time 0, the time and the flow."""
-        return {
-            "flow": dict(self.start.fingerprint()),
-            "time": self.time,
-            "settings": [self.period, self.strength],
-            "version": _VERSION,
-        }
-
-    def expected_size(self) -> ExpectedSize:
-        """Return the size of the mesh, and the memory that it takes to make and to move it."""
-        return _size_of_changed(self.start, _CARRYING_BYTES)
+def _carried_mesh(start: Member, time: float, period: float, strength: float) -> Mesh:
+    mesh = load_mesh(start)
+    return Mesh(carried(np.asarray(mesh.vertices), time, period, strength), mesh.triangles)
 
 
 def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
@@ -261,8 +211,3 @@ def carried(points: Reals, time: float, period: float, strength: float) -> Reals
     turn = 2 * np.pi * time / period
     rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     return np.asarray((rotation @ wound).T)
-
-
-def _size_of_changed(original: Member, bytes_per_triangle: int) -> ExpectedSize:
-    size = original.expected_size()
-    return ExpectedSize(size.triangles, max(size.projected_bytes, bytes_per_triangle * size.triangles), size.seconds)

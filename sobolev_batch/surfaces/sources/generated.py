@@ -6,28 +6,28 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import astuple, dataclass
+from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.ellipsoid import Ellipsoid
 from sobolev_batch.surfaces.smooth.torus import MOST_TRIANGLES, Torus
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
-    ExpectedSize,
     Fingerprint,
+    MadeMember,
     Member,
     Source,
     SurfaceMember,
     at_most,
-    installed_version,
 )
 
 # Measured peak of the subdivision, for each triangle that it makes.
@@ -137,7 +137,10 @@ class IcosphereSource(Source):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
-        return tuple(IcosphereMember(str(level), level) for level in sorted(set(self.levels)))
+        return tuple(
+            _triangulation(level, icosphere, (level,), {"icosphere": level}, 20 << 2 * level, ("trimesh",))
+            for level in sorted(set(self.levels))
+        )
 
 
 class EllipsoidLevelsSource(EllipsoidSource):
@@ -151,7 +154,18 @@ class EllipsoidLevelsSource(EllipsoidSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
-        return tuple(EllipsoidMember(str(level), level, self.shape) for level in sorted(set(self.levels)))
+        shape = self.shape
+        return tuple(
+            _triangulation(
+                level,
+                Ellipsoid.mesh,
+                (shape, level),
+                {"ellipsoid level": level, "ellipsoid": _parameters(shape)},
+                20 << 2 * level,
+                ("trimesh",),
+            )
+            for level in sorted(set(self.levels))
+        )
 
 
 class TorusGridSource(TorusSource):
@@ -179,83 +193,33 @@ class TorusGridSource(TorusSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
-        return tuple(
-            TorusMember(str(level), level, self.shape, self.around << level, self.across << level)
-            for level in sorted(set(self.levels))
-        )
+        shape, members = self.shape, []
+        for level in sorted(set(self.levels)):
+            around, across = self.around << level, self.across << level
+            identity = {"torus grid": [around, across], "torus": _parameters(shape)}
+            members.append(_triangulation(level, Torus.mesh, (shape, around, across), identity, 2 * around * across))
+        return tuple(members)
 
 
-@dataclass(frozen=True)
-class TriangulationMember(Member, ABC):
-    """A triangulation of a closed-form surface, whose number of triangles is known before it is made."""
-
-    @property
-    @abstractmethod
-    def triangles(self) -> int:
-        """Number of triangles."""
-
-    def expected_size(self) -> ExpectedSize:
-        """Return the number of triangles and the memory that making them takes."""
-        return ExpectedSize(self.triangles, _SUBDIVISION_BYTES * self.triangles)
-
-
-@dataclass(frozen=True)
-class IcosphereMember(TriangulationMember):
-    """The icosphere of the member's level."""
-
-    @property
-    def triangles(self) -> int:
-        """Number of triangles."""
-        return 20 << (2 * self.level)
-
-    def load(self) -> Surface:
-        """Make the mesh."""
-        return icosphere(self.level)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the level, and the version of the library that subdivides."""
-        return {"icosphere": self.level, "trimesh": installed_version("trimesh")}
-
-
-@dataclass(frozen=True)
-class EllipsoidMember(IcosphereMember):
-    """The icosphere of the member's level, stretched onto an ellipsoid."""
-
-    ellipsoid: Ellipsoid
-
-    def load(self) -> Surface:
-        """Make the mesh."""
-        return self.ellipsoid.mesh(self.level)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the ellipsoid, the level, and the version of the library that subdivides."""
-        return {
-            "ellipsoid level": self.level,
-            "ellipsoid": _parameters(self.ellipsoid),
-            "trimesh": installed_version("trimesh"),
-        }
-
-
-@dataclass(frozen=True)
-class TorusMember(TriangulationMember):
-    """A grid on a torus."""
-
-    torus: Torus
-    around: int
-    across: int
-
-    @property
-    def triangles(self) -> int:
-        """Number of triangles."""
-        return 2 * self.around * self.across
-
-    def load(self) -> Surface:
-        """Make the mesh."""
-        return self.torus.mesh(self.around, self.across)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the torus and the numbers of cells."""
-        return {"torus grid": [self.around, self.across], "torus": _parameters(self.torus)}
+def _triangulation(
+    level: int,
+    make: Callable[..., Mesh],
+    arguments: tuple[Any, ...],
+    identity: Fingerprint,
+    triangles: int,
+    libraries: tuple[str, ...] = (),
+) -> Member:
+    """Return the member of a level, whose number of triangles is known before it is made."""
+    return MadeMember(
+        str(level),
+        level,
+        make,
+        identity,
+        arguments,
+        libraries=libraries,
+        triangles=triangles,
+        triangle_bytes=_SUBDIVISION_BYTES,
+    )
 
 
 def _parameters(shape: ClosedForm) -> list[float]:

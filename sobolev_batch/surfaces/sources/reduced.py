@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -15,22 +15,21 @@ from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.generated import Levels
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
-    ExpectedSize,
-    Fingerprint,
+    MadeMember,
     Member,
     NestedSource,
     Source,
     at_most,
-    installed_version,
     load_mesh,
     parse_nested,
     single_member,
 )
 
+# Takes a mesh and a number of triangles.
+_Reduction = Callable[[Mesh, int], Mesh]
 # Measured peak of simplifying and of clustering, for each triangle of the original.
 _REDUCING_BYTES = 450
 # No mesh that can be read has as many.
@@ -53,71 +52,37 @@ class ReducedSource(NestedSource, ABC):
         at_most(MOST_ENTRIES),
     ]
 
-    member_type: ClassVar[type[ReducedMember]]
+    kind: ClassVar[str]
+    library: ClassVar[str]
+    # What the library does.
+    reduce: ClassVar[_Reduction]
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per triangle count, coarse to fine."""
         original = single_member(self.mesh, folder)
-        counts = sorted(set(self.triangles))
-        return tuple(self.member_type(str(count), rank, original, count) for rank, count in enumerate(counts))
-
-
-@dataclass(frozen=True)
-class ReducedMember(Member, ABC):
-    """A mesh reduced to a number of triangles.
-
-    Attributes:
-        original: Member of the mesh to reduce.
-        triangles: Number of triangles.
-    """
-
-    original: Member
-    triangles: int
-
-    def load_original(self) -> Mesh:
-        """Return the mesh to reduce.
-
-        Raises:
-            MeshError: It is no mesh, or has too few triangles.
-        """
-        mesh = load_mesh(self.original)
-        if self.triangles >= len(mesh.triangles):
-            raise MeshError(
-                f"{self.original.name} has {len(mesh.triangles)} triangles and cannot be reduced to "
-                f"{self.triangles}: ask for fewer"
+        return tuple(
+            MadeMember(
+                str(count),
+                rank,
+                _reduced,
+                {"triangles": count},
+                (type(self).reduce, count),
+                originals={self.kind: original},
+                libraries=(self.library,),
+                triangles=count,
+                triangle_bytes=_REDUCING_BYTES,
             )
-        return mesh
-
-    def expected_size(self) -> ExpectedSize:
-        """Return the size of the reduced mesh and the memory that reducing the original takes."""
-        return _reduced_size(self.original, self.triangles)
+            for rank, count in enumerate(sorted(set(self.triangles)))
+        )
 
 
-@dataclass(frozen=True)
-class DecimatedMember(ReducedMember):
-    """A mesh simplified to a number of triangles."""
-
-    def load(self) -> Surface:
-        """Load the original and collapse edges down to the count."""
-        return decimated(self.load_original(), self.triangles)
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the original's fingerprint, the count, and the version of the library."""
-        return {
-            "decimate": dict(self.original.fingerprint()),
-            "triangles": self.triangles,
-            "fast-simplification": installed_version("fast-simplification"),
-        }
-
-
-class DecimateSource(ReducedSource):
-    """Simplifications of one mesh by quadric edge collapse.
-
-    M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
-    doi:10.1145/258734.258849; by the library fast-simplification.
-    """
-
-    member_type = DecimatedMember
+def _reduced(original: Member, reduce: _Reduction, triangles: int) -> Mesh:
+    mesh = load_mesh(original)
+    if triangles >= len(mesh.triangles):
+        raise MeshError(
+            f"{original.name} has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: choose fewer"
+        )
+    return reduce(mesh, triangles)
 
 
 def decimated(mesh: Mesh, triangles: int) -> Mesh:
@@ -128,40 +93,42 @@ def decimated(mesh: Mesh, triangles: int) -> Mesh:
     return Mesh(vertices, faces)
 
 
-@dataclass(frozen=True)
-class RemeshedMember(ReducedMember):
-    """A mesh remeshed to about a number of triangles."""
+def remeshed(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh of about a number of triangles around clusters of the vertices of another one.
 
-    def load(self) -> Surface:
-        """Load the original, cluster it, and triangulate the clusters."""
-        try:
-            import pyacvd
-            import pyvista
-        except ImportError as error:
-            raise MeshError(
-                f"remeshing needs a library that is missing ({error}); install the extra: "
-                "pip install 'sobolev-batch[studies]'"
-            ) from error
-        mesh = self.load_original()
-        # A closed surface of genus g has V = F/2 + 2 - 2g: two vertices more than half the triangles.
-        clusters = self.triangles // 2 + 2
-        with warnings.catch_warnings():
-            # pyacvd 0.4 still reads an attribute that pyvista has renamed.
-            warnings.filterwarnings("ignore", message=".*_connectivity_array")
-            clustering = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.triangles))
-            while len(clustering.mesh.points) < _VERTICES_PER_CLUSTER * clusters:
-                clustering.subdivide(2)
-            clustering.cluster(clusters)
-            remeshed = clustering.create_mesh()
-        return Mesh(np.asarray(remeshed.points), np.asarray(remeshed.regular_faces))
+    Raises:
+        MeshError: The library is not installed.
+    """
+    try:
+        import pyacvd
+        import pyvista
+    except ImportError as error:
+        raise MeshError(
+            f"remeshing needs a library that is missing ({error}); install the extra: "
+            "pip install 'sobolev-batch[studies]'"
+        ) from error
+    # A closed surface of genus g has V = F/2 + 2 - 2g: two vertices more than half the triangles.
+    clusters = triangles // 2 + 2
+    with warnings.catch_warnings():
+        # pyacvd 0.4 still reads an attribute that pyvista has renamed.
+        warnings.filterwarnings("ignore", message=".*_connectivity_array")
+        clustering = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.triangles))
+        while len(clustering.mesh.points) < _VERTICES_PER_CLUSTER * clusters:
+            clustering.subdivide(2)
+        clustering.cluster(clusters)
+        result = clustering.create_mesh()
+    return Mesh(np.asarray(result.points), np.asarray(result.regular_faces))
 
-    def fingerprint(self) -> Fingerprint:
-        """Return the original's fingerprint, the count, and the version of the library."""
-        return {
-            "remesh": dict(self.original.fingerprint()),
-            "triangles": self.triangles,
-            "pyacvd": installed_version("pyacvd"),
-        }
+
+class DecimateSource(ReducedSource):
+    """Simplifications of one mesh by quadric edge collapse.
+
+    M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
+    doi:10.1145/258734.258849; by the library fast-simplification.
+    """
+
+    kind, library = "decimate", "fast-simplification"
+    reduce: ClassVar[_Reduction] = staticmethod(decimated)
 
 
 class RemeshSource(ReducedSource):
@@ -172,7 +139,8 @@ class RemeshSource(ReducedSource):
     doi:10.1111/j.1467-8659.2004.00769.x; by the library pyacvd, which the extra ``studies`` installs.
     """
 
-    member_type = RemeshedMember
+    kind, library = "remesh", "pyacvd"
+    reduce: ClassVar[_Reduction] = staticmethod(remeshed)
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -204,47 +172,35 @@ class SphericalLevelsSource(NestedSource):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
         surface, sphere = single_member(self.mesh, folder), single_member(self.sphere, folder)
-        return tuple(LevelMember(str(level), level, surface, sphere) for level in sorted(set(self.levels)))
-
-
-@dataclass(frozen=True)
-class LevelMember(Member):
-    """One icosahedral level of a surface."""
-
-    surface: Member
-    sphere: Member
-
-    def load(self) -> Surface:
-        """Take the vertices of the level from the surface, and its triangles from the hull of the sphere."""
-        surface, sphere = load_mesh(self.surface), load_mesh(self.sphere)
-        count = 10 * 4**self.level + 2
-        if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
-            raise MeshError(
-                f"level {self.level} needs the first {count} vertices of a surface and of its map to the sphere, "
-                f"found {len(surface.vertices)} and {len(sphere.vertices)}"
+        return tuple(
+            MadeMember(
+                str(level),
+                level,
+                _first_vertices,
+                {"spherical level": level},
+                (level,),
+                originals={"surface": surface, "sphere": sphere},
+                triangles=20 * 4**level,
+                # The hull takes memory like a reduction of the surface.
+                triangle_bytes=_REDUCING_BYTES,
             )
-        hull = ConvexHull(sphere.vertices[:count] - sphere.vertices[:count].mean(axis=0))
-        if len(hull.simplices) != 2 * count - 4:
-            raise MeshError(
-                f"the first {count} vertices of {self.sphere.name} are not in convex position: their hull has "
-                f"{len(hull.simplices)} triangles, expected {2 * count - 4}"
-            )
-        return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
-
-    def fingerprint(self) -> Fingerprint:
-        """Return the fingerprints of both surfaces, and the level."""
-        return {
-            "spherical level": self.level,
-            "surface": dict(self.surface.fingerprint()),
-            "sphere": dict(self.sphere.fingerprint()),
-        }
-
-    def expected_size(self) -> ExpectedSize:
-        """Return the size of the level; the hull takes memory like a reduction of the surface."""
-        return _reduced_size(self.surface, 20 * 4**self.level)
+            for level in sorted(set(self.levels))
+        )
 
 
-def _reduced_size(original: Member, triangles: int) -> ExpectedSize:
-    """Return the expected size of a mesh that is made from a finer one."""
-    size = original.expected_size()
-    return ExpectedSize(triangles, max(size.projected_bytes, _REDUCING_BYTES * size.triangles), size.seconds)
+def _first_vertices(surface_member: Member, sphere_member: Member, level: int) -> Mesh:
+    """Take the vertices of a level from a surface, and its triangles from the hull of its map to the sphere."""
+    surface, sphere = load_mesh(surface_member), load_mesh(sphere_member)
+    count = 10 * 4**level + 2
+    if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
+        raise MeshError(
+            f"level {level} needs the first {count} vertices of a surface and of its map to the sphere, "
+            f"found {len(surface.vertices)} and {len(sphere.vertices)}"
+        )
+    hull = ConvexHull(sphere.vertices[:count] - sphere.vertices[:count].mean(axis=0))
+    if len(hull.simplices) != 2 * count - 4:
+        raise MeshError(
+            f"the first {count} vertices of {sphere_member.name} are not in convex position: their hull has "
+            f"{len(hull.simplices)} triangles, expected {2 * count - 4}"
+        )
+    return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))

@@ -13,7 +13,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
@@ -225,6 +225,53 @@ class SurfaceMember(Member):
     def fingerprint(self) -> Fingerprint:
         """Return the identity."""
         return self.identity
+
+
+@dataclass(frozen=True)
+class MadeMember(Member):
+    """A mesh that a function makes, from the surfaces of other members or from numbers alone.
+
+    Attributes:
+        make: Function of a module; it takes the originals, then the arguments.
+        identity: What the fingerprint holds besides the originals and the libraries: the name of the formula, its
+            parameters and its version.
+        arguments: Numbers that the function takes.
+        originals: Members that the function takes, by their keys in the fingerprint.
+        libraries: Distributions whose versions are part of the fingerprint.
+        triangles: Number of triangles of the mesh; None for as many as the first original has.
+        triangle_bytes: Measured peak of the memory that making takes, for each triangle of the first original, or of
+            the mesh itself where there is none.
+    """
+
+    make: Callable[..., Mesh]
+    identity: Fingerprint
+    arguments: tuple[Any, ...] = ()
+    originals: Mapping[str, Member] = field(default_factory=dict)
+    libraries: tuple[str, ...] = ()
+    triangles: int | None = None
+    triangle_bytes: int = 0
+
+    def load(self) -> Mesh:
+        """Make the mesh."""
+        return self.make(*self.originals.values(), *self.arguments)
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the identity, the fingerprints of the originals and the versions of the libraries."""
+        return {
+            **self.identity,
+            **{key: dict(original.fingerprint()) for key, original in self.originals.items()},
+            **{library: installed_version(library) for library in self.libraries},
+        }
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the number of triangles and the memory that it takes to make them, the first original included."""
+        first = next(iter(self.originals.values()), None)
+        size = ExpectedSize(self.triangles or 0) if first is None else first.expected_size()
+        return ExpectedSize(
+            size.triangles if self.triangles is None else self.triangles,
+            max(size.projected_bytes, float(self.triangle_bytes * size.triangles)),
+            size.seconds,
+        )
 
 
 def at_most(count: int) -> BeforeValidator:

@@ -94,7 +94,7 @@ def test_the_fingerprint_of_a_reduction_is_that_of_the_original_and_the_count(
     table = {"source": "decimate", "mesh": {"source": "files", "paths": ["box.off"]}, "triangles": [4, 8]}
     assert dict(members(table, tmp_path)[1].fingerprint()) == of("box.off", 8)
     before = of("box.off", 8)
-    monkeypatch.setattr("sobolev_batch.surfaces.sources.reduced.installed_version", lambda name: "99")
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.installed_version", lambda name: "99")
     assert of("box.off", 8) != before
 
 
@@ -108,7 +108,7 @@ def test_remeshing_without_its_library_shows_what_to_install(monkeypatch: pytest
     def version(distribution: str) -> str:
         raise PackageNotFoundError(distribution)
 
-    (member,) = members({"source": "remesh", "mesh": {"source": "sphere"}, "triangles": [80]})
+    (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
     monkeypatch.setitem(sys.modules, "pyacvd", None)
     monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.version", version)
     for use in (member.load, member.fingerprint):

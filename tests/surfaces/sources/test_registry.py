@@ -257,7 +257,7 @@ def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
 def test_the_fingerprint_of_a_generated_mesh_names_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
     (member,) = members(BALL)
     before = dict(member.fingerprint())
-    monkeypatch.setattr("sobolev_batch.surfaces.sources.generated.installed_version", lambda name: f"{name} 99")
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.installed_version", lambda name: f"{name} 99")
     assert "trimesh 99" in dict(member.fingerprint()).values()
     assert member.fingerprint() != before
 
