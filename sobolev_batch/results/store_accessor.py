@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,10 @@ import xarray as xr
 
 from sobolev_batch.batch.analysis.reduce import StoredFields
 from sobolev_batch.batch.analysis.tiles import Reducer
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.errors import InputError
+from sobolev_batch.batch.store.tables import rows_unlike_tables
+from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.results.open import location_of
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
@@ -158,34 +159,44 @@ class StoreAccessor:
         )
 
     def _fields(self, *labels: str) -> tuple[Any, ...]:
-        """Return the stored fields, and the row of each label."""
-        fields, known, rows = self._stored, self._stored.store.labels(), []
+        """Return the stored fields of some meshes, and the row of each label. No record of other meshes is read."""
+        fields = stored_fields(self._tree, labels)
+        known = fields.store.labels()
         for label in labels:
             record = fields.records[known.index(label)] if label in known else None
             if record is None or record.status != "complete":
                 raise InputError(
                     f"{fields.store.path}: no mesh {quoted(label)} with a field; its labels begin {known[:3]}"
                 )
-            rows.append(known.index(label))
-        return fields, *rows
-
-    @cached_property
-    def _stored(self) -> StoredFields:
-        return stored_fields(self._tree)
+        return fields, *map(known.index, labels)
 
 
-def stored_fields(tree: xr.DataTree) -> StoredFields:
-    """Return the fields of an open store.
+def stored_fields(tree: xr.DataTree, meshes: Collection[str] | None = None) -> StoredFields:
+    """Return fields of an open store.
+
+    Args:
+        tree: Open store.
+        meshes: Labels of the meshes whose records are read; all of them by default.
 
     Raises:
         InputError: The tree does not say where it was opened.
+        DamageError: The record of a mesh is not the one that the tables were made from.
     """
     store = Store.open(location_of(tree))
     study = store.attributes()["study"]
     lattice, octaves = Lattice(**study["lattice"]), study.get("octaves")
     tail = None if octaves is None else TailSampling.from_table(octaves)
     labels, removed = store.labels(), store.removed
-    records = [None if label in removed else record for label, record in zip(labels, store.records(), strict=True)]
+    rows = [i for i, label in enumerate(labels) if label not in removed and (meshes is None or label in meshes)]
+    read = store.records() if meshes is None else {i: store.read_record(i) for i in rows}
+    records: list[Record | None] = [None] * len(labels)
+    for i in rows:
+        records[i] = read[i]
+    unlike = rows_unlike_tables(store, records, rows) if rows else {}
+    for i, problem in unlike.items():
+        raise DamageError(
+            f"{store.path}: the field of {labels[i]} is damaged ({problem}); run the study again", problem, i
+        )
     return StoredFields(store, records, lattice, tail, labels.index(study["reference"]))
 
 

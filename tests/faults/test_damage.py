@@ -188,13 +188,33 @@ def with_checksum(data: bytes) -> bytes:
     ],
     ids=["a huge count", "a huge length", "no UTF-8", "nothing"],
 )
-def test_texts_that_cannot_be_are_refused_before_they_take_memory(data: bytes, store: Path) -> None:
+def test_texts_that_cannot_be_are_refused_before_they_take_memory(
+    data: bytes, store: Path, study: Study, threads: Client
+) -> None:
     (store / "records/record/c/2").write_bytes(with_checksum(data))
     (store / "meshes/name/c/0").write_bytes(with_checksum(data))
     for group, name in (("records", "record"), ("meshes", "name")):
         with pytest.raises(DamageError, match=rf"{group}/{name} is damaged"):
             variable(open_store(store), group, name).load()
+    assert status(store).lost_records == ("ico/2",)
     assert list(verify(store).fields) == ["ico/2"]
+    (store / "records/record/c/2").write_bytes(with_checksum(data))
+    assert run(study, store, threads).computed == ("ico/2",)
+    assert verify(store).is_sound
+
+
+def test_labels_are_read_once_for_any_number_of_damaged_records(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for row in range(5):
+        flip(store / f"records/record/c/{row}")
+    reads, read = [], Store.labels
+
+    def labels(opened: Store) -> tuple[str, ...]:
+        reads.append(opened.path)
+        return read(opened)
+
+    monkeypatch.setattr(Store, "labels", labels)
+    assert Store.open(store).records() == (None,) * 5
+    assert len(reads) == 1
 
 
 def test_sparse_chunks_and_stray_links(store: Path) -> None:

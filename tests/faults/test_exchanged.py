@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import DamageError, Study, open_store, run, status, verify
+from sobolev_batch import DamageError, Study, open_store, run, status, table, verify
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.results.store_accessor import StoreAccessor
 from tests.support.stores import assert_same_fields, assert_same_tables, put_back
 from tests.support.studies import small_table, variable
 
@@ -112,6 +113,13 @@ def test_an_earlier_field_with_its_record(
     assert list(verify(store).fields) == ["ico/1"]
     restore(store, earlier, FIELD.format(row=1), RECORD.format(row=1))
     assert status(store).lost_records == ("ico/1",)
+    tree = open_store(store)
+    with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
+        table(tree, -3.5)
+    fields = StoreAccessor(tree)
+    with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
+        fields.distance("ico/1", "reference", -3.0)
+    assert fields.norm("ico/2", -3.0)["norm"] > 0
     assert_mended(store, study, finished_store, threads, "ico/1")
 
 

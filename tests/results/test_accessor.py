@@ -13,7 +13,9 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.accessor import SobolevAccessor
+from sobolev_batch.spectral.errors.quality import Quality
 from tests.support.studies import SMALL_LATTICE, variable
 
 ORDERS = [-1.5, -7.0]
@@ -49,6 +51,23 @@ def test_stored_fields_at_any_order(finished_store: Path) -> None:
     found = field.sobolev.distance(reference, -3.5)
     assert found["distance"].item() == pytest.approx(fresh["distance"].item(), rel=1e-6)
     assert np.isfinite(found["error"].item())
+
+
+def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree, parsed, parse = sb.open_store(finished_store), [], Quality.from_json
+
+    def from_json(text: str) -> Quality:
+        parsed.append(text)
+        return parse(text)
+
+    monkeypatch.setattr(Quality, "from_json", from_json)
+    monkeypatch.delattr(Store, "records")
+    found = tree.sobolev.distance("ico/3", "reference", -3.0)
+    assert len(parsed) == 2
+    expected = variable(tree, "convergence", "distance").sel(mesh="ico/3", order=-3.0)
+    assert found["distance"].item() == pytest.approx(expected.item(), rel=1e-12)
+    tree.sobolev.norm("ico/3", -3.0)
+    assert len(parsed) == 3
 
 
 def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:

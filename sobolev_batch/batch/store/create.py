@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import version
@@ -307,13 +308,13 @@ def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | No
         label if label in planned and (is_trusted or (record is not None and record.completes(planned[label]))) else ""
         for label, record in zip(stored, records, strict=True)
     ]
-    taken, by_key = set(labels), dict[str, list[str]]()
+    taken, by_key = set(labels), dict[str, deque[str]]()
     for label, key in planned.items():
         if key and label not in taken:
-            by_key.setdefault(key, []).append(label)
+            by_key.setdefault(key, deque()).append(label)
     for row, record in enumerate(records):
         if not labels[row] and record is not None and record.status == "complete" and by_key.get(record.key):
-            labels[row] = by_key[record.key].pop(0)
+            labels[row] = by_key[record.key].popleft()
     taken = set(labels)
     for row, label in enumerate(stored):
         if not labels[row]:

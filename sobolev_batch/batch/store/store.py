@@ -350,10 +350,10 @@ class Store:
     def records(self) -> tuple[Record | None, ...]:
         """Return the completion record of each row, or None if it has none that can be read."""
         records, damage = self.examine_records()
+        # Read once for all of them.
+        labels = self._labels_or_numbers(len(records)) if damage else ()
         for row, problem in damage.items():
-            _log.warning(
-                "%s: the record of %s is damaged and counts as not there: %s", self.path, self._label(row), problem
-            )
+            _log.warning("%s: the record of %s is damaged and counts as not there: %s", self.path, labels[row], problem)
         return tuple(records)
 
     def read_record(self, row: int) -> Record | None:
@@ -511,16 +511,16 @@ class Store:
         return values
 
     def _damage(self, row: int, problem: str) -> DamageError:
-        label = self._label(row)
+        label = self._labels_or_numbers(row + 1)[row]
         return DamageError(
             f"{self.path}: the field of {label} is damaged ({problem}); run the study again", problem, row
         )
 
-    def _label(self, row: int) -> str:
+    def _labels_or_numbers(self, count: int) -> Sequence[str]:
         try:
-            return self.labels()[row]
+            return self.labels()
         except DamageError:
-            return f"row {row}"
+            return [f"row {row}" for row in range(count)]
 
 
 def _digest_of(table: Any) -> str:

@@ -6,7 +6,7 @@ they create arrays, and on object storage each look is a request.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -140,18 +140,23 @@ def damaged_tables(store: Store) -> dict[str, str]:
     return damage
 
 
-def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[int, str]:
+def rows_unlike_tables(
+    store: Store, records: Sequence[Record | None], among: Collection[int] | None = None
+) -> dict[int, str]:
     """Return how records differ from those that the tables were made from, by their rows.
 
     Args:
         store: Store of the tables.
         records: Record of each row, or None.
+        among: Rows to compare; all of them by default.
     """
     if table_attributes(store, "convergence") is None:
         return {}
     rows, statuses, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
     unlike = {}
     for row, status, key in zip(rows, statuses, keys, strict=True):
+        if among is not None and row not in among:
+            continue
         record = records[row] if row < len(records) else None
         if record is None and status != "missing":
             unlike[row] = "its completion record is missing"

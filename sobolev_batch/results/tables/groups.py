@@ -238,7 +238,7 @@ def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     """Return what orders that were computed from the fields rest on, as lines of a note of a table."""
-    fields = stored_fields(tree)
+    fields = stored_fields(tree, meshes=())
     frequencies = f"frequencies up to {fields.lattice.xi_max:g} on each axis"
     if fields.tail is not None:
         frequencies = f"{frequencies}, and samples in octaves up to {fields.tail.highest_frequency:.4g}"
