@@ -85,8 +85,8 @@ from .surfaces.sources.registry import ExpectedSize as ExpectedSize
 from .surfaces.sources.registry import Member as Member
 from .surfaces.sources.registry import Source as Source
 from .surfaces.sources.registry import SurfaceMember as SurfaceMember
-from .testing.assertion import assert_same_surface as assert_same_surface
 from .testing.verdict import Verdict as Verdict
+from .testing.verdict import assert_same_surface as assert_same_surface
 from .testing.verdict import same_surface as same_surface
 
 __all__: list[str]

@@ -10,7 +10,7 @@ from click.core import ParameterSource
 from sobolev_batch.cli.group import EXIT_DIFFERENT, EXIT_UNDECIDED
 from sobolev_batch.cli.options import fraction_of_norm
 from sobolev_batch.cli.output import echo
-from sobolev_batch.testing.defaults import DEFAULT_ORDER
+from sobolev_batch.testing import DEFAULT_ORDER
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.

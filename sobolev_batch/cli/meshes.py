@@ -117,8 +117,7 @@ def compare_command(
             f"Chamfer {nearness.chamfer:.4e} ± {nearness.chamfer_error:.0e} (s.e.)"
         )
     if witness_path is not None:
-        difference = write_difference(first, second, witness_path, orders[0], scaling=not no_scaling)
-        echo(difference.sentence(a.name))
+        echo(write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name))
 
 
 def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> None:

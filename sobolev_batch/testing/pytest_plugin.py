@@ -41,7 +41,7 @@ class SurfaceAssertion:
     def __call__(self, a: SurfaceLike, b: SurfaceLike, **settings: Any) -> Verdict:
         """Raise an AssertionError unless two surfaces are the same; see `sobolev_batch.assert_same_surface`."""
         __tracebackhide__ = True
-        from sobolev_batch.testing.assertion import assert_same_surface
+        from sobolev_batch.testing.verdict import assert_same_surface
 
         return assert_same_surface(a, b, **{"witness": next(self._paths), **settings})
 

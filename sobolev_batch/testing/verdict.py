@@ -1,19 +1,23 @@
-"""Verdicts: two surfaces are the same to a tolerance, different, or neither can be told."""
+"""Verdicts: two surfaces are the same to a tolerance, different, or undecided; and the assertion of test suites."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
+from sobolev_batch.errors import SobolevBatchError, one_line
 from sobolev_batch.html import table_html
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.results.tables.formatting import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.metrics.norms import check_seed
 from sobolev_batch.spectral.shells import single_order
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.testing.defaults import DEFAULT_ORDER, DEFAULT_RTOL
+from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
+from sobolev_batch.testing.witness import write_difference
 
 Outcome = Literal["same", "different", "undecided"]
 
@@ -134,6 +138,7 @@ def same_surface(
     >>> sb.same_surface(coarse, fine).outcome
     'different'
     """
+    check_seed(seed)
     accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, available(memory))
     checked_order = single_order(order)
     surface, reference = (as_surface(one) for one in (a, b))
@@ -144,3 +149,62 @@ def same_surface(
     lower, upper = found.bounds.lower, found.bounds.upper
     outcome: Outcome = "same" if upper <= rtol else "different" if lower > rtol else "undecided"
     return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, found.method)
+
+
+def assert_same_surface(
+    a: SurfaceLike,
+    b: SurfaceLike,
+    *,
+    rtol: float = DEFAULT_RTOL,
+    order: float = DEFAULT_ORDER,
+    scaling: bool = True,
+    memory: float | str | None = None,
+    seed: int = 0,
+    witness: str | Path | None = None,
+) -> Verdict:
+    """Raise an AssertionError unless two surfaces are the same, to a tolerance.
+
+    A test passes if they are proven to be the same: an undecided comparison fails too, with a message that says so.
+
+    Args:
+        a: Surface; see `same_surface`.
+        b: Reference, likewise.
+        rtol: See `same_surface`.
+        order: See `same_surface`.
+        scaling: See `same_surface`.
+        memory: See `same_surface`.
+        seed: See `same_surface`.
+        witness: Beginning of the paths of files to write if the surfaces differ, such as "failures/part". Meshes are
+            written as failures/part-a.ply and failures/part-b.ply, with the witness function of a against b at their
+            vertices: positive where a has area that b lacks. The message then names the place where it is largest.
+
+    Returns:
+        The verdict, which is "same".
+
+    Raises:
+        AssertionError: The surfaces are different, or it is undecided. The message is one line.
+        InputError: An argument is no surface, or out of range.
+
+    >>> import sobolev_batch as sb
+    >>> sphere = sb.icosphere(4)
+    >>> sb.assert_same_surface(sphere, sb.Sphere(), rtol=0.01).outcome
+    'same'
+    >>> sb.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere)
+    Traceback (most recent call last):
+        ...
+    AssertionError: different surfaces: relative distance 0.05... ± 0.0005 at order -4, above rtol 0.001; area -1.9 %
+    """
+    __tracebackhide__ = True
+    surface, reference = as_surface(a), as_surface(b)
+    verdict = same_surface(surface, reference, rtol=rtol, order=order, scaling=scaling, memory=memory, seed=seed)
+    if verdict:
+        return verdict
+    message = str(verdict)
+    if witness is not None:
+        try:
+            difference = write_difference(surface, reference, Path(witness), order, scaling=scaling)
+            message += f"; {difference}"
+        except (SobolevBatchError, OSError, ValueError, TypeError) as error:
+            # The test must fail for its own reason.
+            message += f"; no witness: {one_line(error)}"
+    raise AssertionError(message)

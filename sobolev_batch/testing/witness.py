@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,36 +25,6 @@ _ACCURACY = 1e-2
 _EPS = 1e-6
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Files of two meshes with the witness function of the one against the other.
-
-    Attributes:
-        paths: Files that were written.
-        value: Largest value of the witness function at a vertex, by modulus, in 1 / unit length.
-        place: Vertex where it is, in the meshes' own unit of length.
-    """
-
-    paths: tuple[Path, ...]
-    value: float
-    place: tuple[float, float, float]
-
-    def __str__(self) -> str:
-        """Return where the surfaces differ most, and the files, as the end of a line."""
-        return self.sentence("a")
-
-    def sentence(self, name: str) -> str:
-        """Return where the surfaces differ most, and the files; the first surface has a name."""
-        if not self.paths:
-            return "no witness: neither surface is a mesh"
-        files = f"witness: {' '.join(map(str, self.paths))}"
-        if self.value == 0:
-            return f"they differ nowhere; {files}"
-        kind = "more" if self.value > 0 else "less"
-        place = ", ".join(f"{coordinate:.4g}" for coordinate in self.place)
-        return f"{name} has {kind} area near ({place}); {files}"
-
-
 def require_place(path: Path) -> None:
     """Create the folder of the files that `write_difference` writes.
 
@@ -71,8 +40,8 @@ def require_place(path: Path) -> None:
 
 
 def write_difference(
-    a: Surface, b: Surface, path: Path, order: float, *, scaling: bool = True, name: str = ""
-) -> Difference:
+    a: Surface, b: Surface, path: Path, order: float, *, scaling: bool = True, subject: str = "a"
+) -> str:
     """Write two meshes, each with the witness function of a against b at its vertices.
 
     Surfaces that are no meshes have no file.
@@ -83,7 +52,10 @@ def write_difference(
         path: Beginning of the paths of the files, to which "-a.ply" and "-b.ply" are added. Its folder is created.
         order: Order s.
         scaling: See `same_surface`.
-        name: Name of the comparison for the comments of the files; by default that of the path.
+        subject: Name of the surface in the sentence that is returned.
+
+    Returns:
+        Where the surfaces differ most, and the files, as the end of a line.
 
     Raises:
         InputError: The order is out of range, or the path names no file, or its folder cannot be created.
@@ -110,8 +82,14 @@ def write_difference(
         if abs(values[0, vertex]) > abs(greatest):
             greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
         file = path.with_name(f"{path.name}-{label}.ply")
-        VertexField(
-            own, values, (order,), 1 / similarity.scale, label, "b", name or path.name, context="comparison"
-        ).write(file)
+        VertexField(own, values, (order,), 1 / similarity.scale, label, "b", path.name, context="comparison").write(
+            file
+        )
         written.append(file)
-    return Difference(tuple(written), greatest, place)
+    if not written:
+        return "no witness: neither surface is a mesh"
+    files = f"witness: {' '.join(map(str, written))}"
+    if greatest == 0:
+        return f"they differ nowhere; {files}"
+    kind = "more" if greatest > 0 else "less"
+    return f"{subject} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)}); {files}"

@@ -62,7 +62,7 @@ def test_a_place_that_cannot_be_written_leaves_the_failure_as_it_is(tmp_path: Pa
 def test_equal_surfaces_differ_nowhere(tmp_path: Path) -> None:
     sphere = sb.icosphere(1)
     difference = write_difference(sphere, sphere, tmp_path / "w", -4.0)
-    assert str(difference) == f"they differ nowhere; witness: {tmp_path / 'w-a.ply'} {tmp_path / 'w-b.ply'}"
+    assert difference == f"they differ nowhere; witness: {tmp_path / 'w-a.ply'} {tmp_path / 'w-b.ply'}"
 
 
 def test_surfaces_in_closed_form_have_no_files(tmp_path: Path) -> None:

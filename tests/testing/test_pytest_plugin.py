@@ -61,7 +61,7 @@ def test_files_lie_beside_the_failure(
     assert files[0].startswith("test-lost-a-b-")
     assert files[2].startswith("test-lost-c-")
     result.stdout.fnmatch_lines([f"E *AssertionError: different surfaces: *; witness: *{folder}/{files[0]} *"])
-    assert "assertion.py" not in result.stdout.str()
+    assert "verdict.py" not in result.stdout.str()
 
 
 def test_without_a_cache_files_lie_in_the_temporary_folder(pytester: pytest.Pytester) -> None:

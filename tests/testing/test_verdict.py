@@ -176,6 +176,10 @@ def test_bounds_far_apart_are_told_as_such() -> None:
         ((sb.Sphere(), sb.Sphere()), {"rtol": 0}, "rtol must lie between 0 and 1, found 0"),
         ((sb.Sphere(), sb.Sphere()), {"order": [-2, -3]}, "one order is needed, found 2"),
         (("nowhere.ply", sb.Sphere()), {}, "nowhere.ply: "),
+        ((sb.Sphere(), sb.Sphere()), {"memory": "9000TB"}, "memory of .* is more than there is"),
+        # A seed is refused also where the verdict follows from a lattice, without random frequencies.
+        ((sb.Sphere(), sb.Sphere()), {"seed": -1}, "seed must be a whole number from 0 on, found -1"),
+        ((sb.Sphere(), sb.Sphere()), {"seed": 1.5}, "seed must be a whole number from 0 on, found 1.5"),
     ],
 )
 def test_refusals(arguments: tuple[Any, Any], settings: dict[str, Any], message: str) -> None:
