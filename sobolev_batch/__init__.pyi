@@ -3,8 +3,8 @@ from .batch.run import Summary as Summary
 from .batch.run import run as run
 from .batch.store.heartbeat import release as release
 from .batch.study.collection import StudyCollection as StudyCollection
-from .batch.study.draft.init import StudyDraft as StudyDraft
-from .batch.study.draft.init import init_study as init_study
+from .batch.study.draft import StudyDraft as StudyDraft
+from .batch.study.draft import init_study as init_study
 from .batch.study.study import Study as Study
 from .batch.submit import Submission as Submission
 from .batch.submit import submit as submit

@@ -49,7 +49,7 @@ def init_command(folder: Path, output: Path) -> None:
     ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
     in the number at the end. Several references are several objects. [default: current folder]
     """
-    from sobolev_batch.batch.study.draft.init import init_study
+    from sobolev_batch.batch.study.draft import init_study
 
     echo_lines(init_study(folder, output))
 
