@@ -14,10 +14,10 @@ def test_the_exceptions_agree_with_numpy() -> None:
     rows, values = rng.normal(size=(3, 50)), rng.normal(size=50)
     starts = np.array([0, 3, 4, 20, 49])
     for coefficients in (rng.normal(size=3), rng.normal(size=(5, 3))):
-        found = combine(coefficients, device._asarray(rows))
+        found = combine(coefficients, device.upload(rows))
         assert isinstance(found, Array)
         assert np.abs(found.host - coefficients @ rows).max() < 1e-14
-    sums = sums_of_runs(device._asarray(values), device._asarray(starts))
+    sums = sums_of_runs(device.upload(values), device.upload(starts))
     assert np.abs(sums.host - np.add.reduceat(values, starts)).max() < 1e-14
 
 

@@ -20,7 +20,7 @@ from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.fields import compute_field, field_for
-from sobolev_batch.spectral.lattice import Block, OctaveLattice
+from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
@@ -30,19 +30,20 @@ from tests.support.repository import PACKAGE, imported
 
 LATTICE = Lattice(5.0, 32)
 DOUBLE = TransformSettings(1e-13)
+ROUGH = TransformSettings(1e-9)
 
 
 def uneven() -> Mesh:
     """A closed surface with triangles of all sizes: corners, midpoints, interior rules and triangles cut up."""
-    sphere = icosphere(4)
+    sphere = icosphere(3)
     height = sphere.vertices[:, 2]
     stretched = sphere.vertices * (0.5 + 0.4 * np.sin(sphere.vertices @ np.array([3.0, -2.0, 1.0])))[:, None]
     small = np.where(height[:, None] > 0.2, stretched, 0.02 * stretched + np.array([0.0, 0.0, -0.3]))
     far = Mesh(np.array([[-1.2, -1.2, 0.9], [1.3, -1.1, 0.8], [0.1, 1.4, 1.2]]), [[0, 1, 2]])
-    return Mesh(
-        np.concatenate([small, far.vertices]),
-        np.concatenate([sphere.triangles, far.triangles + len(small)]),
-    )
+    return Mesh(np.concatenate([small, far.vertices]), np.concatenate([sphere.triangles, far.triangles + len(small)]))
+
+
+MESHES = {"icosphere 0": icosphere(0), "icosphere 3": icosphere(3), "uneven": uneven()}
 
 
 def on(backend: backends.Backend, mesh: Mesh, settings: TransformSettings = DOUBLE, **options: Any) -> Transformed:
@@ -50,95 +51,69 @@ def on(backend: backends.Backend, mesh: Mesh, settings: TransformSettings = DOUB
 
 
 def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, tolerance: float = 1e-12) -> None:
+    assert (found.backend, expected.backend) == ("cufinufft", "finufft")
     assert found.points == expected.points
     assert found.values.dtype == expected.values.dtype
     assert isinstance(found.values, np.ndarray)
     assert np.abs(found.values - expected.values).max() < tolerance * mesh.area
 
 
-def rules_in_use(mesh: Mesh, settings: TransformSettings) -> set[str]:
-    assignment = RuleAssignment.for_mesh(mesh, LATTICE.highest_frequency, settings.tolerance, settings.quadrature)
-    kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
-    return {"split" if use.splits else kinds.get(use.rule, "interior") for use in assignment.uses}
-
-
-MESHES: list[Callable[[], Mesh]] = [*(lambda level=level: icosphere(level) for level in range(5)), uneven]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", MESHES)
+@pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("quadrature", ["auto", "gauss8", 7])
-def test_the_fake_agrees_with_the_processor(make: Callable[[], Mesh], quadrature: str | int) -> None:
-    mesh = make()
-    settings = TransformSettings(1e-13, quadrature=Quadrature(quadrature))
-    found = on(Device().backend(), mesh, settings)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh, settings), mesh)
+def test_the_fake_agrees_with_the_processor(name: str, quadrature: str | int) -> None:
+    mesh, settings = MESHES[name], TransformSettings(1e-13, quadrature=Quadrature(quadrature))
+    assert_agree(on(Device().backend(), mesh, settings), on(CPU, mesh, settings), mesh)
 
 
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
-def test_every_kind_of_rule_agrees(tolerance: float) -> None:
-    mesh, settings = uneven(), TransformSettings(1e-13, tolerance=tolerance)
-    if tolerance == 1e-2:
-        assert rules_in_use(mesh, settings) == {"corners", "midpoints", "interior", "split"}
-    found = on(Device().backend(), mesh, settings)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh, settings), mesh)
+def test_every_kind_of_rule_agrees() -> None:
+    mesh, settings = uneven(), TransformSettings(1e-13, tolerance=1e-2)
+    uses = RuleAssignment.for_mesh(mesh, LATTICE.highest_frequency, 1e-2, settings.quadrature).uses
+    kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
+    found = {"split" if use.splits else kinds.get(use.rule, "interior") for use in uses}
+    assert found == {"corners", "midpoints", "interior", "split"}
+    assert_agree(on(Device().backend(), mesh, settings), on(CPU, mesh, settings), mesh)
 
 
 def test_single_precision_agrees_to_its_own_accuracy() -> None:
     mesh, settings = uneven(), TransformSettings(1e-6, "complex64")
-    found = on(Device().backend(), mesh, settings)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh, settings), mesh, 1e-5)
+    assert_agree(on(Device().backend(), mesh, settings), on(CPU, mesh, settings), mesh, 1e-5)
 
 
-@pytest.mark.parametrize("block", [Block((-3, 4, 2), (5, 2, 4)), Block((-2, -3, 0), (4, 6, 1))])
-def test_batches_and_blocks_agree(block: Block) -> None:
+@pytest.mark.parametrize(
+    ("lattice", "block"),
+    [
+        (LATTICE, Block((-3, 4, 2), (5, 2, 4))),
+        (LATTICE, Block((-2, -3, 0), (4, 6, 1))),
+        # Turned and shifted, with a period far below the size of the mesh.
+        (OctaveLattice.random(8.0, 32.0, 16, np.random.default_rng(0)), None),
+    ],
+)
+def test_batches_and_blocks_agree(lattice: FrequencyLattice, block: Block | None) -> None:
     mesh = icosphere(3)
     found, expected = (
-        transform_block(mesh, LATTICE, block, DOUBLE, Execution(backend, batch=20_000))
+        transform_block(mesh, lattice, block or lattice.half, DOUBLE, Execution(backend, batch=20_000))
         for backend in (Device().backend(), CPU)
     )
-    assert found.backend == "cufinufft"
     assert_agree(found, expected, mesh)
 
 
-@pytest.mark.all
-def test_lattices_of_octaves_agree() -> None:
-    # Turned and shifted, with a period far below the size of the mesh.
-    mesh, lattice = icosphere(4), OctaveLattice.random(8.0, 32.0, 32, np.random.default_rng(0))
-    found, expected = (
-        transform_block(mesh, lattice, lattice.half, DOUBLE, Execution(backend, batch=20_000))
-        for backend in (Device().backend(), CPU)
-    )
-    assert found.backend == "cufinufft"
-    assert_agree(found, expected, mesh)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("eps", [1e-5, pytest.param(1e-9, marks=pytest.mark.all)])
-def test_a_small_device_computes_in_parts_and_never_runs_out(eps: float, caplog: pytest.LogCaptureFixture) -> None:
-    mesh, settings, lattice = icosphere(5), TransformSettings(eps), Lattice(5.0, 64)
-    expected = transform_block(mesh, lattice, lattice.half, settings)
-    device = Device(capacity=7.5e7)
-    found = transform_block(mesh, lattice, lattice.half, settings, Execution(device.backend()))
-    assert found.backend == "cufinufft"
-    assert device.options[0]["n_modes"] != lattice.shape
+def test_a_small_device_computes_in_parts_and_never_runs_out(caplog: pytest.LogCaptureFixture) -> None:
+    mesh, device = icosphere(3), Device(capacity=6e7)
+    found = on(device.backend(), mesh, ROUGH)
+    assert device.options[0]["n_modes"] != LATTICE.shape
     assert not caplog.records
-    assert_agree(found, expected, mesh, 5 * eps)
+    assert_agree(found, on(CPU, mesh, ROUGH), mesh, 5e-9)
     assert device.used == 0
 
 
 @pytest.mark.slow
 def test_what_is_foreseen_of_a_device_is_what_it_takes() -> None:
-    mesh, settings = icosphere(6), TransformSettings(1e-9)
-    device = Device()
-    on(device.backend(), mesh, settings, batch=200_000)
+    mesh, device = icosphere(5), Device()
+    on(device.backend(), mesh, ROUGH, batch=100_000)
     allowed = device.most_used / 0.9
-    assert on(Device(capacity=allowed + 1e8).backend(), mesh, settings, batch=200_000).backend == "cufinufft"
+    assert on(Device(capacity=allowed + 1e8).backend(), mesh, ROUGH, batch=100_000).backend == "cufinufft"
     # Points: what a batch holds at most, over the points of a batch.
-    assert device.most_used < 200_000 * GPU_COSTS.point_bytes + 60 * len(mesh.triangles) + 20e6
+    assert device.most_used < 100_000 * GPU_COSTS.point_bytes + 60 * len(mesh.triangles) + 20e6
 
 
 def test_every_option_of_a_plan_is_given() -> None:
@@ -150,81 +125,68 @@ def test_every_option_of_a_plan_is_given() -> None:
     assert (options["isign"], options["modeord"], options["dtype"], options["eps"]) == (-1, 0, "complex128", 1e-13)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("where", ["plan", "setpts", "execute"])
 @pytest.mark.parametrize("times", [1, 2])
 def test_out_of_memory_is_tried_again_in_smaller_parts(
     where: str, times: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    mesh, lattice, device = icosphere(5), Lattice(5.0, 64), Device(failures=[(where, "memory")] * times)
-    settings = TransformSettings(1e-9)
-    found = transform_block(mesh, lattice, lattice.half, settings, Execution(device.backend()))
-    assert found.backend == "cufinufft"
-    assert_agree(found, transform_block(mesh, lattice, lattice.half, settings), mesh, 5e-9)
+    mesh, lattice, device = icosphere(3), Lattice(5.0, 64), Device(failures=[(where, "memory")] * times)
+    found, expected = (
+        transform_block(mesh, lattice, lattice.half, ROUGH, Execution(backend)) for backend in (device.backend(), CPU)
+    )
+    assert_agree(found, expected, mesh, 5e-9)
     assert [record.levelname for record in caplog.records] == ["WARNING"] * times
     assert "cufinufft: out of memory; trying again with" in caplog.text
     assert device.used == 0
 
 
-def test_out_of_memory_for_good_falls_back(caplog: pytest.LogCaptureFixture) -> None:
-    mesh, device = icosphere(3), Device(failures=[("execute", "memory")] * 20)
+@pytest.mark.parametrize(
+    ("device", "reason", "warnings"),
+    [
+        (Device(failures=[("execute", "memory")] * 20), "out of memory", 3),
+        # Too small for anything, and not tried.
+        (Device(capacity=1e6), "out of memory", 1),
+        *((Device(failures=[(where, "error")]), "Error ", 1) for where in ("plan", "setpts", "execute")),
+    ],
+)
+def test_the_processor_steps_in(device: Device, reason: str, warnings: int, caplog: pytest.LogCaptureFixture) -> None:
+    mesh = icosphere(2)
     found = on(device.backend(), mesh)
-    assert found.backend == "finufft after cufinufft: out of memory"
+    assert found.backend.startswith(f"finufft after cufinufft: {reason}")
     assert np.array_equal(found.values, on(CPU, mesh).values)
+    assert len(caplog.records) == warnings
     assert "the processor computes it instead" in caplog.records[-1].message
     assert device.used == 0
+    assert bool(device.options) == (device.capacity > 1e6)
 
 
-def test_a_device_too_small_for_anything_is_not_tried(caplog: pytest.LogCaptureFixture) -> None:
-    mesh, device = icosphere(3), Device(capacity=1e6)
-    found = on(device.backend(), mesh)
-    assert found.backend == "finufft after cufinufft: out of memory"
-    assert not device.options
-    assert len(caplog.records) == 1
-
-
-@pytest.mark.slow
 def test_arrays_that_run_out_of_memory_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh, device = icosphere(4), Device(capacity=2e6)
+    mesh, device = icosphere(3), Device(capacity=3e5)
     monkeypatch.setattr(Gpu, "free_bytes", 1e9)  # as with a limit on CuPy's pool, which CUDA does not know
     found = on(device.backend(), mesh)
     assert found.backend == "finufft after cufinufft: out of memory"
     assert np.array_equal(found.values, on(CPU, mesh).values)
 
 
-@pytest.mark.parametrize("where", ["plan", "setpts", "execute"])
-def test_any_other_failure_falls_back_at_once(where: str, caplog: pytest.LogCaptureFixture) -> None:
-    mesh, device = icosphere(3), Device(failures=[(where, "error")])
-    found = on(device.backend(), mesh)
-    assert found.backend.startswith("finufft after cufinufft: Error ")
-    assert np.array_equal(found.values, on(CPU, mesh).values)
-    assert len(caplog.records) == 1
-    assert "the processor computes it instead" in caplog.text
-    assert device.used == 0
-
-
-@pytest.mark.slow
 def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
-    mesh, lattice = icosphere(4), Lattice(5.0, 64)
-    device = Device(capacity=2.5e8, failures=[("plan", "error")])
-    found = transform_block(mesh, lattice, lattice.half, DOUBLE, Execution(device.backend()))
+    mesh, lattice = icosphere(2), Lattice(5.0, 64)
+    device = Device(capacity=2e8, failures=[("plan", "error")])
+    found = transform_block(mesh, lattice, lattice.half, ROUGH, Execution(device.backend()))
     assert found.backend == "cufinufft"
     assert len(device.options) == 2
-    assert_agree(found, transform_block(mesh, lattice, lattice.half, DOUBLE), mesh)
 
 
 def test_memory_bounds_the_processor_that_steps_in() -> None:
     mesh, device = icosphere(3), Device(failures=[("execute", "error")])
-    found = on(device.backend(), mesh, TransformSettings(1e-9), allowed_bytes=1.2e7)
+    found = on(device.backend(), mesh, ROUGH, allowed_bytes=1.2e7)
     assert found.backend.startswith("finufft after")
-    assert np.array_equal(found.values, on(CPU, mesh, TransformSettings(1e-9), allowed_bytes=1.2e7).values)
+    assert np.array_equal(found.values, on(CPU, mesh, ROUGH, allowed_bytes=1.2e7).values)
     with pytest.raises(InputError, match="give at least"):
         on(Device().backend(), mesh, allowed_bytes=1e6)
 
 
-@pytest.mark.slow
 def test_two_threads_take_turns() -> None:
-    mesh, backend = icosphere(3), Device().backend()
+    mesh, backend = icosphere(1), Device().backend()
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: on(backend, mesh), range(8)))
     assert {each.backend for each in found} == {"cufinufft"}
@@ -478,12 +440,10 @@ def gpu() -> Iterator[Gpu]:
         pytest.skip(str(error))
 
 
-@pytest.mark.parametrize("make", [*MESHES, lambda: icosphere(5)])
-def test_a_gpu_agrees_with_the_processor(gpu: Gpu, make: Callable[[], Mesh]) -> None:
-    mesh = make()
-    found = on(gpu, mesh)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh), mesh)
+@pytest.mark.parametrize("name", MESHES)
+def test_a_gpu_agrees_with_the_processor(gpu: Gpu, name: str) -> None:
+    mesh = MESHES[name]
+    assert_agree(on(gpu, mesh), on(CPU, mesh), mesh)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("complex128", 1e-12), ("complex64", 1e-5)])
@@ -491,19 +451,15 @@ def test_a_gpu_agrees_with_the_processor(gpu: Gpu, make: Callable[[], Mesh]) -> 
 def test_a_gpu_agrees_in_both_precisions(
     gpu: Gpu, dtype: ComplexDtype, tolerance: float, rule_tolerance: float
 ) -> None:
-    mesh = uneven()
     settings = TransformSettings(1e-13 if dtype == "complex128" else 1e-6, dtype, tolerance=rule_tolerance)
-    found = on(gpu, mesh, settings, batch=20_000)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh, settings), mesh, tolerance)
+    mesh = uneven()
+    assert_agree(on(gpu, mesh, settings, batch=20_000), on(CPU, mesh, settings), mesh, tolerance)
 
 
 def test_a_gpu_agrees_in_parts(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = icosphere(5)
     monkeypatch.setattr(Gpu, "free_bytes", 7e7)
-    found = on(gpu, mesh)
-    assert found.backend == "cufinufft"
-    assert_agree(found, on(CPU, mesh), mesh)
+    assert_agree(on(gpu, mesh), on(CPU, mesh), mesh)
 
 
 def test_a_gpu_out_of_memory_falls_back(gpu: Gpu) -> None:
