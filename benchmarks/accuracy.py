@@ -31,7 +31,7 @@ def left_to_us(effort: Effort) -> Iterator[Row]:
     if not _chooses_lattices():
         yield Row("2", f"{what}: distance with its error", target=_SPEED_UP)
         return
-    case = Case.of(level, intervals, effort)
+    case = Case.from_level(level, intervals, effort)
 
     def papers(mesh: sb.Mesh) -> object:
         return relative_distance(case.papers(mesh), case.lattice, ORDER)

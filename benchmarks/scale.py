@@ -41,7 +41,7 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
         ended = time.perf_counter()
         tasks = sum(record.seconds for record in Store(store).records() if record is not None)
         peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        status = elapsed_seconds(lambda: Status.of(store))
+        status = elapsed_seconds(lambda: Status.from_store(store))
         again = elapsed_seconds(lambda: sb.run(study, store, client))
         opened = elapsed_seconds(lambda: sb.open_store(store)["convergence"]["distance"].load())
     fields = marks["fields ends"] - marks["fields begins"]

@@ -52,7 +52,7 @@ class Case:
 
     @classmethod
     @cache
-    def of(cls, level: int, intervals: int, effort: Effort, dtype: ComplexDtype = "complex128") -> Case:
+    def from_level(cls, level: int, intervals: int, effort: Effort, dtype: ComplexDtype = "complex128") -> Case:
         """An icosphere on a lattice up to 5 cycles per unit length."""
         mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
         upsampling = faster_upsampling(mesh, lattice, eps=_EPS[dtype], dtype=dtype, threads=effort.threads)
@@ -129,7 +129,7 @@ def as_in_the_paper(effort: Effort) -> Iterator[Row]:
     if effort.large:
         sizes += [(level, m) for m in (256, 416)]
     for n, m in sizes:
-        ours, papers = Case.of(n, m, effort).times(effort.repeats)
+        ours, papers = Case.from_level(n, m, effort).times(effort.repeats)
         yield Row("3", f"Fig. 4: T_{n}, M = {m}", as_seconds(ours), as_seconds(papers), papers / ours)
 
 
@@ -181,7 +181,7 @@ def growth(effort: Effort) -> Iterator[Row]:
 
 def _speed_up_and_distance(item: str, dtype: ComplexDtype, effort: Effort) -> Iterator[Row]:
     level, intervals = (4, 32) if effort.quick else (7, 128)
-    case = Case.of(level, intervals, effort, dtype)
+    case = Case.from_level(level, intervals, effort, dtype)
     ours, papers = case.times(effort.repeats)
     what = f"T_{level}, M = {intervals}, {dtype}"
     # Single precision holds six digits of a field, hence about one of so small a distance.

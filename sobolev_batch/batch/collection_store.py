@@ -52,7 +52,7 @@ class CollectionStore:
         return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
 
     @classmethod
-    def of(cls, location: Location, collection: StudyCollection) -> CollectionStore:
+    def for_collection(cls, location: Location, collection: StudyCollection) -> CollectionStore:
         """Return the store that a collection has, or would have, at a location."""
         return cls(location, collection.title, collection.name, tuple(collection.studies), collection.table)
 
@@ -81,7 +81,7 @@ class CollectionStore:
         attributes = {"title": collection.title, "schema_version": SCHEMA_VERSION, COLLECTION: entry}
         root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         location.write({ROOT: json.dumps(root).encode()})
-        return cls.of(location, collection)
+        return cls.for_collection(location, collection)
 
     @property
     def stores(self) -> dict[str, Location]:
@@ -102,7 +102,7 @@ def for_each_object(
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}
-    stores = CollectionStore.of(location, collection).stores
+    stores = CollectionStore.for_collection(location, collection).stores
     for name, study in collection.studies.items():
         try:
             results[name] = act(study, stores[name])

@@ -162,7 +162,7 @@ def run(
     2
     """
     require_give_up_after(give_up_after)
-    location, reusable = Location.parse(store), _Reusable.of([Location.parse(other) for other in reuse])
+    location, reusable = Location.parse(store), _Reusable.from_locations([Location.parse(other) for other in reuse])
     cluster: AbstractContextManager[Client]
     if client is None:
         # The workers of another cluster are asked before anything is computed.
@@ -197,7 +197,7 @@ class _Reusable:
     collections: tuple[Mapping[str, Location], ...]
 
     @classmethod
-    def of(cls, locations: Sequence[Location]) -> Self:
+    def from_locations(cls, locations: Sequence[Location]) -> Self:
         """Return the stores at locations, of single objects or of collections."""
         found = {location: CollectionStore.found(location) for location in locations}
         return cls(

@@ -39,7 +39,7 @@ class Workspace:
     records: list[Record | None]
 
     @classmethod
-    def of(cls, store: Store, plan: Plan) -> Self:
+    def for_plan(cls, store: Store, plan: Plan) -> Self:
         """Return the workspace of a store that is laid out for a plan."""
         by_label, labels = {row.label: row for row in plan.rows}, store.labels()
         rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
@@ -48,7 +48,7 @@ class Workspace:
     @classmethod
     def prepared(cls, location: Location, plan: Plan) -> Self:
         """Create or open the store of a plan; see `prepare_store`."""
-        return cls.of(prepare_store(location, plan), plan)
+        return cls.for_plan(prepare_store(location, plan), plan)
 
     @property
     def reference(self) -> int:

@@ -324,7 +324,7 @@ def witness_command(
     """
     from sobolev_batch.results.meshes.export import Exporter
 
-    exporter = Exporter.of(store, orders or None, folder)
+    exporter = Exporter.from_store(store, orders or None, folder)
     labels = exporter.labels(meshes)
     _require_folder(output)
     output.mkdir(parents=True, exist_ok=True)

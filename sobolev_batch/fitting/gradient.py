@@ -111,7 +111,7 @@ class SquaredDistance:
         mesh = as_mesh(mesh)
         orders = (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)
-        own = Lattice.of(field)
+        own = Lattice.from_field(field)
         values = field_values(field)
         execution = Execution(backend_named(backend), thread_count(threads))
         transform = MeshTransform.from_mesh(mesh, own, TransformSettings(eps), execution)
@@ -253,7 +253,7 @@ class _Difference:
             field = field_of(target, lattice, orders)
         else:
             field = fourier_transform(target, lattice, settings.eps, order=orders)
-        own = Lattice.of(field)
+        own = Lattice.from_field(field)
         placed = MeshTransform.from_mesh(mesh, own, settings, execution).at(np.asarray(mesh.vertices))
         return cls(mesh, placed, field, is_given, SobolevWeights(own, orders))
 

@@ -138,7 +138,7 @@ class FitProblem:
         move = Similarity()
         if isinstance(target, xr.DataArray):
             given = field_of(target, common_lattice((target,), lattice), (settings.order,))
-            own, values, quality = Lattice.of(given), field_values(given), quality_of(given)
+            own, values, quality = Lattice.from_field(given), field_values(given), quality_of(given)
         else:
             if lattice is None:
                 move = _centering(start, target)

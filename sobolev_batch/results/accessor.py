@@ -51,7 +51,7 @@ class SobolevAccessor:
     @property
     def lattice(self) -> Lattice:
         """Lattice on whose Hermitian half the field is sampled."""
-        return Lattice.of(self._field)
+        return Lattice.from_field(self._field)
 
     def norm(self, order: Orders) -> xr.Dataset:
         """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""

@@ -42,7 +42,7 @@ class Forecast:
     basis: str
 
     @classmethod
-    def of(
+    def for_plan(
         cls, plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
     ) -> Self:
         """Predict the time of a run.

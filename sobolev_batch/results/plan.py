@@ -331,7 +331,7 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         _plan=study_plan,
         _workers=workers,
         _sizes=sizes,
-        _forecast=Forecast.of(study_plan, stored, workers, client, planning_seconds),
+        _forecast=Forecast.for_plan(study_plan, stored, workers, client, planning_seconds),
     )
 
 

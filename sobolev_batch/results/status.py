@@ -72,7 +72,7 @@ class Status:
     lost_records: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, store: AnyStore) -> Status:
+    def from_store(cls, store: AnyStore) -> Status:
         """Return the status of a store; see `sobolev_batch.status`."""
         place = location_of(store)
         opened = Store.open(place)
@@ -130,7 +130,7 @@ class Status:
     def _of_object(cls, place: Location) -> Status | None:
         """Return the status of an object of a collection; None before a run takes it up."""
         if Store(place).exists():
-            return cls.of(place)
+            return cls.from_store(place)
         # Only a run locks a place without a store: it plans, and has no heartbeat yet.
         lock = Lock.read(place)
         if lock is None or not lock.run or lock.holder_is_gone:
@@ -267,4 +267,4 @@ def status(store: AnyStore) -> Status:
     """
     place = location_of(store)
     collection = CollectionStore.found(Location.parse(place))
-    return Status.of(place) if collection is None else Status.of_collection(collection)
+    return Status.from_store(place) if collection is None else Status.of_collection(collection)

@@ -237,7 +237,7 @@ class Lattice(FrequencyLattice):
         return 3 * (self.M // 2) ** 2 + 1
 
     @classmethod
-    def of(cls, field: xr.DataArray) -> Lattice:
+    def from_field(cls, field: xr.DataArray) -> Lattice:
         """Return the lattice of a field.
 
         Raises:

@@ -128,7 +128,7 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
         done = wait_until(lambda: (record := store.read_run()) and record.state in ("done", "failed") and record)
         assert done
         assert done.state == "done"
-    status = Status.of(store_path)
+    status = Status.from_store(store_path)
     assert (status.complete, status.total, status.failed) == (6, 6, {})
 
 

@@ -123,7 +123,7 @@ class Sides:
     normals: Reals
 
     @classmethod
-    def of(cls, mesh: Mesh) -> Sides:
+    def from_mesh(cls, mesh: Mesh) -> Sides:
         """Return the sides of a mesh's triangles, without those between two triangles of one plane, which cancel."""
         corners = mesh.vertices[mesh.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -144,7 +144,7 @@ def test_two_ways_to_spheres_agree_at_every_order(a: Sphere, b: Sphere) -> None:
 def test_real_space_agrees_with_heat_traces_within_what_both_claim(
     offset: tuple[float, ...], orders: tuple[float, ...], accuracy: float
 ) -> None:
-    a = Rectangles.of(((0, 0, 0), (1, 0.6, 0)), ((0, 0, 0), (0, 0.6, 0.4)))
+    a = Rectangles.from_corners(((0, 0, 0), (1, 0.6, 0)), ((0, 0, 0), (0, 0.6, 0.4)))
     exact = truths_of_rectangles(a, a.moved(*offset), orders, turned=False)
     found = closed_within(a.mesh(), a.moved(*offset).mesh(), orders)
     for truth, other in zip(exact, found, strict=True):

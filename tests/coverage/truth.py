@@ -150,7 +150,7 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
     """Integrate the potentials of the faces; the uncertainty is the change from one outer rule to a finer one."""
     powers = [-order for order in orders]
     signed = ((a, 1.0), (b, -1.0))
-    meshes = [(Sides.of(surface), sign) for surface, sign in signed if isinstance(surface, Mesh)]
+    meshes = [(Sides.from_mesh(surface), sign) for surface, sign in signed if isinstance(surface, Mesh)]
     candidates = []
     for count in _OUTER:
         squares, norms = _spheres_alone(a, b, orders)

@@ -108,7 +108,7 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(
     document["attributes"]["schema_version"] = version
     root.write_text(json.dumps(document))
     before = {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
-    for use in (open_store, Status.of, lambda place: run(study_of(folder), place, client)):
+    for use in (open_store, Status.from_store, lambda place: run(study_of(folder), place, client)):
         with pytest.raises(
             StoreError,
             match=f"its schema has version {version}, this program reads {SCHEMA_VERSION}; run the study",

@@ -46,7 +46,7 @@ plan = make_plan(Study.from_table(small_table()))
 store = Store.open(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()
-for i, row in Workspace.of(store, plan).rows.items():
+for i, row in Workspace.for_plan(store, plan).rows.items():
     if row.label == "reference":
         continue
     job = Job(store, i, row, FieldSettings.for_plan(plan))

@@ -59,9 +59,9 @@ def test_stored_fields_tell_the_speed_of_the_others(plan: Plan) -> None:
     labels = [row.label for row in plan.rows]
     stored = records(plan, *labels[:3], seconds=10.0)
     workers = Workers.of_this_machine(2)
-    forecast = Forecast.of(plan, stored, workers, None, planning_seconds=0.0)
-    twice = Forecast.of(plan, records(plan, *labels[:3], seconds=20.0), workers, None, planning_seconds=0.0)
-    later = Forecast.of(plan, stored, workers, None, planning_seconds=7.0)
+    forecast = Forecast.for_plan(plan, stored, workers, None, planning_seconds=0.0)
+    twice = Forecast.for_plan(plan, records(plan, *labels[:3], seconds=20.0), workers, None, planning_seconds=0.0)
+    later = Forecast.for_plan(plan, stored, workers, None, planning_seconds=7.0)
     assert forecast.surfaces == len(labels) - 3
     # Two surfaces of about the same cost as those that took ten seconds, side by side.
     assert 10 < forecast.seconds < 40
@@ -79,7 +79,7 @@ def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: p
 
     monkeypatch.setattr(forecasts, "slowness", measured)
     stored = records(plan, *(row.label for row in plan.rows), seconds=1.0)
-    forecast = Forecast.of(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
+    forecast = Forecast.for_plan(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
     assert (forecast.seconds, forecast.lines) == (0.0, ("nothing is missing",))
 
 

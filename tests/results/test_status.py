@@ -55,7 +55,7 @@ def running(store: Store, *finished: float, begun: float = 0.0, state: str = "ru
         store.write_record(row, record)
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     store.write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
-    return Status.of(store.path)
+    return Status.from_store(store.path)
 
 
 @pytest.mark.slow
@@ -76,7 +76,7 @@ def test_what_cannot_be_told_is_not(store: Store) -> None:
 
 @pytest.mark.slow
 def test_a_moment_between_two_objects_is_not_the_end(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended = replace(Status.of(store.path), run_store="object")
+    ended = replace(Status.from_store(store.path), run_store="object")
     goes_on = replace(running(store), run_store="object")
     looks = [goes_on, ended, goes_on, goes_on, ended, ended]
     monkeypatch.setattr("sobolev_batch.results.status.status", lambda place: looks.pop(0))
@@ -94,7 +94,7 @@ import sobolev_batch.cli as line
 import sobolev_batch.cli.stores as stores
 import sobolev_batch.results.status as module
 
-found = module.Status.of(sys.argv[2])
+found = module.Status.from_store(sys.argv[2])
 left = [4, 4, 3]
 
 def status(store):

@@ -26,7 +26,7 @@ class HavocPlan:
     drivers: tuple[int, ...]
 
     @classmethod
-    def of(cls, seed: int, requests: range, workers: int, drivers: int) -> HavocPlan:
+    def drawn(cls, seed: int, requests: range, workers: int, drivers: int) -> HavocPlan:
         """Some kills, at random among these requests."""
         chosen = random.Random(seed).sample(requests, workers + drivers)
         return cls(tuple(sorted(chosen[:workers])), tuple(sorted(chosen[workers:])))

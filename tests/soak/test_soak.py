@@ -53,8 +53,8 @@ def test_what_is_lost_would_be_noticed(outcome: Outcome, folder: Path) -> None:
 
 
 def test_kills_depend_on_the_seed_alone() -> None:
-    plan = HavocPlan.of(3, range(100, 1000), 5, 2)
-    assert plan == HavocPlan.of(3, range(100, 1000), 5, 2) != HavocPlan.of(4, range(100, 1000), 5, 2)
+    plan = HavocPlan.drawn(3, range(100, 1000), 5, 2)
+    assert plan == HavocPlan.drawn(3, range(100, 1000), 5, 2) != HavocPlan.drawn(4, range(100, 1000), 5, 2)
     assert (len(plan.workers), len(plan.drivers)) == (5, 2)
     assert set(plan.workers + plan.drivers) <= set(range(100, 1000))
 

@@ -54,7 +54,7 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
     soaked = Location.parse(f"s3://{BUCKET}/soaked.zarr")
     # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
     # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
-    plan = HavocPlan.of(seed, range(meshes, 4 * meshes), kills, driver_kills)
+    plan = HavocPlan.drawn(seed, range(meshes, 4 * meshes), kills, driver_kills)
     with serving(seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
         with local_client(_WORKERS) as client:
             started = time.monotonic()

@@ -74,12 +74,12 @@ def test_block_shapes_are_those_of_a_regular_chunk_grid() -> None:
 
 def test_a_field_tells_its_lattice() -> None:
     lattice = Lattice(2.5, 16)
-    assert Lattice.of(fourier_transform(Sphere(), lattice)) == lattice
+    assert Lattice.from_field(fourier_transform(Sphere(), lattice)) == lattice
 
 
 def test_parts_of_fields_are_not_taken_for_fields() -> None:
     field = fourier_transform(Sphere(), Lattice(2.5, 16))
     with pytest.raises(LatticeError, match="select whole fields"):
-        Lattice.of(field.isel(xi_z=slice(0, 5)))
+        Lattice.from_field(field.isel(xi_z=slice(0, 5)))
     with pytest.raises(LatticeError, match="needs the coordinates"):
-        Lattice.of(field.drop_vars("xi_x"))
+        Lattice.from_field(field.drop_vars("xi_x"))

@@ -26,7 +26,7 @@ _STEPS: dict[str, Callable[[Mesh], object]] = {
     "box and extent": lambda mesh: (mesh.bounding_sphere, mesh.extent),
     "exact values": lambda mesh: exact_transform(mesh, _FREQUENCIES),
     "values in octaves, by two threads": lambda mesh: sampled_transform(mesh, _FREQUENCIES, 2),
-    "directions of faces": lambda mesh: FaceNormals.of([mesh]),
+    "directions of faces": lambda mesh: FaceNormals.from_surfaces([mesh]),
     "common triangles": lambda mesh: shared_triangles(mesh.vertices[mesh.triangles], np.zeros((1, 3, 3))),
 }
 # Bytes for each triangle at the peak of a step. Whole arrays of temporaries took 150 to 290.

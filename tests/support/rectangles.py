@@ -34,7 +34,7 @@ class Rectangles:
     high: Reals
 
     @classmethod
-    def of(cls, *corners: tuple[Sequence[float], Sequence[float]]) -> Self:
+    def from_corners(cls, *corners: tuple[Sequence[float], Sequence[float]]) -> Self:
         return cls(np.array([low for low, _ in corners], float), np.array([high for _, high in corners], float))
 
     @classmethod
@@ -65,7 +65,7 @@ class Rectangles:
         """Return parallel squares, ``count`` of them over a unit of length."""
         heights = np.arange(count) / count - 0.5
         half = width / 2
-        return cls.of(*(((-half, -half, z), (half, half, z)) for z in heights))
+        return cls.from_corners(*(((-half, -half, z), (half, half, z)) for z in heights))
 
     @classmethod
     def perforated(cls, count: int, thickness: float = 0.05) -> Self:
@@ -80,7 +80,7 @@ class Rectangles:
                 corners += [((xs[0], ys[1], z), (xs[1], ys[2], z)), ((xs[2], ys[1], z), (xs[3], ys[2], z))]
             corners += [((x0, ys[1], -half), (x0, ys[2], half)) for x0 in xs[1:3]]
             corners += [((xs[1], y0, -half), (xs[2], y0, half)) for y0 in ys[1:3]]
-        return cls.of(*corners)
+        return cls.from_corners(*corners)
 
     def moved(self, *offset: float) -> Rectangles:
         return Rectangles(self.low + offset, self.high + offset)

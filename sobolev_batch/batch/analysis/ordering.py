@@ -37,7 +37,7 @@ class TableOrder:
     criteria: tuple[Criterion, ...]
 
     @classmethod
-    def of(cls, workspace: Workspace) -> Self:
+    def from_workspace(cls, workspace: Workspace) -> Self:
         """Return the order of the meshes that the study of a workspace has."""
         families: dict[str, list[int]] = {row.family: [] for row in workspace.plan.rows}
         for i, row in workspace.rows.items():

@@ -187,7 +187,7 @@ def _pending(workspace: Workspace) -> dict[int, str]:
 
 def _dataset(workspace: Workspace) -> xr.Dataset:
     """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
-    records, rows = _current(workspace), TableOrder.of(workspace).rows
+    records, rows = _current(workspace), TableOrder.from_workspace(workspace).rows
     columns: dict[str, Any] = {
         name: [getattr(records[i], name) if i in records else np.nan for i in rows]
         for name in (field.name for field in fields(Proximity))
@@ -211,6 +211,6 @@ def _current(workspace: Workspace) -> dict[int, ProximityRecord]:
 
 
 def _digest(workspace: Workspace) -> str:
-    records, rows = _current(workspace), TableOrder.of(workspace).rows
+    records, rows = _current(workspace), TableOrder.from_workspace(workspace).rows
     lines = [[workspace.labels[i], asdict(records[i]) if i in records else None] for i in rows]
     return hashlib.sha256(json.dumps(lines).encode()).hexdigest()

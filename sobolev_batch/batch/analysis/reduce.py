@@ -51,7 +51,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     """
     if are_tabulated(workspace):
         return None
-    order, every_pair = TableOrder.of(workspace), workspace.plan.study.pairs == "all"
+    order, every_pair = TableOrder.from_workspace(workspace), workspace.plan.study.pairs == "all"
     complete = list(workspace.complete)
     reducer, threads = make_reducer(workspace), cluster.workers.threads
     # A larger task is tried all the same, with nothing beside it.
@@ -258,7 +258,7 @@ def _qualities(workspace: Workspace) -> list[str]:
 def _digest(workspace: Workspace) -> str:
     """Return the SHA-256 of all that the tables depend on."""
     plan = workspace.plan
-    shown = [(workspace.rows[i], workspace.records[i]) for i in TableOrder.of(workspace).rows]
+    shown = [(workspace.rows[i], workspace.records[i]) for i in TableOrder.from_workspace(workspace).rows]
     rows = [
         [row.label, row.family, *((record.key, record.status, record.reason) if record else ("", "", ""))]
         for row, record in shown

@@ -104,7 +104,7 @@ class TailReducer:
         return Tail.stacked(flat).reshaped(len(rows), len(others))
 
     def _tail(self, sums: Sequence[OctaveSums], limit: EnergyLimit, inner: Reals) -> Tail:
-        return Tail.of(self.weights.partition, sums, limit, self.orders, inner.tolist())
+        return Tail.from_sums(self.weights.partition, sums, limit, self.orders, inner.tolist())
 
     def _limit(self, row: int, other: int, last_energy: float) -> EnergyLimit:
         """Return the limit of a difference's energy: known to the reference, else between bounds."""

@@ -242,7 +242,7 @@ class Reducer:
         The first ``shared`` others are the rows: of these, only the products on and above the diagonal.
         """
         block = self.blocks[number]
-        arrangement = Arrangement.of(self.weights, block)
+        arrangement = Arrangement.for_block(self.weights, block)
         reference = None if self.reference is None else self.read([self.reference], number)
 
         def read(fields: Sequence[int], buffer: Complexes) -> Complexes:

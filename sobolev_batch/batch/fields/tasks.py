@@ -222,8 +222,8 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         raise ValueError("the study has no octaves")
     settings = job.octave_settings(surface)
     values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
-    own, reference = EnergyLimit.of([surface], [1]), job.load_reference()
-    difference = None if reference is None else EnergyLimit.of([surface, reference], [1, -1])
+    own, reference = EnergyLimit.from_surfaces([surface], [1]), job.load_reference()
+    difference = None if reference is None else EnergyLimit.from_surfaces([surface, reference], [1, -1])
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.checks.radii),
         tuple(float(square) for octave in values for square in octave.checks.squares),

@@ -119,7 +119,7 @@ class StudyCollection:
         require_modest(table)
         _require_sections(table)
         common = {key: value for key, value in table.items() if key not in ("object", "objects")}
-        listed = _Listed.of(table.get("objects"), folder)
+        listed = _Listed.from_section(table.get("objects"), folder)
         objects = _named_objects(table["object"]) if "object" in table else []
         unnamed = [name for name in listed.objects if objects and name not in {one.name for one in objects}]
         if unnamed:
@@ -186,7 +186,7 @@ class _Listed:
     meshes: Mapping[tuple[str, str], Sequence[ListedMesh]]
 
     @classmethod
-    def of(cls, section: Any, folder: Path) -> Self:
+    def from_section(cls, section: Any, folder: Path) -> Self:
         """Return the meshes of the section [objects]."""
         if section is None:
             return cls({})

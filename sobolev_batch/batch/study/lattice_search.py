@@ -67,7 +67,7 @@ def choose_lattice(
     accuracy = study.accuracy
     if accuracy is None:
         raise ValueError("only a study that asks for an accuracy leaves a choice")
-    pilots = Pilots.of(members, similarity, reference)
+    pilots = Pilots.from_members(members, similarity, reference)
     for label, reason in pilots.set_aside.items():
         _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
     if not pilots.surfaces:
@@ -223,7 +223,7 @@ class _Search:
         lattice = max(lattices.values(), key=lambda one: one.M)
         first = next(iter(self.problems.values()))
         surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in self.problems.values())]
-        tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.of(surfaces))
+        tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.from_surfaces(surfaces))
         target = error_target(closest, orders, self.accuracy, first.area)
         dtype = self._dtype(problem.dtype(lattice, target) == "complex64" for problem in self.problems.values())
         reasons = (

@@ -37,7 +37,7 @@ class Pilots:
     set_aside: Mapping[str, str]
 
     @classmethod
-    def of(cls, members: Members, similarity: Similarity, reference: Surface) -> Self:
+    def from_members(cls, members: Members, similarity: Similarity, reference: Surface) -> Self:
         """Make the pilots of a study, and look at other surfaces that are quickly loaded.
 
         Args:

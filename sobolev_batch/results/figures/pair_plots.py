@@ -45,7 +45,7 @@ def _chosen(selection: Selection, order: float) -> _Chosen:
     tree, family_of = selection.tree, families_of(selection.tree)
     reference = reference_of(tree)
     meshes = [label for label in complete_meshes(tree) if family_of[label] in selection.families or label == reference]
-    matrix = Matrix.of(tree, order, MOST_MESHES, meshes)
+    matrix = Matrix.from_tree(tree, order, MOST_MESHES, meshes)
     if matrix is None:
         raise InputError(
             'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'

@@ -36,7 +36,7 @@ class Exporter:
     reference: str
 
     @classmethod
-    def of(cls, store: AnyStore, order: Orders | None = None, folder: str | Path = ".") -> Self:
+    def from_store(cls, store: AnyStore, order: Orders | None = None, folder: str | Path = ".") -> Self:
         """Return the exporter of a store.
 
         Args:
@@ -53,7 +53,7 @@ class Exporter:
         tree = as_tree(store)
         of_study = finished_group(tree, "convergence")["order"].values.tolist()
         orders = tuple(dict.fromkeys(check_orders(of_study if order is None else order)))
-        rebuilder, reference = MeshRebuilder.of(tree, folder), reference_of(tree)
+        rebuilder, reference = MeshRebuilder.from_tree(tree, folder), reference_of(tree)
         status = rebuilder.meshes["status"].sel(mesh=reference).item()
         if status != "complete":
             raise InputError(f"the reference {reference!r} is {status}: no mesh can be compared with it")
@@ -134,7 +134,7 @@ def write_witness(
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: a witness is written as {' or '.join(SUFFIXES)}, found {path.suffix!r}")
-    exporter = Exporter.of(store, order, folder)
+    exporter = Exporter.from_store(store, order, folder)
     (label,) = exporter.labels([mesh])
     exporter.field(label).write(path)
     return path

@@ -52,7 +52,7 @@ class MeshRebuilder:
     similarity: Similarity
 
     @classmethod
-    def of(cls, tree: xr.DataTree, folder: str | Path) -> Self:
+    def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
         """Return the rebuilder of an open store.
 
         Args:

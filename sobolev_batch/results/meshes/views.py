@@ -175,7 +175,7 @@ def make_views(
     chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
     labels = named or tuple(_extremes(tree, chosen[0], chosen_families(tree, family)))
     try:
-        rebuilder = MeshRebuilder.of(tree, folder)
+        rebuilder = MeshRebuilder.from_tree(tree, folder)
     except InputError as error:
         return Views((), dict.fromkeys(labels, str(error)))
     # A closed mesh has half as many vertices as triangles.

@@ -171,7 +171,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     from sobolev_batch.results.report.content import Content
 
     tree = as_tree(store)
-    content = Content.from_tree(tree, Status.of(store), limits)
+    content = Content.from_tree(tree, Status.from_store(store), limits)
     selection = Selection.from_store(tree, most_spectra=limits.spectra)
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):

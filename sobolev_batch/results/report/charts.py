@@ -165,7 +165,7 @@ def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
 def _matrices(tree: xr.DataTree, orders: list[float], limits: ReportLimits) -> Json | None:
     """Return for each order the lower triangle of distances and errors, an order of similar meshes, and the map."""
     most = min(limits.pairs, int(math.sqrt(limits.matrix_numbers / len(orders))))
-    matrices = [matrix for order in orders if (matrix := Matrix.of(tree, order, most)) is not None]
+    matrices = [matrix for order in orders if (matrix := Matrix.from_tree(tree, order, most)) is not None]
     if not matrices or not matrices[0].labels:
         return None
     family_of, labels = families_of(tree), matrices[0].labels

@@ -56,7 +56,7 @@ class Matrix:
     errors: Reals
 
     @classmethod
-    def of(
+    def from_tree(
         cls, tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
     ) -> Matrix | None:
         """Return the matrix of an open store; None where the study asks for distances to the reference alone.
@@ -154,7 +154,7 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     sections = []
     for order in chosen:
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
-        rows = _Rows.of(distances, values, errors)
+        rows = _Rows.from_distances(distances, values, errors)
         caption = prose([f"Sobolev distances of order {order:g}, {unit}"], style)
         tables = [rows.table(columns, style) for columns in rows.column_groups(style)]
         sections.append("\n\n".join([caption, *tables]))
@@ -192,7 +192,7 @@ class _Rows:
     is_symmetric: bool
 
     @classmethod
-    def of(cls, distances: xr.Dataset, numbers: Reals, errors: Reals) -> _Rows:
+    def from_distances(cls, distances: xr.Dataset, numbers: Reals, errors: Reals) -> _Rows:
         """Return the rows of numbers between the meshes of some distances."""
         labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
         symmetric = labels == others

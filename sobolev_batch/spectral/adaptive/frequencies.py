@@ -55,7 +55,7 @@ class Frequencies:
     has_tail: bool = False
 
     @classmethod
-    def of(cls, problem: Problem, solution: Solution) -> Self:
+    def from_solution(cls, problem: Problem, solution: Solution) -> Self:
         """Return the frequencies that a problem was solved with.
 
         Args:
@@ -95,7 +95,7 @@ class Frequencies:
 
     def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:
         """Return the norms of a signed sum of surfaces."""
-        return self._norms(Measure.of(values, signs), self._errors(values), surfaces, signs)
+        return self._norms(Measure.from_values(values, signs), self._errors(values), surfaces, signs)
 
     def against(
         self,
@@ -112,7 +112,7 @@ class Frequencies:
             reference: Values of b.
             pair: The surfaces a and b.
         """
-        difference, own = Measure.of(values, signs), Measure.of([reference], [1])
+        difference, own = Measure.from_values(values, signs), Measure.from_values([reference], [1])
         distances = self._norms(difference, self._errors(values), pair, [1, -1])
         norms = self._norms(own, self._errors([reference]), pair[1:], [1])
         products = self._lattice_sums(difference, own)
@@ -147,7 +147,7 @@ class Frequencies:
             float64 (orders,).
         """
         # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
-        own = Measure.of([values], [1])
+        own = Measure.from_values([values], [1])
         radii = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
         shells = shell_sums(own.lattice, None, self.lattice, self.lattice.half)
         squares = self.weights.per_shell @ (shells * (2 - 2 * np.sinc(2 * radii * length)))
@@ -188,4 +188,4 @@ class Frequencies:
         """Return the tail from the octaves, and what is known to lie beyond them."""
         octaves = [octave.sampling.octave for octave in self.octaves]
         sums, inner = self._octave_sums(measure, measure), self._lattice_sums(measure, measure).outer
-        return Tail.of(octaves, sums, EnergyLimit.of(surfaces, signs), self.orders, inner.tolist())
+        return Tail.from_sums(octaves, sums, EnergyLimit.from_surfaces(surfaces, signs), self.orders, inner.tolist())

@@ -77,7 +77,7 @@ class Core:
     energies: tuple[float, ...]
 
     @classmethod
-    def of(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
+    def for_problem(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
         """Return the core of a problem; the step ends at the cutoff."""
         samples = problem.samples(lattice)
         values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate(samples, problem.orders))
@@ -159,14 +159,14 @@ class _Search:
         self.rng = rng
         self.octaves: list[MeasuredOctave] = []
         self.seconds = 0.0
-        self.sizes = [SurfaceSize.of(surface) for surface in problem.surfaces]
-        self.normals = FaceNormals.of(problem.surfaces)
-        self.limit = EnergyLimit.of(problem.surfaces, [1, -1][: len(problem.surfaces)])
+        self.sizes = [SurfaceSize.from_surface(surface) for surface in problem.surfaces]
+        self.normals = FaceNormals.from_surfaces(problem.surfaces)
+        self.limit = EnergyLimit.from_surfaces(problem.surfaces, [1, -1][: len(problem.surfaces)])
 
     @classmethod
     def begin(cls, problem: Problem, seed: int) -> Self:
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
-        core = Core.of(problem, lattice, lattice.xi_max)
+        core = Core.for_problem(problem, lattice, lattice.xi_max)
         return cls(problem, core, lattice.xi_max, np.random.default_rng(seed))
 
     @property
@@ -215,7 +215,7 @@ class _Search:
             lattice = self.core.lattice
             larger = good_intervals(FINER_LATTICE * lattice.M)
             if larger <= accuracy.largest_intervals:
-                self.core = Core.of(self.problem, Lattice(lattice.xi_max, larger), self.cutoff)
+                self.core = Core.for_problem(self.problem, Lattice(lattice.xi_max, larger), self.cutoff)
                 refined = True
         permitted = self.permitted_variances
         totals = sum((octave.sums.variances for octave in self.octaves), np.zeros(len(permitted)))
@@ -244,7 +244,7 @@ class _Search:
     def _tail(self) -> Tail:
         octaves = [octave.sampling.octave for octave in self.octaves]
         sums = [octave.sums for octave in self.octaves]
-        return Tail.of(octaves, sums, self.limit, self.problem.orders, self.core.energies)
+        return Tail.from_sums(octaves, sums, self.limit, self.problem.orders, self.core.energies)
 
     def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
         problem = self.problem
@@ -254,7 +254,7 @@ class _Search:
         target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
         settings = settings_for(target)
         execution = Execution(threads=problem.threads, allowed_bytes=problem.accuracy.allowed_bytes)
-        octave = SampledOctave.of(sampling)
+        octave = SampledOctave.from_sampling(sampling)
         found = tuple(
             octave_values(
                 surface, octave, problem.orders, settings, execution, known=known.values[number] if known else None

@@ -64,7 +64,7 @@ class Problem:
     signs: Sequence[int] = (1, -1)
 
     @classmethod
-    def of(
+    def from_surfaces(
         cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
     ) -> Self:
         """Return the problem for surfaces alone, moved together to the centre of the lattice's period.

@@ -35,7 +35,7 @@ class Reference:
     pair: Sequence[Surface]
 
     @classmethod
-    def of(cls, problem: Problem, solution: Solution, seed: int) -> Self:
+    def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
         """Return the reference of a distance.
 
         Its values are among those that the distance was computed from. But where the surfaces share triangles, which
@@ -47,7 +47,7 @@ class Reference:
             seed: Seed of the random frequencies of octaves.
         """
         if problem.is_whole:
-            frequencies = Frequencies.of(problem, solution)
+            frequencies = Frequencies.from_solution(problem, solution)
             return cls(frequencies, solution.values[1], solution.values, problem.signs, problem.pair)
         move = centering(problem.pair)
         pair = [move.apply(surface) for surface in problem.pair]
@@ -55,7 +55,7 @@ class Reference:
         accuracy = replace(problem.accuracy, best_effort=True)
         own = replace(problem, surfaces=pair[1:], signs=(1,), support=support, accuracy=accuracy, label="the reference")
         of_reference = solve(own, seed)
-        frequencies = Frequencies.of(own, of_reference)
+        frequencies = Frequencies.from_solution(own, of_reference)
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
         difference = [
             frequencies.values(move.apply(surface), target, problem.execution) for surface in problem.surfaces

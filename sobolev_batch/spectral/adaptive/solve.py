@@ -179,7 +179,7 @@ def prefers_octaves(problem: Problem) -> bool:
 
     The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
     """
-    is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.of(problem.surfaces)
+    is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.from_surfaces(problem.surfaces)
     least = _OCTAVES_FIRST if is_regular else _OCTAVES_AT_ALL
     return problem.accuracy.rtol >= least and (not is_regular or _first_step(problem).is_pilot)
 

@@ -101,10 +101,10 @@ def relative_distance(
         return RelativeDistance(Interval(0.0, 0.0), "identical")
     accuracy = replace(accuracy, rtol=_FIRST_RTOL, best_effort=True)
     pair = _brought_near(surface, reference), reference
-    problem = Problem.of(pair, (order,), accuracy, "the relative distance", threads)
+    problem = Problem.from_surfaces(pair, (order,), accuracy, "the relative distance", threads)
     if not problem.surfaces:
         return RelativeDistance(Interval(0.0, 0.0), "identical")
-    of_norm = Problem.of([reference], (order,), accuracy, "the norm of the reference", threads)
+    of_norm = Problem.from_surfaces([reference], (order,), accuracy, "the norm of the reference", threads)
     for norm_of in (_rough_norm, _exact_norm):
         norm = norm_of(of_norm)
         search = _Search(problem, Interval(threshold * norm.lower, threshold * norm.upper))

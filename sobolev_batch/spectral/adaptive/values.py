@@ -48,7 +48,7 @@ class Measure:
     octaves: tuple[Complexes, ...]
 
     @classmethod
-    def of(cls, surfaces: Sequence[SurfaceValues], signs: Sequence[int]) -> Self:
+    def from_values(cls, surfaces: Sequence[SurfaceValues], signs: Sequence[int]) -> Self:
         """Return the sum of some surfaces, each with its sign."""
         signed = list(zip(surfaces, signs, strict=True))
         lattice = sum(sign * one.field.values for one, sign in signed)

@@ -70,7 +70,7 @@ class Arrangement:
     by_window: Reals
 
     @classmethod
-    def of(cls, weights: SobolevWeights, block: Block) -> Arrangement:
+    def for_block(cls, weights: SobolevWeights, block: Block) -> Arrangement:
         """Return the arrangement of a block of the weights' lattice."""
         lattice = weights.lattice
         shells = lattice.shells(block).ravel()

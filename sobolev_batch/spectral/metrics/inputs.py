@@ -89,7 +89,7 @@ def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> 
     Raises:
         LatticeError: They differ.
     """
-    lattices = [Lattice.of(x) for x in operands if isinstance(x, xr.DataArray)]
+    lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
     if lattice is not None:
         lattices.append(lattice)
     for other in lattices[1:]:

@@ -104,7 +104,7 @@ def norm(
         values = np.array([sphere_norm(a, s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
     field = field_of(a, lattice, orders)
-    weights = SobolevWeights(Lattice.of(field), orders)
+    weights = SobolevWeights(Lattice.from_field(field), orders)
     estimate = _estimate(weights, shells_of(field, None, weights.lattice), [field])
     return _dataset("norm", order, estimate, lattice_attributes(weights.lattice, field))
 
@@ -155,7 +155,7 @@ def inner_product(
         products = np.array([sphere_inner_product(a, b, s) for s in orders])
         return labelled(order, {"inner_product": products}, {})
     first, second = pair_of(a, b, lattice, orders)
-    weights = SobolevWeights(Lattice.of(first), orders)
+    weights = SobolevWeights(Lattice.from_field(first), orders)
     sums = np.zeros(weights.lattice.shell_count)
     for block, (values, others) in read_blocks(weights.lattice, first, second):
         sums += shell_sums(values, others, weights.lattice, block)
@@ -229,7 +229,7 @@ def distance(
             order, Solution.zero(orders).estimate, ReferenceEstimate.of_equal(len(orders)), settings
         )
     first, second = pair_of(a, b, lattice, orders)
-    weights = SobolevWeights(Lattice.of(first), orders)
+    weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
     distances, of_second = _estimate(weights, squares, [first, second]), _estimate(weights, own, [second])
     reference = ReferenceEstimate.on_lattice(
@@ -274,14 +274,14 @@ def to_accuracy(
     if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     check_seed(seed)
-    problem = Problem.of(surfaces, orders, accuracy, f"the {name}", available_cores())
+    problem = Problem.from_surfaces(surfaces, orders, accuracy, f"the {name}", available_cores())
     solution = solve(problem, seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     reference = None
     if name == "norm":
         dataset = _dataset(name, order, solution.estimate, attributes)
     else:
-        reference = Reference.of(problem, solution, seed) if problem.surfaces else None
+        reference = Reference.for_problem(problem, solution, seed) if problem.surfaces else None
         estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate()
         dataset = labelled_distances(order, solution.estimate, estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
@@ -421,7 +421,7 @@ def proportion(a: OperandLike, b: OperandLike, order: Orders, *, lattice: Lattic
     """
     orders = check_orders(order)
     first, second = pair_of(a, b, lattice, orders)
-    weights = SobolevWeights(Lattice.of(first), orders)
+    weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, reference = shells_against(first, second, weights.lattice)
     area, shape, excess = Proportion.of_shells(squares, products, reference, weights)
     distance = np.sqrt(weights.per_shell @ squares)

@@ -79,7 +79,7 @@ def spectrum(
     """
     orders = check_orders(order)
     first, second = (field_of(a, lattice, orders), None) if b is None else pair_of(a, b, lattice, orders)
-    lattice = Lattice.of(first)
+    lattice = Lattice.from_field(first)
     edges = _edges(bands, lattice)
     count = len(edges) - 1
     sums = shells_of(first, second, lattice)

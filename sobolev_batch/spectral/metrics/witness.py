@@ -83,7 +83,7 @@ def witness(
     allowed_bytes = None if memory is None else available(memory)
     coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
-    lattice = Lattice.of(first)
+    lattice = Lattice.from_field(first)
     require_points_inside(coordinates, lattice)
     evaluation = Evaluation(coordinates, SobolevWeights(lattice, orders), settings, threads, allowed_bytes)
     values = np.zeros((len(orders), coordinates.shape[1]))

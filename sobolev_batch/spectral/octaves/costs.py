@@ -35,7 +35,7 @@ class SurfaceSize:
     is_closed_form: bool = False
 
     @classmethod
-    def of(cls, surface: Surface) -> Self:
+    def from_surface(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
         triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
         return cls(triangles, surface.area, not isinstance(surface, Mesh | Smooth))

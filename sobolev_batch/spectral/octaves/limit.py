@@ -64,7 +64,7 @@ class EnergyLimit:
         return cls((lowest + highest) / 2, 0.0, (highest - lowest) / 2)
 
     @classmethod
-    def of(cls, surfaces: Sequence[Surface], signs: Sequence[int], seed: int = 0) -> EnergyLimit:
+    def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], seed: int = 0) -> EnergyLimit:
         """Return the limit for the sum of some surfaces' measures, each with a sign."""
         rng = np.random.default_rng(seed)
         meshes = [(surface, sign) for surface, sign in zip(surfaces, signs, strict=True) if isinstance(surface, Mesh)]

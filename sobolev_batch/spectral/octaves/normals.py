@@ -48,7 +48,7 @@ class FaceNormals:
     sizes: Reals
 
     @classmethod
-    def of(cls, surfaces: Sequence[Surface]) -> Self:
+    def from_surfaces(cls, surfaces: Sequence[Surface]) -> Self:
         """Return the normals of the flat faces of surfaces; none for curved ones."""
         found = [_main_normals(surface) for surface in surfaces if isinstance(surface, Mesh)]
         directions, areas, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))

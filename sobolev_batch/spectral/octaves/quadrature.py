@@ -63,7 +63,7 @@ class OctaveQuadrature:
     parts: tuple[SamplePart, ...]
 
     @classmethod
-    def of(cls, sampling: OctaveSampling) -> Self:
+    def from_sampling(cls, sampling: OctaveSampling) -> Self:
         """Return the quadrature of a sampling."""
         found = [_lattice_samples(lattice) for lattice in sampling.lattices]
         frequencies = np.concatenate([*(samples[0] for samples in found), sampling.drawn.frequencies])

@@ -34,7 +34,7 @@ class Tail:
     uncertainty: Reals
 
     @classmethod
-    def of(
+    def from_sums(
         cls,
         octaves: Sequence[Octave],
         sums: Sequence[OctaveSums],

@@ -44,7 +44,7 @@ class TailSampling:
     def usual(cls, cutoff: float, count: int, surfaces: Sequence[Surface], seed: int = 0) -> Self:
         """Return a sampling of some octaves by one lattice each, and by draws where surfaces have flat faces."""
         rng = np.random.default_rng(seed)
-        normals = FaceNormals.of(surfaces)
+        normals = FaceNormals.from_surfaces(surfaces)
         samplings = []
         for octave in (Octave(cutoff, index) for index in range(1, count + 1)):
             lattice = OctaveLattice.random(octave.lowest, octave.highest, USUAL_M, rng)
@@ -103,7 +103,7 @@ class TailSampling:
     @cached_property
     def sampled(self) -> tuple[SampledOctave, ...]:
         """The octaves with their samples."""
-        return tuple(SampledOctave.of(sampling) for sampling in self.octaves)
+        return tuple(SampledOctave.from_sampling(sampling) for sampling in self.octaves)
 
     @property
     def quadratures(self) -> tuple[OctaveQuadrature, ...]:

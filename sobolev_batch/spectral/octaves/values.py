@@ -39,9 +39,9 @@ class SampledOctave:
     quadrature: OctaveQuadrature
 
     @classmethod
-    def of(cls, sampling: OctaveSampling) -> SampledOctave:
+    def from_sampling(cls, sampling: OctaveSampling) -> SampledOctave:
         """Return an octave with the quadrature of its sampling."""
-        return cls(sampling, OctaveQuadrature.of(sampling))
+        return cls(sampling, OctaveQuadrature.from_sampling(sampling))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def octave_values(
             values.append(known.values[known.octave.quadrature.parts[number].samples])
         elif not part.is_drawn:
             lattice = sampling.lattices[number]
-            if SurfaceSize.of(surface).prefers_exact(lattice):
+            if SurfaceSize.from_surface(surface).prefers_exact(lattice):
                 values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
                 continue
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values

@@ -153,7 +153,7 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, thre
     records = Store(store_path).records()
     assert all(record is None or record.status == "complete" for record in records)
     assert sum(record is not None for record in records) >= 3
-    status = Status.of(store_path)
+    status = Status.from_store(store_path)
     assert status.run is not None
     assert (status.run.state, status.failed) == ("failed", {})
     again = run(study, store_path, threads)

@@ -39,7 +39,7 @@ def test_what_lies_elsewhere_is_not_read(copy: Path, key: str) -> None:
     # Whoever followed it would read for ever.
     lead_away(copy / key, "/dev/zero")
     with pytest.raises(StoreError, match=f"{key}: a link, which may lead out of the store"):
-        Status.of(copy)
+        Status.from_store(copy)
 
 
 def test_a_field_that_lies_elsewhere_is_not_read(copy: Path, tmp_path: Path) -> None:
@@ -105,10 +105,10 @@ def test_a_pipe_is_not_waited_for(copy: Path) -> None:
     (copy / "records" / "record" / "c" / "1").unlink()
     os.mkfifo(copy / "records" / "record" / "c" / "1")
     with pytest.raises(StoreError, match="neither a file nor a folder, in a store"):
-        Status.of(copy)
+        Status.from_store(copy)
 
 
 def test_the_store_itself_may_be_reached_by_a_link(copy: Path, tmp_path: Path) -> None:
     (tmp_path / "link.zarr").symlink_to(copy)
-    assert Status.of(tmp_path / "link.zarr").complete == 5
+    assert Status.from_store(tmp_path / "link.zarr").complete == 5
     assert Store.open(tmp_path / "link.zarr").labels() == Store.open(copy).labels()

@@ -37,7 +37,7 @@ def change(store: Path, node: str, how: Callable[[Document], None]) -> None:
 def refusals(store: Path) -> set[str]:
     """What each way to read a store is told."""
     said = set()
-    for read in (open_store, Status.of, Store.open):
+    for read in (open_store, Status.from_store, Store.open):
         with pytest.raises(StoreError) as caught:
             read(store)
         said.add(str(caught.value))
@@ -99,7 +99,7 @@ def test_documents_beside_the_root_are_checked_when_they_are_read(copy: Path) ->
     path = copy / "records" / "zarr.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "node_type": "array"}))
     with pytest.raises(StoreError, match="records is 'array' of zarr format 3"):
-        Status.of(copy)
+        Status.from_store(copy)
 
 
 def test_a_document_without_end(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ def study(folder: Path, **accuracy: Any) -> sb.Study:
 
 def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Path) -> None:
     found = {f"f/{member.name}": ("f", member) for member in members({"source": "files", "paths": ["*.off"]}, folder)}
-    pilots = Pilots.of(found, sb.Similarity(), sb.Sphere())
+    pilots = Pilots.from_members(found, sb.Similarity(), sb.Sphere())
     assert set(pilots.surfaces) == {"f/z", "f/y"}
     assert set(pilots.set_aside) == {"f/broken", "f/inches"}
     assert "reaches 25.4 times as far as the reference" in pilots.set_aside["f/inches"]

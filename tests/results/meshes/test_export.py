@@ -133,7 +133,7 @@ def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
     place, folder = spheres
-    exporter = Exporter.of(place, folder=folder)
+    exporter = Exporter.from_store(place, folder=folder)
     scaled = exporter.rebuilder.rebuild(LABELS[1]).scaled
     mesh = sb.Mesh(np.vstack([scaled.vertices, [[1e6, 0, 0], [0, 0, 0]]]), scaled.triangles)
     values = witness_at_vertices(exporter.tree, LABELS[1], mesh, ORDERS)
@@ -216,4 +216,4 @@ def test_without_a_reference_there_is_nothing_to_compare_with(
     tree["convergence"].attrs["reference"] = "files/bad"
     monkeypatch.setattr("sobolev_batch.results.meshes.export.as_tree", lambda _: tree)
     with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
-        Exporter.of(place, folder=folder)
+        Exporter.from_store(place, folder=folder)

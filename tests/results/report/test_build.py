@@ -349,7 +349,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
 
 @pytest.mark.all
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    status = replace(Status.of(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
+    status = replace(Status.from_store(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
     monkeypatch.setattr(Status, "of", lambda _: status)
     text = make_report(store).text
     assert "1 mesh lacks a comparison" in text

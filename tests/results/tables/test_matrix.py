@@ -120,15 +120,15 @@ def test_distances_to_the_reference_alone() -> None:
     assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
     text = format_matrix(tree, "text", [-4.0])
     assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)"]
-    assert Matrix.of(tree, -4.0) is None
+    assert Matrix.from_tree(tree, -4.0) is None
 
 
 def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
-    whole = Matrix.of(made(5), -4.0)
+    whole = Matrix.from_tree(made(5), -4.0)
     assert whole is not None
     assert whole.labels == ("f/0", "f/2", "f/3", "f/4", "reference")
     assert np.isfinite(whole.values).all()
-    cut = Matrix.of(made(5), -4.0, most=3)
+    cut = Matrix.from_tree(made(5), -4.0, most=3)
     assert cut is not None
     assert cut.labels == ("f/0", "f/2", "reference")
     assert cut.values[0, 2] == 1.0

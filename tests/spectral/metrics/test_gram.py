@@ -23,7 +23,7 @@ def test_blocks_of_products_give_every_distance() -> None:
     center = fourier_transform(Sphere(), LATTICE)
     parts, own = [], []
     for block in LATTICE.split(2_000):
-        arrangement = Arrangement.of(WEIGHTS, block)
+        arrangement = Arrangement.for_block(WEIGHTS, block)
         part = np.stack([(f - center).values[LATTICE.place(block)].ravel()[arrangement.order] for f in fields])
         parts.append(arrangement.products(part, part))
         own.append(arrangement.squares(part))
@@ -50,7 +50,7 @@ def random_fields(count: int, lattice: Lattice) -> NDArray[np.complex128]:
 def test_sums_are_those_of_shells(intervals: int) -> None:
     lattice = Lattice(4.0, intervals)
     fields = random_fields(3, lattice)
-    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
+    arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
     squares = arrangement.squares(np.take(fields, arrangement.order, axis=1))
     expected = sums_of_shells(
         shell_sums(fields.reshape(3, *lattice.shape), None, lattice, lattice.half), SobolevWeights(lattice, ORDERS)
@@ -62,7 +62,7 @@ def test_sums_are_those_of_shells(intervals: int) -> None:
 
 def test_an_arrangement_has_every_sample_once_and_few_of_the_outer_ones() -> None:
     lattice = Lattice(4.0, 64)
-    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
+    arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
     assert np.array_equal(np.sort(arrangement.order), np.arange(lattice.half.size))
     ends = [(run.samples.start, run.samples.stop) for run in arrangement.runs]
     assert [start for start, _ in ends] == [0, *(stop for _, stop in ends[:-1])]
@@ -78,7 +78,7 @@ def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
     lattice = Lattice(4.0, 40)
     one, two = random_fields(2, lattice)
     twin = one + 1e-2 * two
-    arrangement = Arrangement.of(SobolevWeights(lattice, ORDERS), lattice.half)
+    arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
     pair = np.stack([one[arrangement.order], twin[arrangement.order]])
     squares = arrangement.squares(pair)
     sums, _ = differences(arrangement.products(pair, pair), squares, squares)

@@ -22,21 +22,21 @@ BOX = Rectangles.box((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2)).mesh()
 def test_the_energy_tends_to_twice_the_area() -> None:
     other = BOX.vertices @ np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]) + 0.01
     for surfaces, area in (([BOX], BOX.area), ([BOX, Mesh(other, BOX.triangles)], 2 * BOX.area)):
-        limit = EnergyLimit.of(surfaces, [1, -1][: len(surfaces)])
+        limit = EnergyLimit.from_surfaces(surfaces, [1, -1][: len(surfaces)])
         assert limit.value == pytest.approx(2 * area)
         assert limit.deviation == 0
 
 
 def test_parts_that_coincide_cancel() -> None:
-    assert EnergyLimit.of([BOX, Mesh(BOX.vertices, BOX.triangles)], [1, -1]).value == 0
+    assert EnergyLimit.from_surfaces([BOX, Mesh(BOX.vertices, BOX.triangles)], [1, -1]).value == 0
     # Moved along x by a quarter of its length: three quarters of the four long faces coincide.
     moved = Mesh(BOX.vertices + np.array([0.25, 0, 0]), BOX.triangles)
-    limit = EnergyLimit.of([BOX, moved], [1, -1])
+    limit = EnergyLimit.from_surfaces([BOX, moved], [1, -1])
     long_faces = 2 * (1.0 * 0.6 + 1.0 * 0.4)
     assert limit.value == pytest.approx(2 * (2 * BOX.area - 2 * 0.75 * long_faces), abs=4 * limit.deviation)
     # Counted twice, an area weighs four times as much.
     twice = Mesh(np.concatenate([BOX.vertices] * 2), np.concatenate([BOX.triangles, BOX.triangles + len(BOX.vertices)]))
-    assert EnergyLimit.of([twice], [1]).value == pytest.approx(8 * BOX.area)
+    assert EnergyLimit.from_surfaces([twice], [1]).value == pytest.approx(8 * BOX.area)
 
 
 def beyond_energies(energies: Reals, limit: float, deviation: float = 0.0) -> tuple[float, float]:
@@ -107,8 +107,8 @@ def test_what_an_octave_foretold_holds_on_if_later_ones_agree() -> None:
 def test_vertices_that_no_triangle_uses_do_not_matter() -> None:
     stray = Mesh(np.concatenate([BOX.vertices, [[1e8, 0, 0]]]), BOX.triangles)
     moved = Mesh(stray.vertices + 0.01, BOX.triangles)
-    assert EnergyLimit.of([stray], [1]).value == pytest.approx(2 * BOX.area)
-    assert EnergyLimit.of([stray, moved], [1, -1]).value == pytest.approx(4 * BOX.area)
+    assert EnergyLimit.from_surfaces([stray], [1]).value == pytest.approx(2 * BOX.area)
+    assert EnergyLimit.from_surfaces([stray, moved], [1, -1]).value == pytest.approx(4 * BOX.area)
 
 
 def test_triangles_coincide_whichever_side_is_their_front() -> None:
@@ -116,7 +116,7 @@ def test_triangles_coincide_whichever_side_is_their_front() -> None:
     along, across = np.array([3.0, 5.0, 0.0]), np.array([0.0, 0.0, 1.0])
     corners = 0.7 * np.array([np.zeros(3), along, along + across, across]) + np.array([0.1, 0.2, 0.3])
     for flipped in ([[0, 1, 3], [1, 2, 3]], [[3, 1, 0], [1, 2, 3]], [[3, 1, 0], [3, 2, 1]]):
-        limit = EnergyLimit.of([Mesh(corners, [[0, 1, 2], [0, 2, 3]]), Mesh(corners, flipped)], [1, -1])
+        limit = EnergyLimit.from_surfaces([Mesh(corners, [[0, 1, 2], [0, 2, 3]]), Mesh(corners, flipped)], [1, -1])
         assert limit.value == pytest.approx(0, abs=1e-9)
 
 
@@ -131,11 +131,11 @@ def test_thousands_of_triangles_in_a_plane_are_all_looked_up() -> None:
         triangles = np.concatenate([np.stack(pair, axis=1) for pair in pairs])
         return Mesh(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1), triangles)
 
-    limit = EnergyLimit.of([sheet(True), sheet(False)], [1, -1])
+    limit = EnergyLimit.from_surfaces([sheet(True), sheet(False)], [1, -1])
     assert limit.value == pytest.approx(0, abs=1e-9)
 
 
 def test_a_tail_without_octaves_is_unknown() -> None:
-    tail = Tail.of([], [], EnergyLimit(1.0), (-1.0, -2.0), [0.5, 0.5])
+    tail = Tail.from_sums([], [], EnergyLimit(1.0), (-1.0, -2.0), [0.5, 0.5])
     assert np.isinf(tail.uncertainty).all()
     assert np.isinf(tail.estimate(np.ones(2), np.zeros(2), np.zeros(2)).errors).all()

@@ -34,12 +34,12 @@ TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
 def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
     rng = np.random.default_rng(seed)
     lattices = [OctaveLattice.random(OCTAVE.lowest, OCTAVE.highest, intervals, rng)] if intervals else []
-    drawn = DrawnFrequencies(OCTAVE, draws, seed, FaceNormals.of([surface]), 0.3)
+    drawn = DrawnFrequencies(OCTAVE, draws, seed, FaceNormals.from_surfaces([surface]), 0.3)
     return OctaveSampling(OCTAVE, tuple(lattices), drawn)
 
 
 def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
-    return octave_values(surface, SampledOctave.of(sampling), ORDERS, settings_for(TARGET), known=known)
+    return octave_values(surface, SampledOctave.from_sampling(sampling), ORDERS, settings_for(TARGET), known=known)
 
 
 def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
@@ -110,7 +110,7 @@ def test_sums_over_an_octave_are_right_within_their_standard_errors(intervals: i
 
 
 def test_draws_follow_their_density() -> None:
-    normals = FaceNormals.of([BOX])
+    normals = FaceNormals.from_surfaces([BOX])
     assert len(normals.shares) == 3
     assert normals.shares.sum() == pytest.approx(1)
     rng = np.random.default_rng(0)
@@ -127,14 +127,14 @@ def test_draws_follow_their_density() -> None:
 
 
 def test_curved_surfaces_have_no_normals_to_draw_around() -> None:
-    assert not FaceNormals.of([icosphere(4), Sphere()])
-    assert FaceNormals.of([icosphere(0)])
+    assert not FaceNormals.from_surfaces([icosphere(4), Sphere()])
+    assert FaceNormals.from_surfaces([icosphere(0)])
 
 
 def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
     octave = Octave(40.0, 1)
     deviations = []
-    for normals in (FaceNormals.of([BOX]), FaceNormals.of([Sphere()])):
+    for normals in (FaceNormals.from_surfaces([BOX]), FaceNormals.from_surfaces([Sphere()])):
         sums = sums_of(BOX, OctaveSampling(octave, (), DrawnFrequencies(octave, 2000, 0, normals, 0.3)))
         deviations.append(sums.energy_deviation / sums.energy)
     assert deviations[0] < 0.1
@@ -159,8 +159,10 @@ def test_known_values_are_not_computed_again() -> None:
 def test_a_sampling_is_the_same_after_it_was_stored() -> None:
     sampling = sampling_of(BOX, 5)
     table = json.loads(json.dumps(sampling.to_table()))
-    again = SampledOctave.of(OctaveSampling.from_table(OCTAVE, FaceNormals.of([BOX]), table)).quadrature
-    first = SampledOctave.of(sampling).quadrature
+    again = SampledOctave.from_sampling(
+        OctaveSampling.from_table(OCTAVE, FaceNormals.from_surfaces([BOX]), table)
+    ).quadrature
+    first = SampledOctave.from_sampling(sampling).quadrature
     assert (again.frequencies == first.frequencies).all()
     assert (again.weights == first.weights).all()
 
@@ -175,7 +177,7 @@ def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
 
 
 def test_one_sample_that_carries_the_sum_may_stand_for_others() -> None:
-    octave = SampledOctave.of(sampling_of(BOX, 0, 0, 400))
+    octave = SampledOctave.from_sampling(sampling_of(BOX, 0, 0, 400))
     squares = np.zeros(400)
     squares[7] = 1.0
     weights = OctaveWeights(octave.quadrature, ORDERS)

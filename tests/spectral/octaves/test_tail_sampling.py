@@ -22,10 +22,14 @@ def with_draws(sampling: TailSampling, count: int) -> list[OctaveSampling]:
 def test_joined_samplings_serve_the_most_demanding_pilot_in_each_octave() -> None:
     first, second = TailSampling.usual(4.0, 2, [BOX]), TailSampling.usual(4.0, 3, [BOX], seed=1)
     large = [replace(one, lattices=tuple(replace(lattice, M=96) for lattice in one.lattices)) for one in first.octaves]
-    joined = TailSampling.joined(4.0, [large, with_draws(second, 700), with_draws(first, 900)], FaceNormals.of([BOX]))
+    joined = TailSampling.joined(
+        4.0, [large, with_draws(second, 700), with_draws(first, 900)], FaceNormals.from_surfaces([BOX])
+    )
     assert [[lattice.M for lattice in one.lattices] for one in joined.octaves] == [[96], [96], [64]]
     assert [len(one.drawn) for one in joined.octaves] == [20_000, 20_000, 700]
-    joined = TailSampling.joined(4.0, [with_draws(first, 900), with_draws(second, 700)], FaceNormals.of([BOX]))
+    joined = TailSampling.joined(
+        4.0, [with_draws(first, 900), with_draws(second, 700)], FaceNormals.from_surfaces([BOX])
+    )
     assert [len(one.drawn) for one in joined.octaves] == [900, 900, 700]
 
 
