@@ -76,10 +76,10 @@ from .surfaces.shapes.mesh import Mesh as Mesh
 from .surfaces.shapes.similarity import Similarity as Similarity
 from .surfaces.shapes.sphere import Sphere as Sphere
 from .surfaces.shapes.subdivision import icosphere as icosphere
-from .surfaces.smooth.ellipsoid import Ellipsoid as Ellipsoid
+from .surfaces.smooth.closed_forms import Ellipsoid as Ellipsoid
+from .surfaces.smooth.closed_forms import Torus as Torus
 from .surfaces.smooth.parametrised import ParametrisedSurface as ParametrisedSurface
 from .surfaces.smooth.smooth import Interval as Interval
-from .surfaces.smooth.torus import Torus as Torus
 from .surfaces.sources.conformance import check_source as check_source
 from .surfaces.sources.registry import ExpectedSize as ExpectedSize
 from .surfaces.sources.registry import Member as Member

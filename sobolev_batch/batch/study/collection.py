@@ -15,7 +15,7 @@ from sobolev_batch.batch.study.schema import Name, Section, read_toml, require_m
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, ObjectTemplate, filled, holds, names_of
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.surfaces.sources.mesh_lists import ListedMesh, checked_list, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.files import ListedMesh, checked_list, number_as_text, read_mesh_list
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 
 _MOST_OBJECTS = 1000

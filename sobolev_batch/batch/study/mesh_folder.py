@@ -13,7 +13,7 @@ from sobolev_batch.batch.study.study import REFERENCE_LABEL
 from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
-from sobolev_batch.surfaces.sources.mesh_lists import MOST_MESHES
+from sobolev_batch.surfaces.sources.files import MOST_MESHES
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 
 # Bytes of files that are read as a whole; the header or the length of others gives their size.

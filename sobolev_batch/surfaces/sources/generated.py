@@ -18,8 +18,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.smooth.ellipsoid import Ellipsoid
-from sobolev_batch.surfaces.smooth.torus import MOST_TRIANGLES, Torus
+from sobolev_batch.surfaces.smooth.closed_forms import MOST_TRIANGLES, Ellipsoid, Torus
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     Fingerprint,

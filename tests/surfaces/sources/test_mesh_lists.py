@@ -11,8 +11,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.sources.files import FileMember, FileSource
-from sobolev_batch.surfaces.sources.mesh_lists import read_mesh_list
+from sobolev_batch.surfaces.sources.files import FileMember, FileSource, read_mesh_list
 from tests.support.studies import small_table
 
 

@@ -1,0 +1,146 @@
+"""Ellipsoids and tori: areas, extents, how they move, and their triangulations."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ellipe
+
+from sobolev_batch import Ellipsoid, InputError, Mesh, Similarity, Sphere, Torus, icosphere
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
+from sobolev_batch.surfaces.smooth.smooth import Smooth
+
+EGG = Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3))
+TORUS = Torus(1.0, 0.4, (0.1, -0.2, 0.3))
+AXES = [(1.0, 1.0, 1.0), (1.0, 0.7, 0.4), (0.4, 1.0, 0.7), (2.0, 2.0, 0.5), (0.3, 0.3, 1.5)]
+# Surfaces with half the sides of their boxes, and the radii of their bounding spheres.
+PLACED = [(Ellipsoid(axes, EGG.center), axes, max(axes)) for axes in AXES] + [(TORUS, (1.4, 1.4, 0.4), 1.4)]
+
+
+def area_by_elliptic_integrals(a: float, b: float, c: float) -> float:
+    """The area, ring by ring: each is a complete elliptic integral."""
+
+    def ring(t: float) -> float:
+        first = c**2 * (1 - t * t) * b**2 + (a * b * t) ** 2
+        second = c**2 * (1 - t * t) * a**2 + (a * b * t) ** 2
+        return float(4 * math.sqrt(first) * ellipe(1 - second / first))
+
+    return float(2 * quad(ring, 0, 1, epsabs=0, epsrel=1e-13)[0])
+
+
+def volume(mesh: Mesh) -> float:
+    """Signed, positive where triangles face outwards."""
+    a, b, c = mesh.corners()
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize(
+    ("surface", "area"),
+    [
+        *((Ellipsoid(axes, (5.0, -1.0, 2.0)), area_by_elliptic_integrals(*axes)) for axes in AXES),
+        *((Torus(*radii), 4 * math.pi**2 * radii[0] * radii[1]) for radii in ((1.0, 0.4), (3.0, 0.2), (1.0, 0.95))),
+    ],
+)
+def test_the_area_is_the_closed_form_and_that_of_the_nodes(surface: Smooth, area: float) -> None:
+    assert surface.area == pytest.approx(area, rel=1e-12)
+    assert surface.area == pytest.approx(Smooth.area.func(surface), rel=1e-12)  # type: ignore[attr-defined]
+
+
+def test_the_area_of_a_sphere_and_of_a_flat_ellipsoid() -> None:
+    assert Ellipsoid((3.0, 3.0, 3.0)).area == pytest.approx(Sphere(3.0).area, rel=1e-15)
+    assert Ellipsoid((1.0, 1.0, 1e-9)).area == pytest.approx(2 * math.pi, rel=1e-12)
+    assert Ellipsoid((1e120, 1e120, 1e120)).area == pytest.approx(4 * math.pi * 1e240, rel=1e-14)
+
+
+@pytest.mark.parametrize(("surface", "halves", "radius"), PLACED)
+def test_extents_are_those_that_the_points_reach(surface: Any, halves: Any, radius: float) -> None:
+    assert surface.highest_along(DIRECTIONS) == pytest.approx(Smooth.highest_along(surface, DIRECTIONS), abs=1e-11)
+    lower, upper = surface.bounds
+    assert lower == pytest.approx(np.subtract(surface.center, halves), abs=1e-15)
+    assert upper == pytest.approx(np.add(surface.center, halves), abs=1e-15)
+    by_points = Smooth.bounding_sphere.fget(surface)  # type: ignore[attr-defined]
+    assert by_points == (pytest.approx(surface.center, abs=1e-15), pytest.approx(radius, rel=1e-11))
+    assert surface.bounding_sphere == (surface.center, pytest.approx(radius, rel=1e-15))
+
+
+@pytest.mark.parametrize(("surface", "most"), [(EGG, 0.9), (TORUS, 6.0)])
+def test_the_derivatives_are_those_of_the_positions(surface: Any, most: float) -> None:
+    u, v = np.random.default_rng(3).uniform((-most, 0.0), (most, 6.0), (20, 2)).T
+    step = 1e-5
+    for given, (du, dv) in zip(surface.tangents(u, v), ((step, 0.0), (0.0, step)), strict=True):
+        difference = (surface.positions(u + du, v + dv) - surface.positions(u - du, v - dv)) / (2 * step)
+        assert given == pytest.approx(difference, abs=1e-7)
+
+
+def test_a_similarity_moves_them() -> None:
+    ellipsoid = Ellipsoid((2.0, 4.0, 1.0), (1.0, 2.0, 3.0))
+    assert Similarity(0.5, (1.0, 0.0, 1.0)).apply(ellipsoid) == Ellipsoid((1.0, 2.0, 0.5), (0.0, 1.0, 1.0))
+    assert Similarity.to_unit_ball(ellipsoid) == Similarity(0.25, (1.0, 2.0, 3.0))
+    assert Similarity().apply(ellipsoid) is ellipsoid
+    moved = Similarity(2.0, (0.1, 0.3, 0.3)).apply(TORUS)
+    assert isinstance(moved, Torus)
+    assert (moved.R, moved.r) == (2.0, 0.8)
+    assert moved.center == pytest.approx((0.0, -1.0, 0.0), abs=1e-15)
+    assert Similarity.to_unit_ball(TORUS) == Similarity(1 / 1.4, TORUS.center)
+
+
+def test_meshes_of_ellipsoids_are_stretched_icospheres() -> None:
+    mesh = EGG.mesh(2)
+    radii = (mesh.vertices - EGG.center) / EGG.axes
+    assert np.linalg.norm(radii, axis=1) == pytest.approx(np.ones(162), rel=1e-14)
+    assert np.array_equal(mesh.triangles, icosphere(2).triangles)
+    gaps = [EGG.area - EGG.mesh(level).area for level in (2, 3, 4)]
+    assert gaps[1] / gaps[2] == pytest.approx(4, rel=0.02)
+    assert gaps[0] > gaps[1] > gaps[2] > 0
+
+
+def test_grids_of_tori_are_closed_and_face_outwards() -> None:
+    mesh = TORUS.mesh(12, 6)
+    assert (len(mesh.vertices), len(mesh.triangles)) == (72, 144)
+    counts = mesh.counts
+    assert (counts.zero_area, counts.duplicate, counts.boundary_edges, counts.nonmanifold_edges) == (0, 0, 0, 0)
+    # Neighbours run along a shared edge in opposite directions.
+    edges = np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    exact = 2 * math.pi**2 * 0.4**2
+    gaps = [exact - volume(TORUS.mesh(12 << k, 6 << k)) for k in (1, 2, 3)]
+    assert gaps[0] > gaps[1] > gaps[2] > 0
+    assert gaps[1] / gaps[2] == pytest.approx(4, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("surface", "same"), [(Ellipsoid((3, 2, 1)), Ellipsoid((3.0, 2.0, 1.0), (0.0, 0.0, 0.0))), (Torus(1), Torus())]
+)
+def test_they_are_values(surface: Smooth, same: Smooth) -> None:
+    assert pickle.loads(pickle.dumps(surface)) == surface == same
+    assert hash(surface) == hash(same)
+    assert surface not in (EGG, TORUS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        *(
+            (Ellipsoid, (axes,), "three positive finite numbers")
+            for axes in ((1.0, 1.0), (1.0, 1.0, 0.0), (1.0, math.nan, 1.0), (1.0, math.inf, 1.0), (1.0, True, 1.0))
+        ),
+        (Ellipsoid, ((1.0, 1.0, 1e200),), "between 1e-150 and 1e\\+150"),
+        (Ellipsoid, ((1.0, 1.0, 1.0), (0.0, math.nan, 0.0)), "center must be three finite numbers"),
+        *(
+            (Torus, radii, "0 < r < R")
+            for radii in ((1.0, 1.0), (1.0, 0.0), (1.0, -0.4), (math.inf, 1.0), (1.0, math.nan), (True, 0.5))
+        ),
+        (Torus, (1e200, 1.0), "at most 1e\\+150"),
+        (Torus, (1.0, 0.4, (0.0, 0.0)), "center must be three finite numbers"),
+        *((TORUS.mesh, counts, "at least 3 cells") for counts in ((2, 6), (12, 2), (12, True), (12.0, 6))),
+        (TORUS.mesh, (10**5, 10**5), "at most 1000000000 triangles"),
+    ],
+)
+def test_what_makes_no_surface_is_refused(kind: Any, arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        kind(*arguments)
