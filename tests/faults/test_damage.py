@@ -224,6 +224,21 @@ def test_sparse_chunks_and_stray_links(store: Path) -> None:
     (store / "norms" / ".#lock").unlink()
 
 
+def test_files_larger_than_any_memory_are_named_and_made_again(store: Path, study: Study, threads: Client) -> None:
+    sparse = ("records/record/c/2", "meshes/name/c/0", "fourier/mesh/c/0", "norms/norm/c/0/0", "meshes/area/zarr.json")
+    for name in sparse:
+        content = (store / name).read_bytes()
+        os.truncate(store / name, 1 << 42)
+        assert not verify(store).is_sound or status(store).lost_records, name
+        (store / name).write_bytes(content)
+    for name in sparse:
+        os.truncate(store / name, 1 << 42)
+    with pytest.raises(DamageError, match=r"results\.zarr: chunk 0 of fourier/mesh is damaged \(it has"):
+        Store.open(store).labels()
+    assert run(study, store, threads).computed == ("ico/2",)
+    assert verify(store).is_sound
+
+
 def test_fields_that_are_replaced_are_not_described_any_more(store: Path, threads: Client) -> None:
     """A driver that is killed after a field and before the tables."""
 

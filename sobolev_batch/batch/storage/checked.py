@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Self
 
 import google_crc32c
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import ByteRequest
 from zarr.abc.store import Store as ZarrStore
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from sobolev_batch.errors import DamageError
 
@@ -24,6 +25,8 @@ CHANGED = "it is not what was written"
 CHECKSUM_BYTES = 4
 # Of the codec of texts: their number, and the length of each.
 _COUNT_BYTES = 4
+# Records have checksums of all blocks of a field, and are the longest texts.
+_LARGEST_TEXT_BYTES, _MEAN_TEXT_BYTES = 16 << 20, 16 << 10
 
 
 def checksum_of(values: NDArray[Any]) -> int:
@@ -56,12 +59,14 @@ class CheckedStore(WrapperStore[ZarrStore]):
         Raises:
             DamageError: They cannot be a chunk of their array, or are not those that were written.
         """
-        content = await super().get(key, prototype, byte_range)
         array = key.partition("/c/")[0].removesuffix("/c")
         document = self._documents.get(array) if array != key else None
-        if content is None or byte_range is not None or document is None:
-            return content
-        problem = problem_of_chunk(content.as_numpy_array(), document)
+        if byte_range is not None or document is None:
+            return await super().get(key, prototype, byte_range)
+        problem = await self._problem_of_size(key, document)
+        content = None if problem else await super().get(key, prototype)
+        if content is not None:
+            problem = problem_of_chunk(content.as_numpy_array(), document)
         if problem:
             place = key.removeprefix(f"{array}/c").removeprefix("/")
             raise DamageError(
@@ -70,6 +75,23 @@ class CheckedStore(WrapperStore[ZarrStore]):
                 problem,
             )
         return content
+
+    async def _problem_of_size(self, key: str, document: Mapping[str, Any]) -> str:
+        # A file may be sparse, and larger than the memory. On object storage this would be one more request.
+        if isinstance(self._store, LocalStore):
+            with suppress(FileNotFoundError):
+                size, most = await self._store.getsize(key), largest_chunk_bytes(document)
+                return f"it has {size} bytes, more than {most}" if size > most else ""
+        return ""
+
+
+def largest_chunk_bytes(document: Mapping[str, Any]) -> int:
+    """Return the most bytes that a chunk of an array may have, by its metadata."""
+    dtype = document["data_type"]
+    count: int = math.prod(document["chunk_grid"]["configuration"]["chunk_shape"])
+    if dtype == "string":
+        return max(_LARGEST_TEXT_BYTES, count * _MEAN_TEXT_BYTES)
+    return count * int(np.dtype(dtype).itemsize) + CHECKSUM_BYTES
 
 
 def problem_of_chunk(content: NDArray[np.uint8], document: Mapping[str, Any]) -> str:

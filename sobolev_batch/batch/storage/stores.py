@@ -28,7 +28,7 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore
 
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import DamageError, StoreError
 
 T = TypeVar("T")
 
@@ -113,7 +113,8 @@ class Folder:
         """Return the content of a file."""
         path = path_in(self._path, key)
         if most_bytes is not None and path.stat().st_size > most_bytes:
-            raise StoreError(f"{self._path}: {key} has more than {most_bytes} bytes")
+            problem = f"{key} has more than {most_bytes} bytes"
+            raise DamageError(f"{self._path}: {problem}", problem)
         return path.read_bytes()
 
     def write(self, documents: Mapping[str, bytes]) -> None:

@@ -133,7 +133,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     count = 1 + max((int(number) for number in numbers if number.isdigit()), default=-1)
     fresh = Store(store.location)
     fresh.documents = _documents_of(array_keys(RECORD, str, (count,), (1,), ("mesh",)))
-    records = fresh.examine_records()[0]
+    records, damaged = fresh.examine_records()
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
         raise DamageError(
@@ -149,6 +149,9 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
         _require_same_samples(fresh, plan, is_trusted=False)
         labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
         _lay_out(fresh, plan, labels, ())
+        # Nothing else replaces the record of a row that has lost its label.
+        for row in damaged:
+            fresh.write_record(row, None)
         fresh.consolidate()
     return fresh
 

@@ -29,7 +29,13 @@ from zarr.buffer.cpu import Buffer as BytesBuffer
 from zarr.buffer.cpu import NDBuffer
 from zarr.storage import MemoryStore, StorePath
 
-from sobolev_batch.batch.storage.checked import CHANGED, CHECKSUM_BYTES, CheckedStore, checksum_of
+from sobolev_batch.batch.storage.checked import (
+    CHANGED,
+    CHECKSUM_BYTES,
+    CheckedStore,
+    checksum_of,
+    largest_chunk_bytes,
+)
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.batch.store.records import Record, RunRecord
@@ -246,11 +252,10 @@ class Store:
     def has_digest(self) -> bool:
         """Return whether tables, coordinates and metadata are those that were written together."""
         try:
-            root = self._root()
-        except (ValueError, TypeError, KeyError):
+            return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest(self._root()))
+        except (DamageError, ValueError, TypeError, KeyError):
             # zarr has no exception of its own for metadata that make no sense.
             return False
-        return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest(root))
 
     def _root(self) -> Document:
         """Return the document at the root with those of all nodes, and without the digest."""
@@ -268,13 +273,14 @@ class Store:
     def _digest(self, root: Document) -> str:
         """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
         # The group of records has the state of the latest run.
-        keys = {f"{name}/{ROOT}" for name in self.documents if name not in ("", RECORDS)}
+        keys = {f"{name}/{ROOT}": MOST_BYTES for name in self.documents if name not in ("", RECORDS)}
         for name in filter(self.is_array, self.documents):
             if name not in _BESIDE_DIGEST:
-                keys |= self.chunk_keys(name).keys()
-        unknown = sorted(keys - self._hashes.keys())
+                keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
+        unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
-            for key, content in zip(unknown, pool.map(self.location.read, unknown), strict=True):
+            contents = pool.map(self.location.read, unknown, unknown.values())
+            for key, content in zip(unknown, contents, strict=True):
                 self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
         return _digest_of([root, {key: self._hashes[key] for key in keys}])
 
