@@ -96,7 +96,7 @@ class SobolevAccessor:
         points: ArrayLike,
         *,
         eps: float | None = None,
-        memory: float | None = None,
+        memory: float | str | None = None,
     ) -> xr.DataArray:
         """Return the witness function at points (n, 3), positive where this surface has more area.
 

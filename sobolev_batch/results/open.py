@@ -44,7 +44,9 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     >>> tree["convergence"].attrs["reference"]
     'reference'
     """
-    opened = Store.open(store)
+    # Else values that are read once the process has gone to another folder would be missing ones.
+    location = Location.parse(store).absolute()
+    opened = Store.open(location)
     lost = lost_tables(opened)
     if lost:
         # Without this check they would read as NaN, zero or nothing, like data.
@@ -62,7 +64,7 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
             raise DamageError(
                 f"{opened.path}: the store is damaged ({problem}); run the study again", problem
             ) from error
-    tree.encoding = {**tree.encoding, _SOURCE: str(store), _STATE: tree.attrs.pop(DIGEST, None)}
+    tree.encoding = {**tree.encoding, _SOURCE: str(location), _STATE: tree.attrs.pop(DIGEST, None)}
     return tree
 
 

@@ -29,6 +29,14 @@ def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
         assert str(function(tree)) == str(result)
 
 
+def test_an_open_tree_finds_its_fields_from_any_folder(finished_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(finished_store.parent)
+    tree = sb.open_store(finished_store.name)
+    monkeypatch.chdir("/")
+    assert sb.table(tree, -5.0)["distance"].notna().any()
+    assert sb.status(tree).complete
+
+
 def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Path, threads: Client) -> None:
     shutil.copytree(finished_store, store_path)
     tree = sb.open_store(store_path)

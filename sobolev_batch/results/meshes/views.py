@@ -1,9 +1,12 @@
-"""Views of meshes: a few meshes of a store, simplified for display, with their witness functions."""
+"""Meshes of a store for display: made again by its study, simplified, with their witness functions at vertices."""
 
 from __future__ import annotations
 
+import difflib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal, Self, get_args
 
@@ -12,13 +15,145 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.results.meshes.rebuild import MeshRebuilder, matching_labels
-from sobolev_batch.results.meshes.witness import witness_at, witness_at_vertices
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group, reference_of
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
+from sobolev_batch.surfaces.sources.registry import Member
+
+# Labels of which a message gives examples.
+_MOST_LISTED = 3
+
+
+@dataclass(frozen=True)
+class MeshRebuilder:
+    """Makes meshes of a store again.
+
+    Attributes:
+        members: Family and member of each surface that the study lists on this machine, by label.
+        meshes: Table of the store about the computed meshes.
+        similarity: Similarity from the meshes' own unit of length to the study's.
+    """
+
+    members: Mapping[str, tuple[str, Member]]
+    meshes: xr.Dataset
+    similarity: Similarity
+
+    @classmethod
+    def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
+        """Return the rebuilder of an open store.
+
+        Args:
+            tree: Open store.
+            folder: Folder where relative paths in its study start.
+
+        Raises:
+            InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
+        """
+        meshes = finished_group(tree, "meshes")
+        try:
+            members = members_of(Study.from_table(tree.attrs["study"]["table"], folder=folder))
+        except SobolevBatchError as error:
+            raise InputError(f"the study's meshes cannot be listed here: {error}") from error
+        similarity = tree.attrs["similarity"]
+        return cls(members, meshes, Similarity(similarity["scale"], tuple(similarity["origin"])))
+
+    def rebuild(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
+        """Return the mesh of a label in its own unit of length, and in the study's.
+
+        Files may have changed, and a store may name files that its study never read: only a mesh with the
+        stored digest passes.
+
+        Raises:
+            SobolevBatchError: The mesh cannot be made, is too large, or is not the one that was computed.
+        """
+        row = self.meshes.sel(mesh=label)
+        triangles = row["triangles"].item()
+        if row["status"].item() != "complete":
+            raise InputError(f"its status is {row['status'].item()!r}")
+        if label not in self.members:
+            raise InputError("the study makes no such mesh here")
+        if not triangles:
+            raise InputError("a surface that is no mesh has no triangles")
+        if triangles > most_triangles:
+            raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
+        own = self.members[label][1].load()
+        scaled = self.similarity.apply(own)
+        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
+            raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
+        return own, scaled
+
+
+def matching_labels(names: Sequence[str], meshes: xr.Dataset, reference: str) -> tuple[str, ...]:
+    """Return the labels that are meant by names, each once.
+
+    Args:
+        names: Labels, or patterns of them with the wildcards ``*``, ``?`` and ``[...]``. A pattern stands for meshes
+            that are computed and have triangles.
+        meshes: Table of all meshes.
+        reference: Label of the reference, which no pattern stands for.
+
+    Raises:
+        InputError: The store has no such label; the message suggests one of the store.
+    """
+    known: list[str] = meshes["mesh"].values.tolist()
+    usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference)
+    candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
+    chosen: list[str] = []
+    for name in names:
+        if name in known:
+            chosen.append(name)
+            continue
+        is_pattern = any(character in name for character in "*?[")
+        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
+        if not matches:
+            similar = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
+            raise InputError(
+                f"the store has no computed mesh with triangles that matches {name!r}; "
+                f"its labels are such as {_listed(candidates or known)}"
+                if is_pattern
+                else f"the store has no mesh {name!r}, {remedy}"
+            )
+        chosen += matches
+    return tuple(dict.fromkeys(chosen))
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])
+
+
+def witness_at(
+    tree: xr.DataTree, label: str, orders: Sequence[float], points: Reals, dtype: ComplexDtype = "complex128"
+) -> Reals:
+    """Return values (orders, n) from the stored fields at points (n, 3) in the study's unit; see `witness`."""
+    fields = tree["fourier"].to_dataset()["fourier"]
+    pair = fields.sel(mesh=label), fields.sel(mesh=reference_of(tree))
+    return np.asarray(witness(*pair, list(orders), points, dtype=dtype).to_numpy(), dtype=np.float64)
+
+
+def witness_at_vertices(tree: xr.DataTree, label: str, mesh: Mesh, orders: Sequence[float]) -> Reals:
+    """Return values (orders, n) at a mesh's own vertices.
+
+    Vertices that no triangle uses have NaN: they may lie beyond the lattice's period.
+
+    Args:
+        tree: Open store with tables.
+        label: Label of the mesh.
+        mesh: Mesh in the study's unit.
+        orders: Orders s.
+    """
+    used = mesh.used_vertices
+    values = np.full((len(orders), len(mesh.vertices)), np.nan)
+    values[:, used] = witness_at(tree, label, orders, mesh.vertices[used])
+    return values
+
 
 Reals = NDArray[np.float64]
 Triangles = NDArray[np.int32]
@@ -183,7 +318,7 @@ def make_views(
     views, missing = [], {}
     for label in labels:
         try:
-            mesh = rebuilder.rebuild(label, _LARGEST_REBUILT).scaled
+            _, mesh = rebuilder.rebuild(label, _LARGEST_REBUILT)
             views.append(_view(tree, label, mesh, chosen, most_triangles, up))
         except SobolevBatchError as error:
             missing[label] = str(error)

@@ -17,7 +17,7 @@ from plyfile import PlyData
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
 from sobolev_batch.results.meshes.export import Exporter
-from sobolev_batch.results.meshes.witness import witness_at_vertices
+from sobolev_batch.results.meshes.views import witness_at_vertices
 from tests.support.spheres import CENTER, LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 
 Spheres = tuple[str, Path]
@@ -134,7 +134,7 @@ def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
 def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
     place, folder = spheres
     exporter = Exporter.from_store(place, folder=folder)
-    scaled = exporter.rebuilder.rebuild(LABELS[1]).scaled
+    _, scaled = exporter.rebuilder.rebuild(LABELS[1])
     mesh = sb.Mesh(np.vstack([scaled.vertices, [[1e6, 0, 0], [0, 0, 0]]]), scaled.triangles)
     values = witness_at_vertices(exporter.tree, LABELS[1], mesh, ORDERS)
     assert np.isnan(values[:, -2:]).all()
