@@ -71,12 +71,6 @@ def test_a_byte_order_mark_is_no_part_of_the_text(read: Read, ending: str, conte
     assert soup(read(ending, codecs.BOM_UTF8 + content)) == soup(box())
 
 
-def test_a_path_may_be_text(tmp_path: Path) -> None:
-    path = tmp_path / "box.off"
-    path.write_bytes(off(BOX_VERTICES, BOX_TRIANGLES))
-    assert read_mesh(str(path)).digest == read_mesh(path).digest
-
-
 @pytest.mark.parametrize(
     ("ending", "content"),
     [

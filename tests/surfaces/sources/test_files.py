@@ -30,13 +30,6 @@ def test_files_are_sorted_by_path_and_named_by_stem(tmp_path: Path) -> None:
     assert listed(found) == [("10", -1), ("9", -1), ("C", -1), ("a", -1), ("b", -1)]
 
 
-def test_a_file_loads_what_it_holds(tmp_path: Path) -> None:
-    (tmp_path / "box.off").write_bytes(OFF_BOX)
-    (member,) = members({"source": "files", "paths": ["box.off"]}, tmp_path)
-    assert loaded(member).area == BOX_AREA
-    assert loaded(member).vertices.tolist() == BOX_VERTICES.tolist()
-
-
 def test_paths_start_at_the_folder_unless_they_are_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir("/")
     study, elsewhere = tmp_path / "study", tmp_path / "elsewhere"
@@ -58,14 +51,6 @@ def test_a_named_file_may_be_missing_until_it_is_read(tmp_path: Path) -> None:
             use()
 
 
-def test_a_bad_file_is_named(tmp_path: Path) -> None:
-    (tmp_path / "bad.off").write_bytes(off(BOX_VERTICES, [[0, 1, 99]]))
-    (member,) = members({"source": "files", "paths": ["bad.off"]}, tmp_path)
-    with pytest.raises(MeshError) as caught:
-        member.load()
-    assert str(caught.value).startswith(f"{tmp_path / 'bad.off'}: ")
-
-
 def test_globs_find_files_in_order(tmp_path: Path) -> None:
     (tmp_path / "deep" / "deeper").mkdir(parents=True)
     (tmp_path / "folder.off").mkdir()
@@ -82,14 +67,6 @@ def test_globs_find_files_in_order(tmp_path: Path) -> None:
     assert names("deep/*/*.off") == ["d"]
     # What two of them find is there once.
     assert names("a.off", "*.off", "[a].off", "./a.off") == ["a", "b"]
-
-
-@pytest.mark.parametrize("path", ["*.stl", "nowhere/*.off", "fold*"])
-def test_a_glob_that_matches_no_file_is_an_error(tmp_path: Path, path: str) -> None:
-    (tmp_path / "a.off").write_bytes(OFF_BOX)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(StudyError, match=re.escape(f"the glob {path!r} matches no file below {tmp_path}")):
-        members({"source": "files", "paths": ["a.off", path]}, tmp_path)
 
 
 def test_wildcards_in_the_name_of_the_folder_are_letters(tmp_path: Path) -> None:

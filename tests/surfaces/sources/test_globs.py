@@ -108,10 +108,10 @@ def test_loops_of_links_and_repeated_wildcards_end(tmp_path: Path) -> None:
     assert len(names_of(tmp_path, "/".join(["**"] * 12) + "/*.off")) == 12
 
 
-@pytest.mark.parametrize("glob", ["*.ply", "none/*.off", "*" * 300 + "z", "a[.off", "**/none/*", "a*\n"])
+@pytest.mark.parametrize("glob", ["*.ply", "none/*.off", "fold*", "*" * 300 + "z", "a[.off", "**/none/*", "a*\n"])
 def test_globs_that_match_nothing_are_refused(tmp_path: Path, glob: str) -> None:
-    put(tmp_path, "a.off")
-    message = refused(tmp_path, glob)
+    put(tmp_path, "a.off", "folder/b.txt")
+    message = refused(tmp_path, "a.off", glob)
     assert f"matches no file below {tmp_path}" in message
     assert message.endswith("correct it, or put files there")
 
