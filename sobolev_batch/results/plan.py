@@ -17,7 +17,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.collection import StudyCollection
-from sobolev_batch.batch.study.pilots import Survey
+from sobolev_batch.batch.study.lattice_search import Survey
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import complete_records

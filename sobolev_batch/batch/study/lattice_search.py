@@ -1,10 +1,13 @@
-"""The search for the lattice of a study that asks for an accuracy, among a few pilot pairs."""
+"""The search for the lattice of a study that asks for an accuracy.
+
+A few of its surfaces, the pilots, are compared with the reference. The most demanding of these pairs decides.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -12,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
-from sobolev_batch.batch.study.pilots import Members, Pilots
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.errors import AccuracyError, StudyError
+from sobolev_batch.errors import AccuracyError, InputError, StudyError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
@@ -29,11 +31,21 @@ from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
+from sobolev_batch.surfaces.sources.registry import Member
 
 Reals = NDArray[np.float64]
+# Family and member of each surface, by label.
+Members = Mapping[str, tuple[str, Member]]
 
 _log = logging.getLogger(__name__)
+
+# Pilots are the coarsest and the finest member of this many families.
+_MOST_FAMILIES = 6
+# A surface that reaches this many times as far as the reference is in another unit, or another object.
+_FARTHEST = 8.0
+# Memory that a pilot may take to be made, and that all surfaces together may take whose extents are looked at.
+_MOST_BYTES = 1e9
 
 # Surfaces that are no pilots may reach a little further than those that are.
 _REACH_MARGIN = 1.03
@@ -43,15 +55,82 @@ _PILOT_FRACTION = 0.7
 _MOST_RETRIES = 2
 
 
+class Survey:
+    """A look at the surfaces of a study one after the other; their extents stay.
+
+    Attributes:
+        extents: Extent of each surface that was loaded, by label.
+        set_aside: Reason for each surface that cannot be read or reaches much too far, by label.
+    """
+
+    def __init__(self, members: Members, similarity: Similarity, reference: Extent) -> None:
+        self.members = members
+        self.similarity = similarity
+        self.reference = reference
+        self.extents: dict[str, Extent] = {}
+        self.set_aside: dict[str, str] = {}
+
+    def pilots(self) -> dict[str, Surface]:
+        """Return the coarsest and the finest surface of each of a few families, by label, in the study's unit."""
+        families: dict[str, list[str]] = {}
+        for label, (family, _) in self.members.items():
+            families.setdefault(family, []).append(label)
+        surfaces: dict[str, Surface] = {}
+        for labels in list(families.values())[:_MOST_FAMILIES]:
+            labels.sort(key=self._fineness)
+            for candidates in (labels, labels[::-1]):
+                surfaces |= self._first(candidates, surfaces)
+        return surfaces
+
+    def look_at_others(self, known: Container[str] = ()) -> None:
+        """Note the extents of other surfaces that are quickly loaded, as long as they take little memory together."""
+        left = _MOST_BYTES
+        for label, (_, member) in self.members.items():
+            if label in known or not member.is_quickly_loaded:
+                continue
+            left -= member.expected_size().projected_bytes
+            if left < 0:
+                return
+            self._load(label)
+
+    def _fineness(self, label: str) -> tuple[int, int]:
+        _, member = self.members[label]
+        return member.level, 0 if member.level >= 0 else member.expected_size().triangles
+
+    def _first(self, labels: Sequence[str], known: Mapping[str, Surface]) -> dict[str, Surface]:
+        """Return the first of some surfaces that can be a pilot; those before it are set aside."""
+        for label in labels:
+            if self.members[label][1].expected_size().projected_bytes <= _MOST_BYTES:
+                surface = known[label] if label in known else self._load(label)
+                if surface is not None:
+                    return {label: surface}
+        return {}
+
+    def _load(self, label: str) -> Surface | None:
+        """Return a surface whose extent is noted, or None if it is set aside."""
+        if label in self.set_aside:
+            return None
+        try:
+            surface = self.similarity.apply(self.members[label][1].load())
+        except InputError as error:
+            self.set_aside[label] = str(error)
+            return None
+        times = surface.extent.reach / self.reference.reach
+        if times > _FARTHEST:
+            self.set_aside[label] = f"it reaches {times:.3g} times as far as the reference; are both in the same unit?"
+            return None
+        self.extents[label] = surface.extent
+        return surface
+
+
 def choose_lattice(
     study: Study, similarity: Similarity, reference: Surface, members: Members, basis: str
 ) -> LatticeChoice:
     """Choose lattice, octaves and dtype for the accuracy that a study asks for.
 
-    The coarsest and the finest member of each family are compared with the reference on a small lattice. The most
-    demanding of these pairs determines the choice. Where one lattice would be large, octaves follow a small one.
-    Surfaces that cannot be read, or reach much farther than the reference, have no say. For a best effort, neither
-    have pairs that cannot have the accuracy, as long as others can.
+    The coarsest and the finest member of each family are compared with the reference on a small lattice. Where one
+    lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
+    reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
 
     Args:
         study: Study with an accuracy.
@@ -67,17 +146,20 @@ def choose_lattice(
     accuracy = study.accuracy
     if accuracy is None:
         raise ValueError("only a study that asks for an accuracy leaves a choice")
-    pilots = Pilots.from_members(members, similarity, reference)
-    for label, reason in pilots.set_aside.items():
+    survey = Survey(members, similarity, reference.extent)
+    pilots = survey.pilots()
+    survey.look_at_others(pilots)
+    for label, reason in survey.set_aside.items():
         _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
-    if not pilots.surfaces:
-        examples = [f"{label}: {reason}" for label, reason in pilots.set_aside.items()]
+    if not pilots:
+        examples = [f"{label}: {reason}" for label, reason in survey.set_aside.items()]
         raise StudyError(
             "none of the study's surfaces can serve to choose a lattice"
             + (f" ({examples[0]})" if examples else ", since all are too large")
             + "; see what is wrong with them, or give a [lattice] instead of an [accuracy]"
         )
-    widths, reach = _REACH_MARGIN * pilots.extent.widths, _REACH_MARGIN * pilots.extent.reach
+    extent = Extent.union([reference.extent, *survey.extents.values()])
+    widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
     strict = replace(accuracy, best_effort=False)
     problems = {
         label: Problem(
@@ -88,14 +170,14 @@ def choose_lattice(
             label,
             available_cores(),
         )
-        for label, surface in pilots.surfaces.items()
+        for label, surface in pilots.items()
     }
     search = _Search(study, strict, problems, basis)
     if not accuracy.best_effort:
-        outcome = search.best()
-        if outcome.choice is None or outcome.shortfalls:
-            raise outcome.worst
-        return outcome.choice
+        best, shortfalls = search.best()
+        if best is None or shortfalls:
+            raise _worst(shortfalls)
+        return best
     choice, short = search.best_for_most()
     notes = [f"{label} will fall short of rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
@@ -109,22 +191,13 @@ def choose_lattice(
     return replace(choice, reasons=(*choice.reasons, *notes))
 
 
-@dataclass(frozen=True, eq=False)
-class _Outcome:
-    """A choice from pilot pairs, and why it is too little for some of them.
+# A choice, if there is one for any pair, and why each pair that falls short does, by the label of its surface.
+_Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
 
-    Attributes:
-        choice: Choice; None where there is none for those that fall short.
-        shortfalls: Why each pair that falls short does, by the label of its surface.
-    """
 
-    choice: LatticeChoice | None
-    shortfalls: Mapping[str, AccuracyError] = field(default_factory=dict)
-
-    @property
-    def worst(self) -> AccuracyError:
-        """Why the pair falls short that needs the largest rtol."""
-        return max(self.shortfalls.values(), key=lambda shortfall: shortfall.reachable)
+def _worst(shortfalls: Mapping[str, AccuracyError]) -> AccuracyError:
+    """Return why the pair falls short that needs the largest rtol."""
+    return max(shortfalls.values(), key=lambda shortfall: shortfall.reachable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,29 +218,29 @@ class _Search:
 
     def best(self) -> _Outcome:
         """Return the first choice that is enough for all pairs, else the one of which most can be had."""
-        ways: list[Callable[[], _Outcome]] = [self._on_one_lattice]
+        ways = [self._on_one_lattice]
         if self._distances and permits_octaves(self.accuracy):
             ways.insert(0 if any(map(prefers_octaves, self.problems.values())) else 1, self._in_octaves)
         outcomes: list[_Outcome] = []
         for way in ways:
             outcomes.append(way())
-            if not outcomes[-1].shortfalls:
+            if not outcomes[-1][1]:
                 return outcomes[-1]
-        return min(outcomes, key=lambda outcome: outcome.worst.reachable)
+        return min(outcomes, key=lambda outcome: _worst(outcome[1]).reachable)
 
-    def best_for_most(self) -> tuple[LatticeChoice | None, tuple[str, ...]]:
+    def best_for_most(self) -> tuple[LatticeChoice | None, list[str]]:
         """Return a choice that is enough for all pairs but some that fall short, and their labels; None if all do."""
         search, short = self, list[str]()
         for _ in range(_MOST_RETRIES + 1):
-            outcome = search.best()
-            if outcome.choice is not None and not outcome.shortfalls:
-                return outcome.choice, tuple(short)
-            short += outcome.shortfalls
-            others = {label: one for label, one in search.problems.items() if label not in outcome.shortfalls}
+            choice, shortfalls = search.best()
+            if choice is not None and not shortfalls:
+                return choice, short
+            short += shortfalls
+            others = {label: problem for label, problem in search.problems.items() if label not in shortfalls}
             if not others:
                 break
             search = replace(search, problems=others)
-        return None, tuple(short)
+        return None, short
 
     def aiming_at(self, rtol: float) -> Self:
         """Return the search for another accuracy."""
@@ -219,8 +292,8 @@ class _Search:
             if solution.shortfall is not None:
                 shortfalls[label] = solution.shortfall
         if not lattices:
-            return _Outcome(None, shortfalls)
-        lattice = max(lattices.values(), key=lambda one: one.M)
+            return None, shortfalls
+        lattice = max(lattices.values(), key=lambda lattice: lattice.M)
         first = next(iter(self.problems.values()))
         surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in self.problems.values())]
         tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.from_surfaces(surfaces))
@@ -233,7 +306,7 @@ class _Search:
             f"{len(self.problems)} pilot pairs: {', '.join(lattices)}",
             f"{dtype} for the smallest distance of a pilot, about {_listed(closest, orders)}",
         )
-        return _Outcome(LatticeChoice(lattice, dtype, tuple(closest.tolist()), reasons, self.basis, tail), shortfalls)
+        return LatticeChoice(lattice, dtype, tuple(closest.tolist()), reasons, self.basis, tail), shortfalls
 
     def _on_one_lattice(self) -> _Outcome:
         """Choose a lattice that reaches far enough for every pair."""
@@ -244,7 +317,7 @@ class _Search:
                 pilots[label] = run_pilot(problem)
             except AccuracyError as error:
                 shortfalls[label] = error
-        return _Outcome(None, shortfalls) if shortfalls else _Outcome(self._one_lattice(pilots))
+        return None if shortfalls else self._one_lattice(pilots), shortfalls
 
     def _one_lattice(self, pilots: Mapping[str, Pilot]) -> LatticeChoice:
         highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice, choice_basis
-from sobolev_batch.batch.study.lattice_search import choose_lattice
-from sobolev_batch.batch.study.pilots import Members
+from sobolev_batch.batch.study.lattice_search import Members, choose_lattice
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget

@@ -10,7 +10,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.pilots import Pilots
+from sobolev_batch.batch.study.lattice_search import Survey
 from tests.support.commands import call
 from tests.support.members import members
 
@@ -39,11 +39,10 @@ def study(folder: Path, **accuracy: Any) -> sb.Study:
 
 def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Path) -> None:
     found = {f"f/{member.name}": ("f", member) for member in members({"source": "files", "paths": ["*.off"]}, folder)}
-    pilots = Pilots.from_members(found, sb.Similarity(), sb.Sphere())
-    assert set(pilots.surfaces) == {"f/z", "f/y"}
-    assert set(pilots.set_aside) == {"f/broken", "f/inches"}
-    assert "reaches 25.4 times as far as the reference" in pilots.set_aside["f/inches"]
-    assert pilots.extent.reach == pytest.approx(1, abs=0.01)
+    survey = Survey(found, sb.Similarity(), sb.Sphere().extent)
+    assert set(survey.pilots()) == {"f/z", "f/y"}
+    assert set(survey.set_aside) == {"f/broken", "f/inches"}
+    assert "reaches 25.4 times as far as the reference" in survey.set_aside["f/inches"]
 
 
 @pytest.mark.slow
