@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.batch.analysis.ordering import TableOrder
+from sobolev_batch.batch.analysis.datasets import TableOrder
 from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe_failure
 from sobolev_batch.batch.fields.memory import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record

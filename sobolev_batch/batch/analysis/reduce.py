@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.analysis.datasets import (
     DistancesToReference,
+    TableOrder,
     convergence_dataset,
     distances_dataset,
     meshes_dataset,
     norms_dataset,
 )
-from sobolev_batch.batch.analysis.ordering import TableOrder
 from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task

@@ -28,40 +28,6 @@ def _first_problem(error: ValidationError) -> str:
     return ": ".join(filter(None, (".".join(map(str, problem["loc"])), problem["msg"])))
 
 
-class JsonRecord:
-    """A dataclass that is stored as one line of JSON, which begins with its row: records of rows may trade places."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
-    kind: ClassVar[str]
-
-    def to_json(self, row: int) -> str:
-        """Return the record of a row as one line of JSON."""
-        return json.dumps({_ROW: row, **asdict(self)})  # type: ignore[call-overload]
-
-    @classmethod
-    def from_json(cls, text: str, row: int) -> Self | None:
-        """Return the record of a row that a line holds, or None if the line is empty.
-
-        Raises:
-            DamageError: The line is not a record, or that of another row.
-        """
-        if not text:
-            return None
-        try:
-            table = dict(json.loads(text))
-            stored_row = table.pop(_ROW, None)
-            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
-        except ValidationError as error:
-            problem = _first_problem(error)
-        except (ValueError, TypeError, RecursionError) as error:
-            problem = f"no table: {error}"
-        else:
-            problem = "" if stored_row == row else f"it is that of row {stored_row!r}"
-        if problem:
-            raise DamageError(f"a {cls.kind} is damaged ({problem}): {text[:80]!r}", problem)
-        return record
-
-
 @dataclass(frozen=True)
 class Facts:
     """Properties of a surface, found when it was transformed.
@@ -112,8 +78,10 @@ class ProximityRecord:
 
 
 @dataclass(frozen=True)
-class Record(JsonRecord):
+class Record:
     """Completion record of one surface, written after everything else of it.
+
+    It is stored as one line of JSON, which begins with its row: records of rows may trade places.
 
     Attributes:
         key: Key of the row when the surface was computed: a digest of all that its field depends on.
@@ -130,7 +98,7 @@ class Record(JsonRecord):
         proximity: Hausdorff and Chamfer distances from the reference, where the study asks for them.
     """
 
-    kind = "completion record"
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     key: str
     status: Status
@@ -147,6 +115,33 @@ class Record(JsonRecord):
     def completes(self, key: str) -> bool:
         """Return whether the field with this key exists already."""
         return self.status == "complete" and bool(key) and self.key == key
+
+    def to_json(self, row: int) -> str:
+        """Return the record of a row as one line of JSON."""
+        return json.dumps({_ROW: row, **asdict(self)})
+
+    @classmethod
+    def from_json(cls, text: str, row: int) -> Self | None:
+        """Return the record of a row that a line holds, or None if the line is empty.
+
+        Raises:
+            DamageError: The line is not a record, or that of another row.
+        """
+        if not text:
+            return None
+        try:
+            table = dict(json.loads(text))
+            stored_row = table.pop(_ROW, None)
+            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
+        except ValidationError as error:
+            problem = _first_problem(error)
+        except (ValueError, TypeError, RecursionError) as error:
+            problem = f"no table: {error}"
+        else:
+            problem = "" if stored_row == row else f"it is that of row {stored_row!r}"
+        if problem:
+            raise DamageError(f"a completion record is damaged ({problem}): {text[:80]!r}", problem)
+        return record
 
 
 @dataclass(frozen=True)
