@@ -1,0 +1,172 @@
+"""Counts of the work behind public calls: they catch a second transform of one mesh, which no result shows.
+
+A count is the same on each machine, where seconds are not. A change that raises a count changes the table.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import finufft
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.spectral.exact import sampled
+from sobolev_batch.spectral.quadrature import kinds
+from tests.support.studies import SMALL_LATTICE, small_table
+
+COARSE, FINE, SPHERE = sb.icosphere(1), sb.icosphere(2), sb.Sphere()
+
+
+def run_study(store: str, *levels: int) -> None:
+    """Run a study of some icospheres in threads of this process, where calls are counted."""
+    family = [{"name": "ico", "source": "icosphere", "levels": list(levels)}]
+    sb.run(sb.Study.from_table(small_table(family=family)), f"memory://counts-{store}")
+
+
+def first_run(store: str, *levels: int) -> Callable[[], object]:
+    return lambda: run_study(store, *levels)
+
+
+def norms(times: int) -> Callable[[], object]:
+    return lambda: [sb.norm(FINE, -4.0, lattice=SMALL_LATTICE) for _ in range(times)]
+
+
+def second_run() -> None:
+    run_study("second", 0, 1)
+
+
+# Each call, with the most NUFFTs, points in them and terms of exact transforms that it may take, and why it takes them.
+WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
+    "distance of a mesh from itself": (
+        lambda: sb.distance(FINE, FINE, -4.0, lattice=SMALL_LATTICE),
+        *(0, 0, 0),
+        "equal surfaces are equal by their triangles",
+    ),
+    "norm of a mesh": (
+        lambda: sb.norm(FINE, -4.0, lattice=SMALL_LATTICE),
+        *(1, 21_440, 10_240),
+        "one field, probed at 32 frequencies",
+    ),
+    "distance of two meshes": (
+        lambda: sb.distance(COARSE, FINE, -4.0, lattice=SMALL_LATTICE),
+        *(2, 31_840, 12_800),
+        "one field of each mesh, probed at 32 frequencies",
+    ),
+    "distances at three orders": (
+        lambda: sb.distance(COARSE, FINE, [-2.0, -4.0, -6.0], lattice=SMALL_LATTICE),
+        *(2, 31_840, 12_800),
+        "all orders share the fields and their probes",
+    ),
+    "distance of a mesh from a sphere": (
+        lambda: sb.distance(FINE, SPHERE, -4.0, lattice=SMALL_LATTICE),
+        *(1, 21_440, 10_240),
+        "the transform of a sphere is a formula",
+    ),
+    "distance to an accuracy": (
+        lambda: sb.distance(COARSE, FINE, -4.0, rtol=0.05),
+        *(2, 5_900, 51_200),
+        "the lattice is chosen from exact values, before one coarse field of each mesh",
+    ),
+    "gradient": (
+        lambda: sb.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),
+        *(10, 115_200, 0),
+        "a field and two sums at the nodes, at two accuracies, and four fields for the share of the target's error",
+    ),
+    "verdict on equal meshes": (
+        lambda: sb.same_surface(FINE, FINE),
+        *(0, 0, 0),
+        "equal surfaces are equal by their triangles",
+    ),
+    "verdict far from its tolerance": (
+        lambda: sb.same_surface(COARSE, FINE, rtol=1e-3),
+        *(3, 47_340, 25_600),
+        "a rough norm of the reference, and the two fields on one lattice",
+    ),
+    "verdict near its tolerance": (
+        lambda: sb.same_surface(COARSE, FINE, rtol=0.1),
+        *(5, 25_820, 51_200),
+        "a rough norm of the reference, and the two fields on two lattices",
+    ),
+    "study of one mesh": (
+        first_run("one", 1),
+        *(1, 10_400, 2_560),
+        "its field, as for a distance; the reference is a sphere",
+    ),
+    "study of two meshes": (
+        first_run("two", 1, 2),
+        *(2, 31_840, 12_800),
+        "one field of each mesh, whatever is compared with it",
+    ),
+    "second run of a study": (
+        second_run,
+        *(0, 0, 0),
+        "its fields are stored, with their probes",
+    ),
+}
+# What is used first, with the largest number of the package's own modules that it may load, and why.
+MODULES = {
+    "import sobolev_batch": (1, "names are loaded when they are used"),
+    "import sobolev_batch as sb; sb.distance": (75, "surfaces and spectral, and no study, store or table"),
+    "import sobolev_batch as sb; sb.same_surface": (86, "a distance, and the files of a failed assertion"),
+    "import sobolev_batch as sb; sb.run": (129, "a study, its store and its cluster"),
+    "import sobolev_batch.cli": (22, "help texts appear before anything computes"),
+    "import sobolev_batch.testing.pytest_plugin": (3, "every session of pytest loads it"),
+}
+
+
+def work_of(call: Callable[[], object]) -> dict[str, int]:
+    """Count NUFFTs, their points, and the terms of exact transforms: pairs of a triangle and a frequency."""
+    # Appending is safe from several threads.
+    events: list[tuple[str, int]] = []
+
+    class Plan(finufft.Plan):  # type: ignore[misc]
+        def setpts(self, *coordinates: Any, **targets: Any) -> Any:
+            self.point_count = len(coordinates[0])
+            return super().setpts(*coordinates, **targets)
+
+        def execute(self, *arguments: Any, **settings: Any) -> Any:
+            events.extend((("transforms", 1), ("points", self.point_count)))
+            return super().execute(*arguments, **settings)
+
+    def counting(exact: Callable[..., Any]) -> Callable[..., Any]:
+        def transform(mesh: sb.Mesh, frequencies: Any) -> Any:
+            events.append(("exact", len(mesh.triangles) * len(frequencies)))
+            return exact(mesh, frequencies)
+
+        return transform
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finufft, "Plan", Plan)
+        for module in (kinds, sampled):
+            patch.setattr(module, "exact_transform", counting(module.exact_transform))
+        call()
+    return {name: sum(count for kind, count in events if kind == name) for name in ("transforms", "points", "exact")}
+
+
+@pytest.mark.parametrize("name", WORK)
+def test_a_call_takes_no_more_work_than_its_row(name: str) -> None:
+    call, *most, reason = WORK[name]
+    if call is second_run:
+        assert work_of(call)["transforms"] == 2
+    work = work_of(call)
+    assert all(count <= limit for count, limit in zip(work.values(), most, strict=True)), (work, most, reason)
+
+
+def test_a_count_sees_each_transform() -> None:
+    # Else all rows would hold of a count that sees nothing.
+    one, two = (work_of(norms(times)) for times in (1, 2))
+    assert min(one.values()) > 0
+    assert two == {name: 2 * count for name, count in one.items()}
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("code", MODULES)
+def test_a_first_use_loads_no_more_modules_than_its_row(code: str) -> None:
+    most, reason = MODULES[code]
+    command = f"{code}; import sys; print(*(name for name in sys.modules if name.split('.')[0] == 'sobolev_batch'))"
+    loaded = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True).stdout.split()
+    assert 0 < len(loaded) <= most, (reason, sorted(loaded))
