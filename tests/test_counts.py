@@ -111,8 +111,8 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
 MODULES = {
     "import sobolev_batch": (1, "names are loaded when they are used"),
     "import sobolev_batch as sb; sb.distance": (75, "surfaces and spectral, and no study, store or table"),
-    "import sobolev_batch as sb; sb.same_surface": (86, "a distance, and the files of a failed assertion"),
-    "import sobolev_batch as sb; sb.run": (129, "a study, its store and its cluster"),
+    "import sobolev_batch as sb; sb.same_surface": (82, "a distance; the files of a failed assertion come later"),
+    "import sobolev_batch as sb; sb.run": (126, "a study, its store and its cluster"),
     "import sobolev_batch.cli": (22, "help texts appear before anything computes"),
     "import sobolev_batch.testing.pytest_plugin": (3, "every session of pytest loads it"),
 }

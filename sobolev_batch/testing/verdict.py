@@ -17,7 +17,6 @@ from sobolev_batch.spectral.shells import single_order
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
-from sobolev_batch.testing.witness import write_difference
 
 Outcome = Literal["same", "different", "undecided"]
 
@@ -201,6 +200,9 @@ def assert_same_surface(
         return verdict
     message = str(verdict)
     if witness is not None:
+        # Files load what reads stores, which a verdict does without.
+        from sobolev_batch.testing.witness import write_difference
+
         try:
             difference = write_difference(surface, reference, Path(witness), order, scaling=scaling)
             message += f"; {difference}"
