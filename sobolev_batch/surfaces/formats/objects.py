@@ -23,42 +23,26 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 
-class TrimeshMesh(Protocol):
-    """A ``trimesh.Trimesh``."""
+class WithVertices(Protocol):
+    """A ``trimesh.Trimesh`` or an ``open3d.geometry.TriangleMesh``."""
 
     vertices: Any
-    faces: Any
 
 
-class TrimeshScene(Protocol):
+class WithPoints(Protocol):
+    """A ``pyvista.PolyData`` or a ``meshio.Mesh``."""
+
+    points: Any
+
+
+class WithParts(Protocol):
     """A ``trimesh.Scene``."""
 
     geometry: Any
     dump: Any
 
 
-class PyvistaMesh(Protocol):
-    """A ``pyvista.PolyData``."""
-
-    points: Any
-    faces: Any
-
-
-class MeshioMesh(Protocol):
-    """A ``meshio.Mesh``."""
-
-    points: Any
-    cells: Any
-
-
-class Open3dMesh(Protocol):
-    """An ``open3d.geometry.TriangleMesh``."""
-
-    vertices: Any
-    triangles: Any
-
-
-class Open3dTensorMesh(Protocol):
+class WithTensors(Protocol):
     """An ``open3d.t.geometry.TriangleMesh``."""
 
     vertex: Any
@@ -67,16 +51,7 @@ class Open3dTensorMesh(Protocol):
 
 # What `as_mesh` makes a mesh of.
 MeshLike = (
-    Mesh
-    | str
-    | os.PathLike[str]
-    | tuple[ArrayLike, ArrayLike]
-    | TrimeshMesh
-    | TrimeshScene
-    | PyvistaMesh
-    | MeshioMesh
-    | Open3dMesh
-    | Open3dTensorMesh
+    Mesh | str | os.PathLike[str] | tuple[ArrayLike, ArrayLike] | WithVertices | WithPoints | WithParts | WithTensors
 )
 SurfaceLike = Surface | MeshLike
 # A further kind has a class in `spectral/quadrature/kinds` too.
