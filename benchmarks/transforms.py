@@ -14,9 +14,8 @@ from benchmarks.paper import Complexes, faster_upsampling, relative_distance, wh
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings
 from sobolev_batch.spectral.exact.triangles import exact_transform
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
 
 ORDER = -10.0

@@ -23,7 +23,6 @@ from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
-from sobolev_batch.spectral.errors.a_priori import choose_settings
 from sobolev_batch.spectral.errors.probe import Probe, draws_for, join, probe_block
 from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.fields import compute_field, field_for
@@ -32,7 +31,7 @@ from sobolev_batch.spectral.octaves.limit import EnergyLimit
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity

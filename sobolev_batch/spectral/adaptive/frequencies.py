@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_of
 from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget, permits_single
 from sobolev_batch.spectral.errors.budget import (
     NormEstimate,
     ReferenceEstimate,
@@ -30,7 +29,7 @@ from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squar
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]

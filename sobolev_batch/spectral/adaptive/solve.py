@@ -17,7 +17,6 @@ from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, S
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.errors.probe import Sample, estimate
 from sobolev_batch.spectral.fields import Field, field_for
@@ -25,7 +24,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]

@@ -18,12 +18,18 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.backends import CPU, Backend
-from sobolev_batch.spectral.exact.sampled import sampled_transform
 from sobolev_batch.spectral.exact.spheres import sphere_block, sphere_transform
-from sobolev_batch.spectral.exact.triangles import exact_transform
+from sobolev_batch.spectral.exact.triangles import exact_transform, sampled_transform
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
-from sobolev_batch.spectral.quadrature.meshes import AUTO, Faces, Quadrature, RuleAssignment, WeightedPoints
-from sobolev_batch.spectral.quadrature.prediction import loosest_tolerance, weight_masses
+from sobolev_batch.spectral.quadrature.meshes import (
+    AUTO,
+    Faces,
+    Quadrature,
+    RuleAssignment,
+    WeightedPoints,
+    loosest_tolerance,
+    weight_masses,
+)
 from sobolev_batch.spectral.quadrature.smooth import Resolution, exact_values, resolution_of
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.sphere import Sphere

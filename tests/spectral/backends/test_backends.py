@@ -18,12 +18,11 @@ from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fouri
 from sobolev_batch.spectral.backends import backends, cuda
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import Transformed, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 from tests.support.repository import PACKAGE, imported

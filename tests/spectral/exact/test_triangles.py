@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Mesh
-from sobolev_batch.spectral.exact.triangles import doubled_areas, exact_transform
+from sobolev_batch import Mesh, icosphere
+from sobolev_batch.spectral.exact.triangles import doubled_areas, exact_transform, sampled_transform
+from tests.support.shapes import box, tetrahedron
 
 Reals = NDArray[np.float64]
 
@@ -123,3 +124,22 @@ def test_sums_over_triangles_and_is_conjugate_at_opposite_frequencies() -> None:
     parts = sum(exact_transform(Mesh(vertices, triangles[i : i + 1]), frequencies) for i in range(20))
     assert np.allclose(whole, parts, rtol=0, atol=1e-13)
     assert np.allclose(exact_transform(Mesh(vertices, triangles), -frequencies), whole.conj(), rtol=0, atol=1e-13)
+
+
+SLIVER = Mesh(np.array([(0, 0, 0), (1, 0, 0), (0.5, 1e-6, 0), (0.3, 0.2, 0.7)]), [[0, 1, 2], [0, 1, 3]])
+
+
+@pytest.mark.parametrize("mesh", [box(), tetrahedron(), icosphere(3), SLIVER], ids=["box", "corner", "T_3", "sliver"])
+@pytest.mark.parametrize("length", [0.0, 0.01, 1.0, 30.0, 1000.0])
+def test_the_faster_closed_form_agrees(mesh: Mesh, length: float) -> None:
+    directions = np.random.default_rng(1).normal(size=(40, 3))
+    # Along axes and diagonals, edges and whole faces have a single phase.
+    special = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1], [1, -1, 0], [1e-9, 0, 1]])
+    directions = np.concatenate([directions, special])
+    frequencies = length * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    expected = exact_transform(mesh, frequencies)
+    assert np.abs(sampled_transform(mesh, frequencies) - expected).max() <= 1e-9 * mesh.area
+
+
+def test_no_frequencies_have_no_values() -> None:
+    assert sampled_transform(box(), np.zeros((0, 3))).shape == (0,)

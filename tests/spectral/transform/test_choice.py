@@ -9,11 +9,10 @@ import pytest
 import trimesh
 
 from sobolev_batch import Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.errors.a_priori import ErrorTarget, choose_settings, permits_single
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.quadrature.prediction import SizeHistogram
+from sobolev_batch.spectral.quadrature.meshes import SizeHistogram
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget, TransformSettings, choose_settings, permits_single
 from sobolev_batch.spectral.transform.transform import transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
 
