@@ -11,7 +11,7 @@ from typing import NoReturn
 import click
 
 # Importing these modules adds their commands to the group.
-from sobolev_batch.cli import fitting, league, meshes, stores, studies  # noqa: F401
+from sobolev_batch.cli import meshes, stores, studies  # noqa: F401
 from sobolev_batch.cli.group import EXIT_INPUT, EXIT_OTHER, cli
 from sobolev_batch.cli.interruption import (
     SECONDS_TO_END,

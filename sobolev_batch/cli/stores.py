@@ -1,4 +1,4 @@
-"""Commands that read a store: status, verify, release, table, plot, witness, report."""
+"""Commands that read a store: status, verify, release, table, plot, witness, report, league."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sobolev_batch.cli.options import (
     folder_option,
     format_option,
     fraction_of_norm,
+    location,
     meshes_option,
     orders_option,
     output_option,
     store_argument,
     up_option,
 )
-from sobolev_batch.cli.output import echo, echo_lines, progress_bar
-from sobolev_batch.cli.reporter import ProgressLine
+from sobolev_batch.cli.output import ProgressLine, echo, echo_lines, progress_bar
 from sobolev_batch.errors import SobolevBatchError, StoreError
 from sobolev_batch.results.tables.formatting import Format
 
@@ -361,3 +361,31 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     echo(written.path)
     for omission in written.omissions:
         echo(f"left out: {omission}", err=True)
+
+
+@cli.command("league")
+@store_argument
+@format_option
+@orders_option("Compare at this order.", "all of the stores")
+@click.option("--x", default="triangles", show_default=True, help="Compare methods at equal values of this size.")
+@click.option("--method", "methods", multiple=True, help="Compare this method; may be repeated. [default: all]")
+@click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
+def league_command(
+    store: Location,
+    style: Format,
+    orders: tuple[float, ...],
+    x: str,
+    methods: tuple[str, ...],
+    against: Location | None,
+) -> None:
+    """Rank the methods of a collection's STORE over its objects.
+
+    With --against, compare each method with itself in an earlier study instead.
+    """
+    from sobolev_batch.results.league.league import compare_studies, league
+    from sobolev_batch.results.league.text import format_changes, format_league
+
+    if against is not None:
+        echo_lines(format_changes(compare_studies(store, against, orders or None), style))
+    else:
+        echo_lines(format_league(league(store, orders or None, x=x, methods=methods or None), style))

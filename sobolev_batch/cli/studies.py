@@ -20,7 +20,7 @@ from sobolev_batch.cli.options import (
     study_argument,
     trust_option,
 )
-from sobolev_batch.cli.output import echo, echo_lines
+from sobolev_batch.cli.output import Reporter, echo, echo_lines
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -97,7 +97,6 @@ def run_command(
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
     from sobolev_batch.batch.study.study import Study
-    from sobolev_batch.cli.reporter import Reporter
     from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
 

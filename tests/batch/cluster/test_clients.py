@@ -145,9 +145,9 @@ if __name__ == "__main__":
 COMMAND = """
 import sys
 from sobolev_batch import cli
-from sobolev_batch.cli import reporter
+from sobolev_batch.cli import studies
 
-class Pausing(reporter.Reporter):
+class Pausing(studies.Reporter):
     def __call__(self, progress):
         super().__call__(progress)
         if progress.stage == "fields" and progress.done == 1:
@@ -155,7 +155,7 @@ class Pausing(reporter.Reporter):
             sys.stdin.readline()
 
 if __name__ == "__main__":
-    reporter.Reporter = Pausing
+    studies.Reporter = Pausing
     sys.argv[1:] = ["run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
     cli.main()
 """
