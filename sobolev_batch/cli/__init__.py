@@ -36,7 +36,7 @@ def main() -> None:
     """Run the command line; the process ends with its exit status."""
     debug = "--debug" in sys.argv
     command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
-    # A job at its time limit is asked to end, too, and has time to give up its lock of a store.
+    # A job at its time limit is also asked to end, and has time to give up its lock of a store.
     deadline = Deadline(_REMARKS.get(command, ""), _SECONDS_WITH_LOCK.get(command, SECONDS_TO_END))
     deadline.start()
     make_messages_visible()

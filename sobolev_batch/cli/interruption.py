@@ -34,7 +34,7 @@ class Deadline:
         seconds: Time to clean up.
 
     Attributes:
-        request: Number of the signal that asks for the end; 0 before.
+        request: Number of the signal that requests the end; 0 before.
     """
 
     _current: ClassVar[Deadline | None] = None

@@ -34,7 +34,7 @@ _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
 _KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling"}
 
-# Of compare, which takes the nearest that can be had where nobody asks for more.
+# Default of compare, which then takes the nearest attainable accuracy.
 _DEFAULT_RTOL = 1e-2
 # In radii of the target; distances have about as many digits.
 _MOST_ROUNDING = 1e-6
@@ -52,8 +52,10 @@ _below_option = click.option(
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
 @orders_option("Print the distance of this order, which may be any below -1/2.", "-2")
-@click.option("--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest to be had]")
-@memory_option("Let a transform for --rtol take so much memory. [default: 2GB]")
+@click.option(
+    "--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest attainable]"
+)
+@memory_option("Limit the memory of a transform for --rtol. [default: 2GB]")
 @best_effort_option
 @click.option(
     "--xi-max",
@@ -64,15 +66,16 @@ _below_option = click.option(
     "--M",
     "intervals",
     type=int,
-    help="Divide each axis of the lattice into so many intervals, in place of --rtol. [default: 64 with --xi-max]",
+    metavar="M",
+    help="Divide each axis of the lattice into M intervals, in place of --rtol. [default: 64 with --xi-max]",
 )
 @click.option(
     "--yardsticks",
     "with_yardsticks",
     is_flag=True,
-    help="Print which move, noise and decimation bring B as far from itself, too. It takes several times as long.",
+    help="Print which move, noise and decimation bring B as far from itself.",
 )
-@click.option("--proximity", "with_proximity", is_flag=True, help="Print Hausdorff and Chamfer distances, too.")
+@click.option("--proximity", "with_proximity", is_flag=True, help="Also print Hausdorff and Chamfer distances.")
 @click.option(
     "--witness",
     "witness_path",
@@ -188,7 +191,7 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
     """Print one line on whether two files hold the same surface, and return the exit status.
 
     Raises:
-        click.UsageError: Other options ask for numbers, or there are several orders.
+        click.UsageError: Other options request numbers, or there are several orders.
     """
     from sobolev_batch.testing.verdict import same_surface
 
@@ -230,21 +233,25 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
     help="Lower the distance of this order.",
 )
 @click.option(
-    "--steps", type=int, default=DEFAULT_STEPS, show_default=True, help="Take so many steps at most."
+    "--steps",
+    type=int,
+    default=DEFAULT_STEPS,
+    metavar="N",
+    show_default=True,
+    help="Take N steps at most.",
 )
 @click.option(
     "--smoothing",
     type=float,
     default=DEFAULT_SMOOTHING,
     show_default=True,
-    help="Make steps so smooth. Smoother ones keep triangles and worst points better, but lower the distance less. "
-    "A far START takes at least 4.",
+    help="Smooth the steps: more keeps triangles better, less lowers the distance more. A far START takes at least 4.",
 )
 @click.option(
     *("--refine-to", "triangles"),
     type=int,
-    metavar="TRIANGLES",
-    help="Split edges, too, until there are so many triangles: those where that lowers the distance most.",
+    metavar="N",
+    help="Also split the edges that lower the distance most, until there are N triangles.",
 )
 @click.option("--keep-boundary", is_flag=True, help="Leave vertices of open boundaries where they are.")
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise TARGET is scaled to the unit sphere.")

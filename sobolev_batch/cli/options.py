@@ -89,7 +89,7 @@ study_argument = click.argument("study", type=click.Path(path_type=Path))
 best_effort_option = click.option(
     "--best-effort",
     is_flag=True,
-    help="Compute the nearest accuracy that can be had where the one asked for is out of reach. Mark what falls short.",
+    help="Take the nearest attainable accuracy where the requested one is out of reach, and mark it.",
 )
 give_up_option = click.option(
     "--give-up-after",

@@ -87,8 +87,8 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 def verify_command(context: click.Context, store: Location) -> None:
     """Check all data of STORE against its checksums.
 
-    Of a collection, all objects are checked. Damaged data are named. If STORE can be written, they are also removed,
-    and `run` computes them again. The exit status is 1 if anything is damaged.
+    All objects of a collection are checked. Damaged data are listed and, if STORE can be written, removed; `run`
+    computes them again. The exit status is 1 if anything is damaged.
     """
     from sobolev_batch.batch.verify import verify
 
@@ -96,7 +96,7 @@ def verify_command(context: click.Context, store: Location) -> None:
 
         def show(done: int, total: int) -> None:
             if done == 1:
-                # Of the next object of a collection, too.
+                # The next object of a collection adds its own.
                 bar.length = (bar.length or 0) + total
             bar.update(1)
 
@@ -173,12 +173,12 @@ def table_command(
     truth: str | None,
     factor: float | None,
 ) -> None:
-    """Print the tables or distance matrices of STORE. Of a collection, print the tables of all objects.
+    """Print the tables or distance matrices of STORE. A collection has those of all its objects.
 
     Orders that the study lacks are computed from its stored fields. The table says what they rest on.
     """
     if matrix + over_time + (below is not None) > 1:
-        raise click.UsageError("--matrix, --over-time and --below are different tables: ask for one of them")
+        raise click.UsageError("--matrix, --over-time and --below are different tables: choose one")
     for name, is_given in (("--truth", truth is not None), ("--factor", factor is not None)):
         if is_given and not over_time:
             raise click.UsageError(f"{name} belongs to --over-time")
@@ -247,7 +247,7 @@ def plot_command(
 ) -> None:
     """Draw the results of STORE as pictures.
 
-    They show convergence, transforms, distances and spectra, and some of the meshes. Of a collection, they show the
+    They show convergence, transforms, distances and spectra, and some of the meshes. Those of a collection show its
     league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-# Lines about distances that are less accurate than asked for.
+# Lines about distances that are less accurate than requested.
 _MOST_IMPRECISE = 10
 
 
@@ -62,9 +62,12 @@ def init_command(folder: Path, output: Path) -> None:
 )
 @trust_option
 @click.option(
-    "--workers", type=click.IntRange(min=1), help="Start so many processes on this machine. [default: one per core]"
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Start N processes on this machine. [default: one per core]",
 )
-@memory_option("Give each process so much memory, such as 4GB. [default: equal parts]")
+@memory_option("Limit the memory of each process, such as 4GB. [default: equal parts]")
 @best_effort_option
 @click.option(
     "--reuse",
@@ -92,7 +95,7 @@ def run_command(
     Ctrl-C and SIGTERM end it. The same command continues from the store. A study with several objects gets a store for
     each of them, and its league is printed.
 
-    The exit status is 3 if a mesh failed, or if a distance is less accurate than the study asks for.
+    The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
