@@ -14,7 +14,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral.exact import sampled
+from sobolev_batch.spectral.exact import triangles
 from sobolev_batch.spectral.quadrature import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
@@ -141,7 +141,7 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finufft, "Plan", Plan)
-        for module in (kinds, sampled):
+        for module in (kinds, triangles):
             patch.setattr(module, "exact_transform", counting(module.exact_transform))
         call()
     return {name: sum(count for kind, count in events if kind == name) for name in ("transforms", "points", "exact")}
