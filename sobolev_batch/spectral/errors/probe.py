@@ -204,7 +204,7 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
         orders: Orders s.
         degree: Lowest degree of the triangle rules in use.
     """
-    terms = max(kind_of(surface).term_count for surface in surfaces)
+    terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
     return draw(lattice, orders, degree, draw_count(terms), seed)
 
@@ -226,7 +226,7 @@ def probe_block(
     if not needs_probe(surface, settings):
         return Probe()
     if draws is None:
-        draws = draws_for([surface], lattice, orders, settings.lowest_degree(surface, lattice))
+        draws = draws_for([surface], lattice, orders, settings.plan(surface, lattice).lowest_degree)
     draws = draws.within(block)
     probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws).exact)
     change = settings.plan(surface, lattice).change

@@ -8,9 +8,8 @@ from typing import Self
 
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
-from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 # Seconds for a quadrature point, for a sample of a lattice's block, and for a pair of a triangle and a frequency.
 _POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8
@@ -37,8 +36,8 @@ class SurfaceSize:
     @classmethod
     def from_surface(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
-        triangles = len(surface.triangles) if isinstance(surface, Mesh) else 0
-        return cls(triangles, surface.area, not isinstance(surface, Mesh | Smooth))
+        kind = kind_of(surface)
+        return cls(kind.triangles, surface.area, kind.is_closed_form)
 
     @property
     def draw_seconds(self) -> float:

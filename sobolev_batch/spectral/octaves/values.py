@@ -150,7 +150,7 @@ def octave_values(
 def check_count(surface: Surface) -> int:
     """Return the number of comparisons on each lattice: fewer where each costs more; none for closed forms."""
     kind = kind_of(surface)
-    return 0 if kind.is_closed_form else int(np.clip(_PAIRS // kind.term_count, _FEWEST_CHECKS, _MOST_CHECKS))
+    return 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
 
 
 def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:

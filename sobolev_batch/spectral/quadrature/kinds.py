@@ -6,12 +6,12 @@ A further kind of surface is one more class here.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,37 +35,71 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.smooth.smooth import Smooth
 
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
 # Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
 _NODES = 1 << 14
 # The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of the
 # degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that showed most of it.
 _SMOOTH_DEGREE = 16
+# A parametrised surface has at least so many nodes.
+_FEWEST_NODES = 500
 
 
-class PointCount(NamedTuple):
-    """Number of points: the expected one, and a bound before shared points are merged."""
+@dataclass(frozen=True, eq=False)
+class SurfaceKind(ABC):
+    """A surface as transforms see it: exact values anywhere, and points that stand for it up to a frequency.
 
-    expected: float
-    largest: int
+    `kind_of` makes it for exact values, and `plan` for points. These are chosen when first needed, and made batch by
+    batch.
 
+    Attributes:
+        surface: Surface in units of length.
+        highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
+        tolerance: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
+            surfaces observe it.
+        quadrature: Method to choose the rules of triangles.
+    """
 
-class QuadraturePlan(ABC):
-    """Points that stand for a surface up to a frequency: chosen when first asked for, made batch by batch."""
+    surface: Any
+    highest_frequency: float = 0.0
+    tolerance: float = 0.0
+    quadrature: Quadrature = AUTO
+
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> Self:
+        """Return the surface with points up to a frequency; see the attributes."""
+        return replace(self, highest_frequency=highest_frequency, tolerance=tolerance, quadrature=quadrature)
 
     @property
-    @abstractmethod
-    def size(self) -> PointCount:
-        """Number of points."""
-
-    @property
-    @abstractmethod
-    def lowest_degree(self) -> int:
-        """Lowest degree among the rules, whose error shows first; 0 for a closed form."""
+    def is_closed_form(self) -> bool:
+        """True if the transform is a formula at every frequency."""
+        return False
 
     @property
     def triangles(self) -> int:
         """Number of triangles."""
         return 0
+
+    @property
+    def fewest_points(self) -> int:
+        """Number of quadrature points at least, among which the errors of a NUFFT spread."""
+        return 1
+
+    @property
+    @abstractmethod
+    def expected_points(self) -> float:
+        """Expected number of points."""
+
+    @property
+    @abstractmethod
+    def largest_points(self) -> int:
+        """Bound on the number of points, before shared ones are merged."""
+
+    @property
+    @abstractmethod
+    def lowest_degree(self) -> int:
+        """Lowest degree among the rules, whose error shows first; 0 for a closed form."""
 
     @property
     def change(self) -> float:
@@ -84,43 +118,48 @@ class QuadraturePlan(ABC):
             InputError: A parametrised surface whose quadrature does not converge.
         """
 
+    @abstractmethod
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        """Return the exact transform at frequencies (P, 3), complex128 (P,)."""
 
-class _ClosedFormPlan(QuadraturePlan):
-    """Plan of a surface whose transform has a closed form: no points."""
+    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
+        """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
+        return self.exact_values(frequencies)
 
-    size = PointCount(0.0, 0)
-    lowest_degree = 0
+    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
+        """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
+        raise TypeError(f"{type(self).__name__} has no closed form")
 
-    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
-        yield from ()
+    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
+        """Return the largest tolerance of points whose error is predicted to have at most some norms (orders,)."""
+        raise TypeError(f"{type(self).__name__} has no quadrature")
 
 
-@dataclass(frozen=True, eq=False)
-class _MeshPlan(QuadraturePlan):
-    """Plan of a mesh, which holds two bytes for each triangle."""
-
-    mesh: Mesh
-    highest_frequency: float
-    tolerance: float
-    quadrature: Quadrature
-
+class _Triangles(SurfaceKind):
     @cached_property
     def assignment(self) -> RuleAssignment:
-        """Rules of the triangles."""
-        return RuleAssignment.for_mesh(self.mesh, self.highest_frequency, self.tolerance, self.quadrature)
+        """Rules of the triangles, which take two bytes for each."""
+        return RuleAssignment.for_mesh(self.surface, self.highest_frequency, self.tolerance, self.quadrature)
 
     @property
-    def size(self) -> PointCount:
-        uses = self.assignment.uses
-        return PointCount(sum((use.expected_points for use in uses), 0.0), sum(use.largest_points for use in uses))
+    def triangles(self) -> int:
+        return len(self.surface.triangles)
+
+    @property
+    def fewest_points(self) -> int:
+        return self.triangles
+
+    @property
+    def expected_points(self) -> float:
+        return sum((use.expected_points for use in self.assignment.uses), 0.0)
+
+    @property
+    def largest_points(self) -> int:
+        return sum(use.largest_points for use in self.assignment.uses)
 
     @property
     def lowest_degree(self) -> int:
         return min(use.rule.degree for use in self.assignment.uses)
-
-    @property
-    def triangles(self) -> int:
-        return len(self.mesh.triangles)
 
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         # Nodes are merged within a batch of triangles: these are large where nodes are shared.
@@ -135,19 +174,22 @@ class _MeshPlan(QuadraturePlan):
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
         # number by at most one batch of triangles.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
-        faces = Faces.uploaded(self.mesh, backend)
+        faces = Faces.uploaded(self.surface, backend)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
             yield WeightedPoints.concatenated([batch.points(faces, backend) for _, batch in group])
 
+    def exact_values(self, frequencies: Reals) -> Complexes:
+        return exact_transform(self.surface, frequencies)
 
-@dataclass(frozen=True, eq=False)
-class _SmoothPlan(QuadraturePlan):
-    """Plan of a parametrised surface."""
+    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
+        return sampled_transform(self.surface, frequencies, threads)
 
-    surface: Smooth
-    highest_frequency: float
-    tolerance: float
+    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
+        return loosest_tolerance(self.surface, lattice, orders, norms)
 
+
+class _Parametrised(SurfaceKind):
+    fewest_points = _FEWEST_NODES
     lowest_degree = _SMOOTH_DEGREE
 
     @property
@@ -156,8 +198,12 @@ class _SmoothPlan(QuadraturePlan):
         return resolution_of(self.surface, self.highest_frequency, self.tolerance)
 
     @property
-    def size(self) -> PointCount:
-        return PointCount(float(self.resolution.size), self.resolution.size)
+    def expected_points(self) -> float:
+        return float(self.resolution.size)
+
+    @property
+    def largest_points(self) -> int:
+        return self.resolution.size
 
     @property
     def change(self) -> float:
@@ -174,96 +220,6 @@ class _SmoothPlan(QuadraturePlan):
             count += len(weights)
         yield WeightedPoints.concatenated(gathered)
 
-
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
-
-# A parametrised surface has at least so many nodes.
-_FEWEST_NODES = 500
-
-
-class SurfaceKind(ABC):
-    """A surface as transforms see it; `kind_of` makes it."""
-
-    @property
-    def is_closed_form(self) -> bool:
-        """True if the transform is a formula at every frequency."""
-        return False
-
-    @property
-    def term_count(self) -> int:
-        """Number of terms that an exact value adds up, where they grow with the surface; else 1."""
-        return 1
-
-    @property
-    def fewest_points(self) -> int:
-        """Number of quadrature points at least, among which the errors of a NUFFT spread."""
-        return 1
-
-    @abstractmethod
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
-        """Return the plan of the quadrature points.
-
-        Args:
-            highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
-            tolerance: Largest quadrature error at any such frequency, relative to the area. Only "auto" and
-                parametrised surfaces observe it.
-            quadrature: Method to choose the rules of triangles.
-        """
-
-    @abstractmethod
-    def exact_values(self, frequencies: Reals) -> Complexes:
-        """Return the exact transform at frequencies (P, 3), complex128 (P,)."""
-
-    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
-        """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
-        return self.exact_values(frequencies)
-
-    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
-        raise TypeError(f"{type(self).__name__} has no closed form")
-
-    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
-        """Return the largest tolerance of a plan whose error is predicted to have at most some norms (orders,)."""
-        raise TypeError(f"{type(self).__name__} has no quadrature")
-
-
-@dataclass(frozen=True, eq=False)
-class _Triangles(SurfaceKind):
-    mesh: Mesh
-
-    @property
-    def term_count(self) -> int:
-        return len(self.mesh.triangles)
-
-    @property
-    def fewest_points(self) -> int:
-        return len(self.mesh.triangles)
-
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
-        return _MeshPlan(self.mesh, highest_frequency, tolerance, quadrature)
-
-    def exact_values(self, frequencies: Reals) -> Complexes:
-        return exact_transform(self.mesh, frequencies)
-
-    def sampled_values(self, frequencies: Reals, threads: int) -> Complexes:
-        return sampled_transform(self.mesh, frequencies, threads)
-
-    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
-        return loosest_tolerance(self.mesh, lattice, orders, norms)
-
-
-@dataclass(frozen=True, eq=False)
-class _Parametrised(SurfaceKind):
-    surface: Smooth
-
-    @property
-    def fewest_points(self) -> int:
-        return _FEWEST_NODES
-
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
-        return _SmoothPlan(self.surface, highest_frequency, tolerance)
-
     def exact_values(self, frequencies: Reals) -> Complexes:
         return exact_values(self.surface, frequencies)
 
@@ -272,25 +228,21 @@ class _Parametrised(SurfaceKind):
         return float(np.min(norms / (self.surface.area * np.sqrt(weight_masses(lattice, orders)))))
 
 
-@dataclass(frozen=True, eq=False)
 class _ClosedForm(SurfaceKind):
-    sphere: Sphere
+    is_closed_form = True
+    expected_points, largest_points, lowest_degree = 0.0, 0, 0
 
-    @property
-    def is_closed_form(self) -> bool:
-        return True
-
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> QuadraturePlan:
-        return _ClosedFormPlan()
+    def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
+        yield from ()
 
     def exact_values(self, frequencies: Reals) -> Complexes:
-        return sphere_transform(self.sphere, frequencies)
+        return sphere_transform(self.surface, frequencies)
 
     def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        return sphere_block(self.sphere, lattice, block)
+        return sphere_block(self.surface, lattice, block)
 
 
-_KINDS: Mapping[type, Callable[[Any], SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}
+_KINDS: Mapping[type, type[SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}
 
 
 def kind_of(surface: object) -> SurfaceKind:

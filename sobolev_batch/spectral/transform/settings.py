@@ -18,7 +18,7 @@ from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, Backend
 from sobolev_batch.spectral.lattice import FrequencyLattice
-from sobolev_batch.spectral.quadrature.kinds import QuadraturePlan, kind_of
+from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature, weight_masses
 from sobolev_batch.spectral.transform.memory import DEFAULT_BATCH
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -69,13 +69,9 @@ class TransformSettings:
         object.__setattr__(self, "quadrature", quadrature)
         object.__setattr__(self, "tolerance", eps if tolerance is None else tolerance)
 
-    def plan(self, surface: Surface, lattice: FrequencyLattice) -> QuadraturePlan:
-        """Return the quadrature plan of a surface for a lattice."""
+    def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
+        """Return a surface with quadrature points for a lattice."""
         return kind_of(surface).plan(lattice.highest_frequency, self.tolerance, self.quadrature)
-
-    def lowest_degree(self, surface: Surface, lattice: FrequencyLattice) -> int:
-        """Return the lowest degree among the rules of a surface: see `QuadraturePlan.lowest_degree`."""
-        return self.plan(surface, lattice).lowest_degree
 
 
 def thread_count(threads: int | None) -> int:

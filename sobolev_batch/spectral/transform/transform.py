@@ -15,7 +15,7 @@ from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
 from sobolev_batch.spectral.backends.backends import CPU, CPU_COSTS, Backend, Gpu, NufftSpec
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
-from sobolev_batch.spectral.quadrature.kinds import QuadraturePlan, SurfaceKind, kind_of
+from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
@@ -59,7 +59,7 @@ def transform_block(
     block: Block,
     settings: TransformSettings,
     execution: Execution = ON_CPU,
-    plan: QuadraturePlan | None = None,
+    plan: SurfaceKind | None = None,
 ) -> Transformed:
     """Return the transform of a surface on one block of the lattice.
 
@@ -128,7 +128,7 @@ class _QuadratureTransform:
         fill: Fraction of the lattice's period that the surface's bounding box fills, by volume.
     """
 
-    plan: QuadraturePlan
+    plan: SurfaceKind
     lattice: FrequencyLattice
     block: Block
     settings: TransformSettings
@@ -151,8 +151,7 @@ class _QuadratureTransform:
         workload = Workload(triangles=self.plan.triangles, fill=self.fill)
         if self.whole.projected_bytes(workload, backend.costs) > allowed_bytes:
             # Only now do the points need counting.
-            size = self.plan.size
-            workload = replace(workload, points=size.expected, largest_points=size.largest)
+            workload = replace(workload, points=self.plan.expected_points, largest_points=self.plan.largest_points)
         batching = fastest_batching(self.whole, workload, backend.costs, allowed_bytes)
         return batching, batching.projected_bytes(workload, backend.costs)
 
@@ -283,4 +282,4 @@ def _points_of_triangle(area: float, lattice: Lattice, settings: TransformSettin
     sphere = icosphere(_STAND_IN_LEVEL)
     count = len(sphere.triangles)
     alike = Similarity(math.sqrt(area * count / sphere.area)).apply(sphere)
-    return settings.plan(alike, lattice).size.expected / count
+    return settings.plan(alike, lattice).expected_points / count

@@ -58,13 +58,14 @@ def test_small_triangles_get_few_points() -> None:
 def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
     plan = kind_of(surface).plan(8.66, 1e-2, Quadrature(method))
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
-    assert plan.size.expected == pytest.approx(count, rel=0.05)
-    assert count <= plan.size.largest
+    assert plan.expected_points == pytest.approx(count, rel=0.05)
+    assert count <= plan.largest_points
 
 
 def test_a_closed_form_has_no_points() -> None:
     plan = kind_of(Sphere()).plan(8.66, 1e-9)
-    assert (plan.size, plan.lowest_degree, list(plan.batches(1 << 20))) == ((0.0, 0), 0, [])
+    assert (plan.expected_points, plan.largest_points, plan.lowest_degree) == (0.0, 0, 0)
+    assert not list(plan.batches(1 << 20))
 
 
 def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> None:

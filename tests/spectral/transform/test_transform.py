@@ -164,7 +164,7 @@ from sobolev_batch.spectral.transform.transform import projected_bytes, transfor
 
 mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
 mesh.areas, mesh.centroid_radii, mesh.bounds
-settings.lowest_degree(mesh, lattice)
+settings.plan(mesh, lattice).lowest_degree
 unit = 1 if sys.platform == "darwin" else 1024
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 values = transform_block(mesh, lattice, lattice.half, settings, Execution(allowed_bytes={memory})).values
