@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from glob import has_magic
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -13,17 +14,16 @@ from pydantic import AfterValidator, ValidationError
 from sobolev_batch.batch.study.refusals import joined, refusals
 from sobolev_batch.batch.study.schema import Name, Section, read_toml, require_modest, without_frames
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, ObjectTemplate, filled, holds, names_of
+from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, as_written, filled, holds, names_of
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.surfaces.sources.files import ListedMesh, checked_list, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.files import checked_list, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 
 _MOST_OBJECTS = 1000
 
 
 def _plain_name(name: str) -> str:
-    found = next((character for character in name if character in RESERVED), None)
-    if found is not None or name.startswith((".", "__")) or name.endswith(".json"):
+    if any(character in RESERVED for character in name) or name.startswith((".", "__")) or name.endswith(".json"):
         raise ValueError(
             f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
             "begin with . or __, and does not end with .json"
@@ -119,28 +119,33 @@ class StudyCollection:
         require_modest(table)
         _require_sections(table)
         common = {key: value for key, value in table.items() if key not in ("object", "objects")}
-        listed = _Listed.from_section(table.get("objects"), folder)
+        listed = _listed_meshes(table.get("objects"), folder)
+        named = list(dict.fromkeys(name for name, _ in listed))
         objects = _named_objects(table["object"]) if "object" in table else []
-        unnamed = [name for name in listed.objects if objects and name not in {one.name for one in objects}]
+        unnamed = [name for name in named if objects and name not in {section.name for section in objects}]
         if unnamed:
             raise StudyError(
                 f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or "
                 "give all of them sections"
             )
-        objects = objects or _plain_objects(listed.objects or _found(common, folder))
-        same = duplicate_names(one.name for one in objects)
+        if not objects:
+            plain = {f"object {quoted(name)}": {"name": name} for name in named or _names_in_reference(common, folder)}
+            objects = _object_sections(plain)
+        same = duplicate_names(section.name for section in objects)
         if same:
             raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
-        studies, lacking = {}, {}
-        for one in objects:
-            # Their files match the templates of this object, too.
-            longer = [other.name for other in objects if one.name in other.name and other.name != one.name]
-            part = _Part(common, one, longer, listed, folder)
+        studies: dict[str, Study] = {}
+        for section in objects:
+            own = {method: meshes for (name, method), meshes in listed.items() if name == section.name}
+            # Files of objects with longer names match the templates of this object, too.
+            longer = [other.name for other in objects if section.name in other.name and other.name != section.name]
             try:
-                studies[one.name] = Study.from_table(part.table(), folder=folder)
+                table_of_object = _Part(section, common, own, longer, folder).table()
+                studies[section.name] = Study.from_table(table_of_object, folder=folder)
             except StudyError as error:
-                raise StudyError(f"object {quoted(one.name)}: {error}") from error
+                raise StudyError(f"object {quoted(section.name)}: {error}") from error
         methods = dict.fromkeys(family.name for study in studies.values() for family in study.families)
+        lacking: dict[str, tuple[str, ...]] = {}
         for name, study in studies.items():
             missing = methods.keys() - {family.name for family in study.families}
             if missing:
@@ -175,66 +180,33 @@ def read_study(path: str | Path) -> Study | StudyCollection:
     return kind.from_toml(path)
 
 
-@dataclass(frozen=True)
-class _Listed:
-    """Meshes of a list with the columns object and method.
-
-    Attributes:
-        meshes: Meshes by object and method.
-    """
-
-    meshes: Mapping[tuple[str, str], Sequence[ListedMesh]]
-
-    @classmethod
-    def from_section(cls, section: Any, folder: Path) -> Self:
-        """Return the meshes of the section [objects]."""
-        if section is None:
-            return cls({})
-        try:
-            given = checked_list(_ObjectsSection.model_validate(section).meshes)
-        except ValidationError as error:
-            values = section if isinstance(section, dict) else {}
-            raise StudyError(joined(refusals(error, values, _ObjectsSection, "[objects]"))) from error
-        except ValueError as error:
-            raise StudyError(f"[objects]: meshes {error}") from error
-        base = Path()
-        if isinstance(given, str):
-            base, given = Path(given).parent, read_mesh_list(folder / given)
-        meshes: dict[tuple[str, str], list[ListedMesh]] = {}
-        for mesh in given or ():
-            known = dict(mesh.metadata)
-            names = [known.pop(key, None) for key in ("object", "method")]
-            if None in names:
-                column = ("object", "method")[names.index(None)]
+def _listed_meshes(section: Any, folder: Path) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Return the meshes of the section [objects], as entries of a family, by object and method."""
+    if section is None:
+        return {}
+    try:
+        given = checked_list(_ObjectsSection.model_validate(section).meshes)
+    except ValidationError as error:
+        values = section if isinstance(section, dict) else {}
+        raise StudyError(joined(refusals(error, values, _ObjectsSection, "[objects]"))) from error
+    except ValueError as error:
+        raise StudyError(f"[objects]: meshes {error}") from error
+    base = Path()
+    if isinstance(given, str):
+        base, given = Path(given).parent, read_mesh_list(folder / given)
+    meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for mesh in given or ():
+        known: dict[str, Any] = dict(mesh.metadata)
+        names: list[str] = []
+        for column in ("object", "method"):
+            if column not in known:
                 raise StudyError(f"[objects]: meshes: {quoted(mesh.path)} has no {column}; each mesh needs both")
-            path = (base / mesh.path).as_posix()
-            rest = ListedMesh(path, mesh.name, mesh.time, tuple(known.items()))
-            of_object, method = (number_as_text(name) if isinstance(name, float) else str(name) for name in names)
-            meshes.setdefault((of_object, method), []).append(rest)
-        return cls(meshes)
-
-    @property
-    def objects(self) -> list[str]:
-        """Names of the objects, as the list has them."""
-        return list(dict.fromkeys(name for name, _ in self.meshes))
-
-    def reference(self, name: str) -> dict[str, Any] | None:
-        """Return the reference of an object, if the list has one."""
-        found = [
-            mesh
-            for (one, method), meshes in self.meshes.items()
-            for mesh in meshes
-            if one == name and caseless_key(method) == REFERENCE_LABEL
-        ]
-        return {"source": "files", "paths": [mesh.path for mesh in found]} if found else None
-
-    def families(self, name: str) -> list[dict[str, Any]]:
-        """Return the families of an object."""
-        return [
-            {"name": method, "source": "files", "meshes": [_as_table(mesh) for mesh in meshes]}
-            for (one, method), meshes in self.meshes.items()
-            if one == name and caseless_key(method) != REFERENCE_LABEL
-        ]
+            name = known.pop(column)
+            names.append(number_as_text(name) if isinstance(name, float) else str(name))
+        own = {"path": (base / mesh.path).as_posix(), "name": mesh.name, "time": mesh.time, **known}
+        entry = {key: value for key, value in own.items() if value is not None}
+        meshes.setdefault((names[0], names[1]), []).append(entry)
+    return meshes
 
 
 @dataclass(frozen=True)
@@ -242,53 +214,96 @@ class _Part:
     """The study of one object of a collection.
 
     Attributes:
+        section: Section of the object.
         common: Sections that all objects share.
-        object: Section of the object.
-        longer: Names of other objects that hold the name of this one.
-        listed: Meshes that a list gives.
-        folder: Folder in which relative paths start.
+        listed: Its meshes in a list, by method.
+        longer: Names of other objects that hold its name. A file is of the object with the longest name that fits.
+        folder: Folder where relative paths start.
     """
 
+    section: _ObjectSection
     common: Mapping[str, Any]
-    object: _ObjectSection
+    listed: Mapping[str, Sequence[Mapping[str, Any]]]
     longer: Sequence[str]
-    listed: _Listed
     folder: Path
 
     def table(self) -> dict[str, Any]:
         """Return the study as nested tables."""
-        name = self.object.name
+        name = self.section.name
         common = filled({key: value for key, value in self.common.items() if key != "family"}, OBJECT, name)
-        reference = self.object.reference or self.listed.reference(name) or common.get("reference")
-        header = dict(common.get("study", {}))
+        reference = self.section.reference or self._listed_reference() or common.get("reference")
         families = [table for family in self.common.get("family", []) for table in self._families(family)]
+        families += (
+            {"name": method, "source": "files", "meshes": meshes}
+            for method, meshes in self.listed.items()
+            if caseless_key(method) != REFERENCE_LABEL
+        )
+        header = common["study"]
         return {
             **common,
-            "study": {**header, "name": f"{header.get('name', '')} {name}"},
+            "study": {**header, "name": f"{header['name']} {name}"},
             **({} if reference is None else {"reference": filled(reference, OBJECT, name)}),
-            **({} if self.object.scaling is None else {"scaling": self.object.scaling}),
-            "family": [*families, *self.listed.families(name)],
+            **({} if self.section.scaling is None else {"scaling": self.section.scaling}),
+            "family": families,
         }
+
+    def _listed_reference(self) -> dict[str, Any] | None:
+        listed = self.listed.items()
+        meshes = [mesh for method, meshes in listed if caseless_key(method) == REFERENCE_LABEL for mesh in meshes]
+        return {"source": "files", "paths": [mesh["path"] for mesh in meshes]} if meshes else None
 
     def _families(self, family: Any) -> list[Any]:
         """Return a family for each method among its files, or none where no file matches."""
-        others = filled({key: value for key, value in family.items() if key != "paths"}, OBJECT, self.object.name)
+        others = filled({key: value for key, value in family.items() if key != "paths"}, OBJECT, self.section.name)
         paths = family.get("paths")
         if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-            return [filled(family, OBJECT, self.object.name)]
+            return [filled(family, OBJECT, self.section.name)]
         if not holds(family.get("name"), METHOD):
-            return [{**others, "paths": [own for path in paths for own in self._template(path).paths()]}]
+            own = [file for path in paths for file in self._paths(path, self._files_of_others(path))]
+            return [{**others, "paths": own}]
         methods: dict[str, list[str]] = {}
         for path in paths:
-            template = self._template(path)
-            for method in template.methods() if METHOD in path else []:
-                methods.setdefault(method, []).extend(template.paths(method))
+            foreign = self._files_of_others(path)
+            for method in self._methods(path, foreign) if METHOD in path else []:
+                methods.setdefault(method, []).extend(self._paths(path, foreign, method))
         return [
             {**filled(others, METHOD, method), "paths": methods[method]} for method in sorted(methods, key=natural_key)
         ]
 
-    def _template(self, path: str) -> ObjectTemplate:
-        return ObjectTemplate(path, self.object.name, self.longer, self.folder)
+    def _methods(self, template: str, foreign: set[Path]) -> list[str]:
+        """Return the methods that have files of the object; none where no file matches."""
+        own = template.replace(OBJECT, self.section.name)
+        try:
+            return names_of(own, METHOD, self.folder, foreign)
+        except StudyError:
+            return []
+
+    def _paths(self, template: str, foreign: set[Path], method: str = "") -> list[str]:
+        """Return the path or glob of a method, or the files that match it where others are of another object."""
+        text = template.replace(OBJECT, self.section.name).replace(METHOD, method)
+        files = _files(self.folder, text) if foreign and has_magic(text) else []
+        if foreign.isdisjoint(files):
+            return [text]
+        own = [as_written(path, self.folder) for path in files if path not in foreign]
+        if not own:
+            raise StudyError(
+                f"{quoted(text)} matches files of other objects alone, such as {quoted(str(files[0]))}; "
+                f"put files of {quoted(self.section.name)} there, or correct it"
+            )
+        return own
+
+    def _files_of_others(self, template: str) -> set[Path]:
+        """Return the files of the objects with longer names."""
+        globs = [template.replace(OBJECT, name).replace(METHOD, "*") for name in self.longer if OBJECT in template]
+        return {path for glob in globs for path in _files(self.folder, glob)}
+
+
+def _files(folder: Path, text: str) -> list[Path]:
+    """Return the files that match a path or glob; none where no file does."""
+    try:
+        return matching_files(folder, text)
+    except StudyError:
+        return []
 
 
 def _require_sections(table: Mapping[str, Any]) -> None:
@@ -317,11 +332,6 @@ def _named_objects(entries: Any) -> list[_ObjectSection]:
     return _object_sections({f"[[object]] {number}": entry for number, entry in enumerate(entries, 1)})
 
 
-def _plain_objects(names: Sequence[str]) -> list[_ObjectSection]:
-    """Return the sections of objects of which the names alone are known."""
-    return _object_sections({f"object {quoted(name)}": {"name": name} for name in names})
-
-
 def _object_sections(entries: Mapping[str, dict[str, Any]]) -> list[_ObjectSection]:
     """Return the sections of objects, by where they are given."""
     if len(entries) > _MOST_OBJECTS:
@@ -338,7 +348,7 @@ def _object_sections(entries: Mapping[str, dict[str, Any]]) -> list[_ObjectSecti
     return sections
 
 
-def _found(common: Mapping[str, Any], folder: Path) -> list[str]:
+def _names_in_reference(common: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the objects that the files of the reference name."""
     reference = common.get("reference")
     paths = reference.get("paths") if isinstance(reference, Mapping) else None
@@ -350,8 +360,3 @@ def _found(common: Mapping[str, Any], folder: Path) -> list[str]:
         )
     names = dict.fromkeys(name for template in templates for name in names_of(template, OBJECT, folder))
     return sorted(names, key=natural_key)
-
-
-def _as_table(mesh: ListedMesh) -> dict[str, Any]:
-    known = {"path": mesh.path, "name": mesh.name, "time": mesh.time, **dict(mesh.metadata)}
-    return {key: value for key, value in known.items() if value is not None}

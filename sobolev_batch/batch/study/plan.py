@@ -12,7 +12,8 @@ import numpy as np
 
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice, choice_basis
 from sobolev_batch.batch.study.lattice_search import Members, choose_lattice
-from sobolev_batch.batch.study.study import REFERENCE_LABEL, FamilyReference, Study
+from sobolev_batch.batch.study.schema import FamilyReference
+from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.probe import Sample, draws_for
@@ -135,7 +136,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     members = members_of(study)
     reference = _reference_label(study, members)
     own = _load_reference(members[reference][1])
-    similarity = Similarity.to_unit_ball(own) if study.scaling.mode == "reference" else study.scaling.fixed
+    similarity = study.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
     if not kind_of(surface).is_closed_form:

@@ -27,6 +27,7 @@ from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.formats.raw_files import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
+from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import at_most
 
@@ -138,6 +139,11 @@ class _ScalingSection(Section):
     scale: Number | None = None
     origin: Annotated[tuple[Number, Number, Number] | None, Field(strict=False)] = None
 
+    def settings(self) -> Similarity | None:
+        if self.mode == "reference":
+            return None
+        return Similarity(1.0 if self.scale is None else self.scale, self.origin or (0.0, 0.0, 0.0))
+
     @model_validator(mode="after")
     def _values_where_needed(self) -> Self:
         given = self.scale is not None or self.origin is not None
@@ -150,8 +156,8 @@ class _ProximitySection(Section):
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
 
 
-class FamilyReferenceSection(Section):
-    """Reference that is a member of a family."""
+class FamilyReference(Section):
+    """A reference that is a member of one of the study's families: its finest unless named."""
 
     family: str
     member: str | None = None

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from sobolev_batch.batch.study.refusals import joined, known_names, refusals, shown_value
 from sobolev_batch.batch.study.schema import (
     Backends,
-    FamilyReferenceSection,
+    FamilyReference,
     FamilySection,
     StudyDocument,
     read_toml,
@@ -54,26 +54,6 @@ class Family:
 
 
 @dataclass(frozen=True)
-class FamilyReference:
-    """A reference that is a member of one of the study's families: its finest unless named."""
-
-    family: str
-    member: str | None
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """Choice of the study's one similarity transform.
-
-    "reference" takes the reference's bounding sphere to the unit sphere at the origin, "none" is the identity, and
-    "fixed" is the given one.
-    """
-
-    mode: Literal["reference", "none", "fixed"]
-    fixed: Similarity
-
-
-@dataclass(frozen=True)
 class Study:
     """A validated study. Make it by `from_toml` or `from_table`.
 
@@ -90,7 +70,7 @@ class Study:
         pairs: "all" for the distances of all pairs of meshes, "reference" for those to the reference alone.
         families: Families of surfaces to compare.
         reference: Surface that they are compared with.
-        scaling: Choice of the common unit of length.
+        scaling: Similarity transform of all surfaces; None takes the reference's bounding sphere to the unit sphere.
         proximity: Number of points that are drawn on each mesh for its Hausdorff and Chamfer distances from the
             reference; None if these are not asked for.
         folder: Folder in which relative paths start.
@@ -120,7 +100,7 @@ class Study:
     pairs: Literal["all", "reference"]
     families: tuple[Family, ...]
     reference: Source | FamilyReference
-    scaling: Scaling
+    scaling: Similarity | None
     proximity: int | None
     folder: Path
     table: Mapping[str, Any]
@@ -261,7 +241,7 @@ class Study:
         with _in_section("transform"):
             transform = document.transform.settings()
         with _in_section("scaling"):
-            scaling = _scaling(document)
+            scaling = document.scaling.settings()
         orders = document.norm.orders
         return cls(
             name=document.study.name,
@@ -316,7 +296,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "pairs": (str,),
     "families": (tuple,),
     "reference": (Source, FamilyReference),
-    "scaling": (Scaling,),
+    "scaling": (Similarity, NoneType),
     "proximity": (int, NoneType),
     "folder": (Path,),
     "table": (Mapping,),
@@ -372,18 +352,12 @@ def _reference(entry: object, families: list[dict[str, Any]], refused: list[str]
         return _source(entry, place, refused)
     parameters = {key: value for key, value in entry.items() if key != "source"}
     try:
-        section = FamilyReferenceSection.model_validate(parameters)
+        reference = FamilyReference.model_validate(parameters)
     except ValidationError as error:
-        refused += refusals(error, parameters, FamilyReferenceSection, place, ("source",))
+        refused += refusals(error, parameters, FamilyReference, place, ("source",))
         return None
-    names = [str(family.get("name")) for family in families]
-    if section.family not in names:
-        refused.append(f"{place}: no family is named {quoted(section.family)}; {known_names(section.family, names)}")
+    names, name = [str(family.get("name")) for family in families], reference.family
+    if name not in names:
+        refused.append(f"{place}: no family is named {quoted(name)}; {known_names(name, names)}")
         return None
-    return FamilyReference(section.family, section.member)
-
-
-def _scaling(document: StudyDocument) -> Scaling:
-    section = document.scaling
-    scale = 1.0 if section.scale is None else section.scale
-    return Scaling(section.mode, Similarity(scale, section.origin or (0.0, 0.0, 0.0)))
+    return reference

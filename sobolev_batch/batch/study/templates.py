@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from glob import has_magic
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.sources.files import expand
-from sobolev_batch.surfaces.sources.names import quoted
 
 OBJECT, METHOD = "{object}", "{method}"
 # Characters of globs and templates, which the names of objects and methods cannot have.
@@ -40,71 +36,6 @@ def filled(value: Any, placeholder: str, name: str) -> Any:
     return [filled(entry, placeholder, name) for entry in value] if isinstance(value, list | tuple) else value
 
 
-@dataclass(frozen=True)
-class ObjectTemplate:
-    """A path or glob of a family, for one object.
-
-    Attributes:
-        text: Path or glob with placeholders.
-        name: Name of the object.
-        longer: Names of other objects that hold this name. A file is of the object with the longest name that fits.
-        folder: Folder where relative paths start.
-    """
-
-    text: str
-    name: str
-    longer: Sequence[str]
-    folder: Path
-
-    @property
-    def own(self) -> str:
-        """The template with the name of the object."""
-        return self.text.replace(OBJECT, self.name)
-
-    @cached_property
-    def others(self) -> set[Path]:
-        """Files of the objects with longer names."""
-        if OBJECT not in self.text:
-            return set()
-        globs = [self.text.replace(OBJECT, name).replace(METHOD, "*") for name in self.longer]
-        return {path for glob in globs for path in self._files(glob)}
-
-    def methods(self) -> list[str]:
-        """Return the methods that have files of the object, in their natural order; none where no file matches."""
-        try:
-            return names_of(self.own, METHOD, self.folder, self.others)
-        except StudyError:
-            return []
-
-    def paths(self, method: str = "") -> list[str]:
-        """Return the path or glob of a method, or the files that match it where others are of another object.
-
-        Raises:
-            StudyError: All files that match are those of another object.
-        """
-        text = self.own.replace(METHOD, method)
-        if not self.others or not has_magic(text):
-            return [text]
-        files = self._files(text)
-        if self.others.isdisjoint(files):
-            return [text]
-        own = [_as_written(path, self.folder) for path in files if path not in self.others]
-        if not own:
-            raise StudyError(
-                f"{quoted(text)} matches files of other objects alone, such as {quoted(str(files[0]))}; "
-                f"put files of {quoted(self.name)} there, or correct it"
-            )
-        return own
-
-    def _files(self, glob: str) -> list[Path]:
-        if not has_magic(glob):
-            return [self.folder / glob]
-        try:
-            return expand(self.folder, glob)
-        except StudyError:
-            return []
-
-
 def names_of(template: str, placeholder: str, folder: Path, others: Container[Path] = ()) -> list[str]:
     """Return the names that a placeholder has among the files that match a template, in their natural order.
 
@@ -123,7 +54,7 @@ def names_of(template: str, placeholder: str, folder: Path, others: Container[Pa
     paths = [path for path in files if path not in others]
     match = re.compile(_pattern(template)).fullmatch
     group = placeholder.strip("{}")
-    found = {matched[group] for path in paths if (matched := match(_as_written(path, folder))) is not None}
+    found = {matched[group] for path in paths if (matched := match(as_written(path, folder))) is not None}
     if not found:
         raise StudyError(
             f"no file gives {placeholder} of {template!r} one name; it stands for a part of a path, without /"
@@ -131,7 +62,7 @@ def names_of(template: str, placeholder: str, folder: Path, others: Container[Pa
     return sorted(found)
 
 
-def _as_written(path: Path, folder: Path) -> str:
+def as_written(path: Path, folder: Path) -> str:
     """Return a path as a template of the study would have it."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
 

@@ -96,7 +96,7 @@ def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder:
         {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}},
     ]
     found = sb.StudyCollection.from_table(table(object=objects, family=ICO), folder=folder)
-    assert [study.scaling.mode for study in found.studies.values()] == ["reference", "none"]
+    assert [study.scaling for study in found.studies.values()] == [None, sb.Similarity()]
     assert [study.name for study in found.studies.values()] == ["small cow", "small ball"]
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from sobolev_batch import Lattice, OrderError, Study, StudyError
-from sobolev_batch.batch.study.schema import FamilyReferenceSection, FamilySection, StudyDocument
+from sobolev_batch import Lattice, OrderError, Similarity, Study, StudyError
+from sobolev_batch.batch.study.schema import FamilyReference, FamilySection, StudyDocument
 from sobolev_batch.surfaces.sources.registry import Source, source_type_of
 from tests.support.members import KINDS
 from tests.support.repository import blocks
@@ -62,7 +62,7 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert study.pairs == "reference"
     assert (study.transform.eps, study.transform.dtype) == (1e-6, "complex64")
     assert study.transform.quadrature.method == 5
-    assert study.scaling.fixed.scale == 0.5
+    assert study.scaling == Similarity(0.5)
     assert [family.name for family in study.families] == ["ico", "thin"]
     assert study.folder == tmp_path
 
@@ -79,7 +79,7 @@ def keys_of(model: type[BaseModel]) -> set[str]:
 
 def test_the_reference_of_study_files_names_every_key_and_source() -> None:
     text = (WORKFLOWS.parent / "docs" / "studies.md").read_text(encoding="utf-8")
-    keys = keys_of(StudyDocument) | keys_of(FamilyReferenceSection) | keys_of(FamilySection)
+    keys = keys_of(StudyDocument) | keys_of(FamilyReference) | keys_of(FamilySection)
     assert {"rtol", "backend", "origin", "member"} < keys
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
