@@ -152,7 +152,7 @@ def compare_command(
 
 def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> None:
     """Print a sentence for each order, what is as far away if that was measured, and then the numbers."""
-    from sobolev_batch.results.tables.formatting import answer, likeness
+    from sobolev_batch.results.tables.text import answer, likeness
 
     by_order = [results.sel(order=order) for order in results["order"].values]
     for sentence in dict.fromkeys(answer(name, reference, result, area_change) for result in by_order):
@@ -169,7 +169,7 @@ def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: 
 
 def _details(result: xr.Dataset, rtol: float | None) -> str:
     """Return the distance of one order and the parts of its error, on one line."""
-    from sobolev_batch.results.tables.formatting import with_error
+    from sobolev_batch.results.tables.text import with_error
 
     names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
     parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
@@ -362,7 +362,7 @@ class _Steps:
 
 def _text(quality: FitQuality, scale: float) -> str:
     """Return the numbers on one line, lengths in the files' unit."""
-    from sobolev_batch.results.tables.formatting import percent, with_error
+    from sobolev_batch.results.tables.text import percent, with_error
 
     if not math.isfinite(quality.distance):
         return "not measured"

@@ -23,7 +23,7 @@ from sobolev_batch.cli.options import (
 )
 from sobolev_batch.cli.output import ProgressLine, echo, echo_lines, progress_bar
 from sobolev_batch.errors import SobolevBatchError, StoreError
-from sobolev_batch.results.tables.formatting import Format
+from sobolev_batch.results.tables.text import Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -254,14 +254,14 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.convergence_plots import LEAGUE
+    from sobolev_batch.results.figures.curves import LEAGUE
     from sobolev_batch.results.figures.plots import write_plots
     from sobolev_batch.results.figures.selection import Selection
     from sobolev_batch.results.figures.style import Output, parse_size
     from sobolev_batch.results.figures.witness_plots import write_witness_plots
-    from sobolev_batch.results.league.league import league
     from sobolev_batch.results.open import fields_read
     from sobolev_batch.results.tables.groups import EDGE_LENGTH
+    from sobolev_batch.results.tables.league import league
 
     written_as = Output(formats or ("png",), None if size is None else parse_size(size))
     _require_folder(output)
@@ -382,8 +382,8 @@ def league_command(
 
     With --against, compare each method with itself in an earlier study instead.
     """
-    from sobolev_batch.results.league.league import compare_studies, league
-    from sobolev_batch.results.league.text import format_changes, format_league
+    from sobolev_batch.results.tables.league import compare_studies, league
+    from sobolev_batch.results.tables.league_text import format_changes, format_league
 
     if against is not None:
         echo_lines(format_changes(compare_studies(store, against, orders or None), style))

@@ -16,7 +16,7 @@ from sobolev_batch.batch.store.tables import rows_unlike_tables, table_attribute
 from sobolev_batch.batch.workspace import complete_records, failed_proximities
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.results.open import AnyStore, location_of
-from sobolev_batch.results.tables.formatting import duration
+from sobolev_batch.results.tables.text import duration
 from sobolev_batch.visible import visible
 
 # A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.

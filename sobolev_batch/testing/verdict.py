@@ -9,7 +9,7 @@ from typing import Literal
 from sobolev_batch.errors import SobolevBatchError, one_line
 from sobolev_batch.html import table_html
 from sobolev_batch.machine import available, available_cores
-from sobolev_batch.results.tables.formatting import rounded_outwards, with_error
+from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.metrics.norms import check_seed

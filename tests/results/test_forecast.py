@@ -13,8 +13,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.results import forecast as forecasts
-from sobolev_batch.results.forecast import Forecast
+from sobolev_batch.results.plan import Forecast
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import expected_points, field_seconds, transform_block
 from tests.support.studies import small_table
@@ -77,7 +76,7 @@ def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: p
     def measured() -> float:
         raise AssertionError("nothing needs to be measured")
 
-    monkeypatch.setattr(forecasts, "slowness", measured)
+    monkeypatch.setattr("sobolev_batch.results.plan.slowness", measured)
     stored = records(plan, *(row.label for row in plan.rows), seconds=1.0)
     forecast = Forecast.for_plan(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
     assert (forecast.seconds, forecast.lines) == (0.0, ("nothing is missing",))

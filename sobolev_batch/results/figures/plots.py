@@ -8,25 +8,23 @@ from pathlib import Path
 from matplotlib.axes import Axes
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.convergence_plots import (
+from sobolev_batch.results.figures.curves import (
     LEAGUE,
+    computed_members,
     draw_convergence,
+    draw_energy,
     draw_evolution,
+    draw_spectrum,
+    draw_transform,
     moving_families,
+    transform_panels,
 )
 from sobolev_batch.results.figures.pair_plots import draw_map, draw_matrix, has_pairs
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.spectrum_plots import (
-    computed_members,
-    draw_energy,
-    draw_spectrum,
-    draw_transform,
-    transform_panels,
-)
 from sobolev_batch.results.figures.style import Output, Plot, notes_of
-from sobolev_batch.results.league.league import League
 from sobolev_batch.results.open import AnyStore, fields_read
 from sobolev_batch.results.tables.groups import EDGE_LENGTH, Families
+from sobolev_batch.results.tables.league import League
 
 
 def _orders(selection: Selection) -> Sequence[float]:

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.tables.formatting import middle_cut
+from sobolev_batch.results.tables.text import middle_cut
 from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.visible import visible
 

@@ -16,19 +16,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.convergence_plots import LEAGUE
+from sobolev_batch.results.figures.curves import LEAGUE
 from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
 from sobolev_batch.results.figures.plots import PLOTS
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
-from sobolev_batch.results.league.league import League, Scores
 from sobolev_batch.results.meshes.render import render
 from sobolev_batch.results.meshes.views import MeshView, Views
 from sobolev_batch.results.report.elements import ReportLimits
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
-from sobolev_batch.results.tables.formatting import minus
 from sobolev_batch.results.tables.groups import (
     complete_meshes,
     families_of,
@@ -38,7 +36,9 @@ from sobolev_batch.results.tables.groups import (
     label_of,
     reference_of,
 )
+from sobolev_batch.results.tables.league import League, Scores
 from sobolev_batch.results.tables.matrix import Matrix
+from sobolev_batch.results.tables.text import minus
 
 # Orders that printed pictures show; more would make the page heavy.
 MOST_PICTURED_ORDERS = 6

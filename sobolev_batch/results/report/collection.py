@@ -11,16 +11,6 @@ import pandas as pd
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.league.league import League, Scores, leagues_of
-from sobolev_batch.results.league.text import (
-    LEAGUE_COLUMNS,
-    LEAGUE_NOTE,
-    PAIR_COLUMNS,
-    left_out,
-    number_text,
-    pair_lines,
-    percent_text,
-)
 from sobolev_batch.results.open import open_store
 from sobolev_batch.results.report.elements import (
     PageTable,
@@ -34,8 +24,17 @@ from sobolev_batch.results.report.elements import (
 )
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import tables_of
-from sobolev_batch.results.tables.formatting import duration, minus, percent
-from sobolev_batch.results.tables.text import Column
+from sobolev_batch.results.tables.league import League, Scores, leagues_of
+from sobolev_batch.results.tables.league_text import (
+    LEAGUE_COLUMNS,
+    LEAGUE_NOTE,
+    PAIR_COLUMNS,
+    left_out,
+    number_text,
+    pair_lines,
+    percent_text,
+)
+from sobolev_batch.results.tables.text import Column, duration, minus, percent
 
 _OBJECT_COLUMNS = (
     Column("object", "object", kind="label"),

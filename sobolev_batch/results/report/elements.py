@@ -11,8 +11,7 @@ import tomli_w
 from sobolev_batch.results.figures.pair_plots import MOST_MESHES
 from sobolev_batch.results.figures.selection import MOST_MESHES as MOST_SPECTRA
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.formatting import minus
-from sobolev_batch.results.tables.text import Column
+from sobolev_batch.results.tables.text import Column, minus
 
 _LONGEST_VALUE = 300
 

@@ -16,7 +16,6 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
 from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables.formatting import Format, count, percent, with_error
 from sobolev_batch.results.tables.groups import (
     EDGE_LENGTH,
     convergence_at,
@@ -28,7 +27,17 @@ from sobolev_batch.results.tables.groups import (
     placement_doubts,
     sizes_of,
 )
-from sobolev_batch.results.tables.text import Column, column_table, machine_table, printed_table, prose
+from sobolev_batch.results.tables.text import (
+    Column,
+    Format,
+    column_table,
+    count,
+    machine_table,
+    percent,
+    printed_table,
+    prose,
+    with_error,
+)
 from sobolev_batch.spectral.metrics.datasets import observed_rates
 from sobolev_batch.spectral.shells import Orders
 

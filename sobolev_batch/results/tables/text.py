@@ -1,4 +1,4 @@
-"""Tables as text: for people (text, markdown, latex) or for programs (csv, json)."""
+"""Numbers and tables as text: for people (text, markdown, latex) or for programs (csv, json)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,295 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import pandas as pd
 from tabulate import tabulate
 
-from sobolev_batch.results.tables.formatting import Format, latex_powers, middle_cut
 from sobolev_batch.visible import visible
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Formats of tables; commands list them without importing what makes tables.
+Format = Literal["text", "csv", "json", "markdown", "latex"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+# More digits are hard to read, whatever the error.
+_MOST_DIGITS = 7
+_DIGITS_WITHOUT_ERROR = 4
+# Beyond these, powers of ten are easier to read.
+_SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
+_LARGEST_BRACKETED = 3
+_POWER = " × 10"
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+# Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
+_ROUNDING = 1e-10
+# A share of area is told if its error is no larger, and to whole per cents.
+_LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
+# Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
+_LEAST_CHANGE = 0.5
+_PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
+
+
+def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
+
+    The error has one digit and is rounded up, so that it stays a bound; it may be unknown (NaN). NaN gives an empty
+    text.
+
+    >>> with_error(0.04733, 4.6e-4), with_error(2.0123e-5, 1.23e-8)
+    ('0.0473 ± 0.0005', '(2.012 ± 0.002) × 10⁻⁵')
+    """
+    if not math.isfinite(value):
+        return ""
+    shown = rounded(value, error, unit)
+    if not math.isfinite(error) or error == 0:
+        return f"{shown} ± {'0' if error == 0 else '?'}"
+    above, last = _rounded_up(error, 1), _last_digit(value, error)
+    if _POWER in shown and above < value * 1e3 and _magnitude(above) >= last:
+        power = _magnitude(round(value, -last))
+        size, decimals = 10.0**power, max(0, power - last)
+        return f"({value / size:.{decimals}f} ± {above / size:.{decimals}f}){_power(power)}{unit}"
+    return f"{shown} ± {_shown(above, _magnitude(above))}{unit}"
+
+
+def rounded(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it; see `with_error`."""
+    return f"{_shown(value, _last_digit(value, error))}{unit}" if math.isfinite(value) else ""
+
+
+def percent(fraction: float, error: float = math.nan) -> str:
+    """Return a fraction in per cent with its error.
+
+    >>> percent(0.010203, 0.000094)
+    '1.02 % ± 0.01 %'
+    """
+    return with_error(100 * fraction, 100 * error, " %")
+
+
+def count(number: int) -> str:
+    """Return a number of things; nothing for none."""
+    return f"{number:,}" if number else ""
+
+
+def bound(fraction: float) -> str:
+    """Return an upper bound in per cent, with two digits, rounded up.
+
+    >>> bound(0.00301)
+    '0.31 %'
+    """
+    rounded = _rounded_up(100 * fraction, 2)
+    return f"{_shown(rounded, _magnitude(rounded) - 1)} %"
+
+
+def rounded_outwards(lower: float, upper: float) -> tuple[str, str]:
+    """Return two bounds with two digits, the lower one rounded down and the upper one up.
+
+    >>> rounded_outwards(0.01239, 0.1231)
+    ('0.012', '0.13')
+    """
+    low, high = _rounded_down(lower, 2), _rounded_up(upper, 2)
+    return _shown(low, _magnitude(low) - 1), _shown(high, _magnitude(high) - 1)
+
+
+def count_text(number: float, error: float) -> str:
+    """Return a large number of things with the digits that its error leaves it.
+
+    >>> count_text(2312.4, 36.0)
+    '2,310'
+    """
+    return "" if math.isnan(number) else f"{round(number, -max(0, _magnitude(_rounded_up(error, 1)))):,.0f}"
+
+
+def second_digit(value: float) -> float:
+    """Return the unit of the second digit of a number.
+
+    >>> second_digit(2312.4)
+    100.0
+    """
+    return 10.0 ** (_magnitude(value) - 1) if math.isfinite(value) else math.nan
+
+
+def concise(value: float, error: float) -> str:
+    """Return a number with its error in brackets, in units of the last digit.
+
+    The error is rounded up. NaN gives an empty text; "?" stands for an unknown error.
+
+    >>> concise(0.012341, 0.00005), concise(1.2341e-7, 5e-10)
+    ('0.01234(5)', '1.234(5)e-07')
+    """
+    if not math.isfinite(value):
+        return ""
+    power = _magnitude(value)
+    if not math.isfinite(error):
+        return _bracketed(value, "?", power, power - _DIGITS_WITHOUT_ERROR + 1)
+    if error == 0:
+        return f"{value:.4g}"
+    rounded = _rounded_up(error, 1)
+    power = _magnitude(value or rounded)
+    last = max(_magnitude(rounded), power - _MOST_DIGITS + 1)
+    # Rounding may carry into the next power, or leave nothing of a value below its error.
+    power = max(_magnitude(round(value, -last)) if round(value, -last) else last, last)
+    # Where digits were left out, the error is that of the last one shown.
+    shown = max(1, math.ceil(rounded / 10.0**last * (1 - 1e-9)))
+    return _bracketed(value, str(shown), power, last)
+
+
+def _bracketed(value: float, error: str, power: int, last: int) -> str:
+    """Return a value of a power of ten, down to the last one, with the digit of its error."""
+    if _magnitude(_SMALLEST_PLAIN) <= power <= _LARGEST_BRACKETED and last <= power:
+        return f"{round(value, -last):.{max(0, -last)}f}({error}{'0' * last})"
+    return f"{value / 10.0**power:.{power - last}f}({error})e{power:+03d}"
+
+
+def duration(seconds: float, digits: int = 3) -> str:
+    """Return a duration in the largest unit of which it has two or more.
+
+    >>> duration(42), duration(5400), duration(1e6), duration(1e6, digits=2)
+    ('42 s', '90 min', '11.6 days', '12 days')
+    """
+    units = (("days", 86400), ("h", 3600), ("min", 60))
+    unit, size = next(((unit, size) for unit, size in units if seconds >= 2 * size), ("s", 1))
+    # Rounded first, since the format turns 120 into 1.2e+02.
+    rounded = float(f"{max(seconds, 0) / size:.{digits}g}")
+    return f"{rounded:g} {unit}"
+
+
+def latex_powers(text: str) -> str:
+    r"""Return a text whose powers of ten are formulas of LaTeX, which has no raised digits.
+
+    >>> latex_powers("1.2 × 10⁻⁵ %")
+    '1.2 $\\times 10^{-5}$ %'
+    """
+    return re.sub(
+        rf"{_POWER.strip()}([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda found: rf"$\times 10^{{{found[1].translate(_PLAIN)}}}$", text
+    )
+
+
+def minus(text: str) -> str:
+    """Return numbers with minus signs as wide as a digit."""
+    return text.replace("-", "−")
+
+
+def middle_cut(label: str, longest: int) -> str:
+    """Return a label that is cut in its middle: labels of one family differ at their ends."""
+    return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
+
+
+def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return a sentence that says how much a surface differs from the reference at one order.
+
+    Args:
+        name: Name of the surface.
+        reference: Name of the reference.
+        result: Variables of `distance` at one order, and the order.
+        area_change: Area of the surface over that of the reference, minus one.
+
+    >>> numbers = {"distance": 0.3, "error": 0.003, "relative": 0.0102, "relative_error": 0.0001}
+    >>> shares = {"area_share": 0.561, "area_share_error": 0.02, "excess": -0.007}
+    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares}, area_change=-0.008)
+    'small.obj differs from large.obj by 1.02 % ± 0.01 % at order -2; 56 % of it is lost area.'
+    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares, "distance": 1e-3}, area_change=-0.008)
+    'small.obj differs from large.obj by less than 1.1 % at order -2: not resolved.'
+    """
+    numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
+    at_order = f"at order {float(result['order']):g}"
+    if numbers["distance"] == numbers["error"] == 0:
+        return f"{name} and {reference} are identical: they have the same triangles."
+    if numbers["distance"] > numbers["error"]:
+        amount = percent(numbers["relative"], numbers["relative_error"])
+        return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
+    most = numbers["relative"] + numbers["relative_error"]
+    if most < _ROUNDING:
+        return f"{name} and {reference} are equal up to rounding {at_order}: they differ by less than {bound(most)}."
+    amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
+    return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
+
+
+def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]) -> str:
+    """Return a sentence that says which changes of the reference bring it as far from itself as a surface is.
+
+    Args:
+        name: Name of the surface.
+        reference: Name of the reference.
+        result: Variables of `yardsticks` at one order, and the order.
+
+    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
+    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
+    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}))
+    At order -2, small.obj is as far from large.obj as
+      large.obj moved by 0.81 % of its radius,
+      large.obj with noise of 0.32 % of its radius,
+      large.obj decimated to 2,300 triangles.
+    """
+    amounts = {kind: float(result[kind]) for kind in ("moved", "noise", "decimated")}
+    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
+    texts = {
+        "moved": f"moved by {rounded(100 * amounts['moved'], 100 * errors['moved'], ' %')} of its radius",
+        "noise": f"with noise of {rounded(100 * amounts['noise'], 100 * errors['noise'], ' %')} of its radius",
+        "decimated": f"decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles",
+    }
+    known = [f"  {reference} {text}" for kind, text in texts.items() if not math.isnan(amounts[kind])]
+    at_order = f"At order {float(result['order']):g}, "
+    if not known:
+        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
+    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(known) + "."
+
+
+def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return which share of a squared distance is a change of area; nothing where that is not known."""
+    share, error, excess = (float(result[key]) for key in ("area_share", "area_share_error", "excess"))
+    if not error <= _LARGEST_SHARE_ERROR:
+        return ""
+    if share + error < _WHOLE_PERCENT:
+        return "; less than 1 % of it is a change of area"
+    # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
+    if share <= error or not area_change / excess >= _LEAST_CHANGE:
+        return ""
+    amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
+    return f"; {amount} of it is {'lost' if excess < 0 else 'gained'} area"
+
+
+def _last_digit(value: float, error: float) -> int:
+    """Return the power of ten of the last digit that an error leaves a number."""
+    if not math.isfinite(error) or error == 0:
+        return _magnitude(value) - (_MOST_DIGITS if error == 0 else _DIGITS_WITHOUT_ERROR) + 1
+    above = _rounded_up(error, 1)
+    # A value below its error keeps a digit, to be told from zero.
+    top = _magnitude(value or above)
+    return min(top, max(_magnitude(above), top - _MOST_DIGITS + 1))
+
+
+def _magnitude(value: float) -> int:
+    """Return the power of ten of the first digit."""
+    return 0 if value == 0 else int(f"{abs(value):e}".partition("e")[2])
+
+
+def _rounded_up(value: float, digits: int) -> float:
+    unit = 10.0 ** (_magnitude(value) - digits + 1)
+    return float(f"{math.ceil(value / unit * (1 - 1e-9)) * unit:.{digits}g}")
+
+
+def _rounded_down(value: float, digits: int) -> float:
+    unit = 10.0 ** (_magnitude(value) - digits + 1)
+    return float(f"{math.floor(value / unit * (1 + 1e-9)) * unit:.{digits}g}")
+
+
+def _shown(value: float, last: int) -> str:
+    """Return a value down to a power of ten."""
+    value = round(value, -last)
+    if value == 0:
+        return "0"
+    if abs(value) < _LARGEST_PLAIN and (abs(value) >= _SMALLEST_PLAIN or last >= _LAST_PLAIN):
+        return f"{value:.{max(0, -last)}f}"
+    power = _magnitude(value)
+    return f"{value / 10.0**power:.{max(0, power - last)}f}{_power(power)}"
+
+
+def _power(power: int) -> str:
+    return _POWER + str(power).translate(_SUPERSCRIPTS)
+
 
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 
@@ -82,7 +364,10 @@ def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: 
     In a text the labels of the first column are cut in their middle where lines would be too long. LaTeX's special
     characters are escaped by tabulate.
     """
-    rows, headers = [[_shown(cell, style) for cell in row] for row in rows], [_shown(text, style) for text in headers]
+    rows, headers = (
+        [[_escaped(cell, style) for cell in row] for row in rows],
+        [_escaped(text, style) for text in headers],
+    )
     if style == "text":
         rows = _with_short_labels(rows, headers)
     table = str(
@@ -107,10 +392,10 @@ def _with_short_labels(rows: Sequence[Sequence[str]], headers: Sequence[str]) ->
 
 def prose(lines: Iterable[str], style: Format) -> str:
     """Return lines that stand beside tables; LaTeX takes them as comments."""
-    return "\n".join(f"{'% ' * (style == 'latex')}{_shown(line, style)}" for line in lines)
+    return "\n".join(f"{'% ' * (style == 'latex')}{_escaped(line, style)}" for line in lines)
 
 
-def _shown(text: str, style: Format) -> str:
+def _escaped(text: str, style: Format) -> str:
     """Return a text whose characters have no meaning of their own to terminals and Markdown."""
     return _MARKDOWN_MARKS.sub(r"\\\g<0>", visible(text)) if style == "markdown" else visible(text)
 

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch import InputError
 from sobolev_batch.cli import cli
-from sobolev_batch.results.league.league import leagues_of
 from sobolev_batch.results.report import collection as collection_module
 from sobolev_batch.results.report.build import make_report
+from sobolev_batch.results.tables.league import leagues_of
 from tests.support.browser import Browser, browser
 from tests.support.studies import small_table
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sobolev_batch.results.report.verdict import StudyVerdict
+from sobolev_batch.results.report.content import StudyVerdict
 
 # Family, triangles and relative distance of each mesh.
 Meshes = list[tuple[str, int, float]]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sobolev_batch.results.tables.formatting import bound, concise, percent, with_error
+from sobolev_batch.results.tables.text import bound, concise, percent, with_error
 
 _NAN = float("nan")
 

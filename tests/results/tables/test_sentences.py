@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sobolev_batch.results.tables.formatting import answer
+from sobolev_batch.results.tables.text import answer
 
 NUMBERS = {"order": -2.0, "distance": 0.03, "error": 0.0003, "relative": 0.0102, "relative_error": 0.0001}
 SHARES = {"area_share": 0.561, "area_share_error": 0.012, "excess": -0.007}

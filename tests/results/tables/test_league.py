@@ -12,9 +12,9 @@ import pytest
 from scipy import stats
 
 import sobolev_batch as sb
-from sobolev_batch.results.league.league import League, leagues_of
-from sobolev_batch.results.league.statistics import Interval, adjusted, sign_flip_test, within_objects
-from sobolev_batch.results.league.text import format_league
+from sobolev_batch.results.tables.league import League, leagues_of
+from sobolev_batch.results.tables.league_text import format_league
+from sobolev_batch.results.tables.statistics import Interval, adjusted, sign_flip_test, within_objects
 
 SIZES = (100, 400, 1600)
 

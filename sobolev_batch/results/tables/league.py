@@ -16,7 +16,10 @@ import xarray as xr
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.league.statistics import (
+from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables.convergence import table, tables_of
+from sobolev_batch.results.tables.groups import EDGE_LENGTH, finished_group, reference_of
+from sobolev_batch.results.tables.statistics import (
     SIGNIFICANCE,
     Curve,
     Interval,
@@ -26,9 +29,6 @@ from sobolev_batch.results.league.statistics import (
     sign_flip_test,
     within_objects,
 )
-from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables.convergence import table, tables_of
-from sobolev_batch.results.tables.groups import EDGE_LENGTH, finished_group, reference_of
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.shells import Orders
 from sobolev_batch.surfaces.sources.names import quoted

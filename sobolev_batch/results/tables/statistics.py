@@ -1,4 +1,4 @@
-"""Curves of distances over sizes, means over objects with their intervals, and tests whether two methods differ."""
+"""Curves of methods at equal sizes, their intervals, and tests whether two methods differ."""
 
 from __future__ import annotations
 

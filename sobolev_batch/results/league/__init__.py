@@ -1,4 +1,0 @@
-"""Methods compared over several objects, and studies with earlier ones.
-
-See docs/leagues.md.
-"""
