@@ -357,9 +357,9 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     """
     from sobolev_batch.results.report.build import write_report
 
-    written = write_report(store, output, folder=folder, witnesses=meshes, up=up)
-    echo(written.path)
-    for omission in written.omissions:
+    page = write_report(store, output, folder=folder, witnesses=meshes, up=up)
+    echo(output)
+    for omission in page.omissions:
         echo(f"left out: {omission}", err=True)
 
 

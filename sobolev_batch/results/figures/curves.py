@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -42,30 +41,9 @@ _HEIGHT_INCHES = 3.6
 _MOST_NAMED = 3
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """A horizontal axis of the convergence plot.
-
-    Attributes:
-        missing: What a mesh lacks that has no place on the axis.
-        slope: Slope of second-order convergence; None where it has none.
-    """
-
-    missing: str
-    slope: int | None = None
-
-
-_AXES: dict[str, _Axis] = {
-    "edge_length": _Axis("edges", 2),
-    "triangles": _Axis("triangles", -1),
-    "vertices": _Axis("vertices", -1),
-    "seconds": _Axis("a time"),
-}
-
-
-def _axis(x: str) -> _Axis:
-    """Return a horizontal axis; what no table of this package knows is one of the metadata of meshes."""
-    return _AXES.get(x) or _Axis(f"a number {x}")
+# By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
+_MISSING = {"edge_length": "edges", "triangles": "triangles", "vertices": "vertices", "seconds": "a time"}
+_SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
 
 
 def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
@@ -88,26 +66,26 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
             axes.plot(hollow["x"], hollow["relative"], style.marker, **look)  # type: ignore[arg-type]
         sequences += [rows] if is_joined else []
     joined = pd.concat(sequences) if sequences else drawn.iloc[:0]
-    if len(joined) > 1 and (slope := _axis(selection.x).slope):
+    if len(joined) > 1 and (slope := _SLOPES.get(selection.x)):
         _draw_slope(axes, joined["x"].to_numpy(), joined["relative"].to_numpy(), slope)
     if not drawn["resolved"].all():
         axes.plot([], [], "o", color="gray", markerfacecolor="white", markersize=4, label="not above its error")
     if drawn.empty:
         axes.text(0.5, 0.5, "no mesh to draw", transform=axes.transAxes, ha="center")
     gone = [name for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
-    set_title(axes, f"order {order:g}", _absent(frame, _axis(selection.x)), _named("families not drawn: ", gone))
+    set_title(axes, f"order {order:g}", _absent(frame, selection.x), _named("families not drawn: ", gone))
     axes.set_xlabel(escaped(label_of(selection.x)))
     axes.set_ylabel("relative Sobolev distance")
 
 
-def _absent(frame: pd.DataFrame, axis: _Axis) -> str:
+def _absent(frame: pd.DataFrame, x: str) -> str:
     """Return how many meshes have no place in the plot, and why."""
     is_complete = frame["status"] == "complete"
     has_place = frame["x"] > 0
     counts = {
         "not computed": (~is_complete).sum(),
         "equal to the reference": (is_complete & has_place & (frame["relative"] == 0)).sum(),
-        f"without {axis.missing}": (is_complete & ~has_place).sum(),
+        f"without {_MISSING.get(x, f'a number {x}')}": (is_complete & ~has_place).sum(),
         "not compared": (is_complete & has_place & frame["relative"].isna()).sum(),
     }
     reasons = [f"{count} {reason}" for reason, count in counts.items() if count]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -34,14 +31,8 @@ def has_pairs(tree: xr.DataTree) -> bool:
     return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
 
 
-class _Chosen(NamedTuple):
-    """Distances of some meshes, and a note on those left out."""
-
-    matrix: Matrix
-    omission: str
-
-
-def _chosen(selection: Selection, order: float) -> _Chosen:
+def _chosen(selection: Selection, order: float) -> tuple[Matrix, str]:
+    """Return the distances of the chosen meshes, and a note on those left out."""
     tree, family_of = selection.tree, families_of(selection.tree)
     reference = reference_of(tree)
     meshes = [label for label in complete_meshes(tree) if family_of[label] in selection.families or label == reference]
@@ -51,7 +42,7 @@ def _chosen(selection: Selection, order: float) -> _Chosen:
             'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
         )
     shown = len(matrix.labels)
-    return _Chosen(matrix, f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else "")
+    return matrix, f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else ""
 
 
 def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
@@ -98,17 +89,17 @@ def draw_map(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the meshes as points of a plane whose distances approximate the Sobolev distances."""
     (matrix, omission), reference = _chosen(selection, order), reference_of(selection.tree)
     family_of = families_of(selection.tree)
-    embedding = Embedding.from_distances(matrix.values)
+    points, share = embedded(matrix.values)
     families = [family_of[label] for label in matrix.labels]
     for name in dict.fromkeys(families):
         chosen = [i for i, label in enumerate(matrix.labels) if families[i] == name and label != reference]
         if chosen:
-            places, style = embedding.points[chosen].T, selection.styles[name]
+            places, style = points[chosen].T, selection.styles[name]
             axes.plot(*places, style.marker, color=style.color, label=shortened(name), markersize=5, alpha=0.85)
     center = matrix.labels.index(reference) if reference in matrix.labels else None
     if center is not None:
-        axes.plot(*embedding.points[center], "*", color="black", markersize=12, label=escaped(reference))
-    explained = "" if np.isnan(embedding.explained) else f", {embedding.explained:.0%} of the variance"
+        axes.plot(*points[center], "*", color="black", markersize=12, label=escaped(reference))
+    explained = "" if np.isnan(share) else f", {share:.0%} of the variance"
     set_title(axes, f"map at order {matrix.order:g}{explained}", omission)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.1)
@@ -134,45 +125,36 @@ def clustered_order(distances: Reals) -> NDArray[np.intp]:
     return np.asarray(leaves_list(linkage(pairs, method="average", optimal_ordering=True)), dtype=np.intp)
 
 
-@dataclass(frozen=True)
-class Embedding:
-    """Meshes as points of the plane.
+def embedded(distances: Reals) -> tuple[Reals, float]:
+    """Return meshes as points of the plane that is nearest to all, by classical scaling.
 
-    Attributes:
-        points: Coordinates (meshes, 2) in the unit of the distances; the first axis is the longer one.
-        explained: Fraction of the meshes' variance that the plane shows; NaN where all meshes are equal.
+    Distances of a norm are those of points in a Euclidean space, so that double centring gives their
+    inner products exactly, up to the errors of the distances. Its first two principal axes span the
+    plane that shows most of their variance. Distances in it are never larger than the true ones.
+
+    Args:
+        distances: Distances (meshes, meshes), symmetric, without NaN.
+
+    Returns:
+        Coordinates (meshes, 2) in the unit of the distances, the first axis the longer one; and the fraction of the
+        meshes' variance that the plane shows, NaN where all meshes are equal.
+
+    Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952),
+    doi:10.1007/BF02288916.
     """
-
-    points: Reals
-    explained: float
-
-    @classmethod
-    def from_distances(cls, distances: Reals) -> Embedding:
-        """Return the best plane through the meshes, by classical scaling.
-
-        Distances of a norm are those of points in a Euclidean space, so that double centring gives their
-        inner products exactly, up to the errors of the distances. Its first two principal axes span the
-        plane that shows most of their variance. Distances in it are never larger than the true ones.
-
-        Args:
-            distances: Distances (meshes, meshes), symmetric, without NaN.
-
-        Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952),
-        doi:10.1007/BF02288916.
-        """
-        count = len(distances)
-        if count == 0:
-            return cls(np.zeros((0, 2)), float("nan"))
-        centring = np.eye(count) - 1 / count
-        products = -centring @ (distances**2 + distances.T**2) @ centring / 4
-        eigenvalues, axes = np.linalg.eigh(products)
-        # Rounding and the errors of the distances make some of them negative.
-        variances = np.maximum(eigenvalues[::-1], 0.0)
-        points = np.zeros((count, 2))
-        shown = min(2, count)
-        points[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
-        # Eigenvectors have no sign of their own: maps would flip between machines.
-        for axis in points.T:
-            axis *= np.sign(axis[np.argmax(np.abs(axis))]) or 1.0
-        total = variances.sum()
-        return cls(points, float(variances[:2].sum() / total) if total > 0 else float("nan"))
+    count = len(distances)
+    if count == 0:
+        return np.zeros((0, 2)), float("nan")
+    centring = np.eye(count) - 1 / count
+    products = -centring @ (distances**2 + distances.T**2) @ centring / 4
+    eigenvalues, axes = np.linalg.eigh(products)
+    # Rounding and the errors of the distances make some of them negative.
+    variances = np.maximum(eigenvalues[::-1], 0.0)
+    points = np.zeros((count, 2))
+    shown = min(2, count)
+    points[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
+    # Eigenvectors have no sign of their own: maps would flip between machines.
+    for axis in points.T:
+        axis *= np.sign(axis[np.argmax(np.abs(axis))]) or 1.0
+    total = variances.sum()
+    return points, float(variances[:2].sum() / total) if total > 0 else float("nan")

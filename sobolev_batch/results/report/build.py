@@ -52,19 +52,6 @@ class Page:
     omissions: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class WrittenReport:
-    """The file of a report.
-
-    Attributes:
-        path: Path of the page.
-        omissions: What it leaves out, for people.
-    """
-
-    path: Path
-    omissions: tuple[str, ...]
-
-
 def report(
     store: AnyStore,
     path: str | Path,
@@ -99,7 +86,8 @@ def report(
     >>> sb.report("storage/icosphere.zarr", "report.html").name  # doctest: +SKIP
     'report.html'
     """
-    return write_report(store, path, folder=folder, witnesses=witnesses, up=up).path
+    write_report(store, path, folder=folder, witnesses=witnesses, up=up)
+    return Path(path)
 
 
 def write_report(
@@ -109,13 +97,13 @@ def write_report(
     folder: str | Path = ".",
     witnesses: Sequence[str] = (),
     up: Axis = "z",
-) -> WrittenReport:
-    """Write the report of a store, and say what it leaves out; see `report`."""
+) -> Page:
+    """Write the report of a store, and return the page; see `report`."""
     path = Path(path)
     with _written_to(path) as write:
         page = make_report(store, folder=folder, witnesses=witnesses, up=up)
         write(page.text)
-    return WrittenReport(path, page.omissions)
+    return page
 
 
 @contextmanager
@@ -168,10 +156,10 @@ def make_report(
 
 
 def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis, limits: ReportLimits) -> Page:
-    from sobolev_batch.results.report.content import Content
+    from sobolev_batch.results.report.content import study_content
 
     tree = as_tree(store)
-    content = Content.from_tree(tree, Status.from_store(store), limits)
+    content = study_content(tree, Status.from_store(store), limits)
     selection = Selection.from_store(tree, most_spectra=limits.spectra)
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
@@ -180,15 +168,19 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     pictures = study_pictures(selection, views)
     text = _filled("study", content, charts, spectra=spectra, views=views, pictures=pictures)
     require_unchanged(tree)
-    return Page(text, (*content.omissions, *chart_omissions(tree, charts, spectra, views), *unpictured(tree, pictures)))
+    return Page(
+        text, (*content["omissions"], *chart_omissions(tree, charts, spectra, views), *unpictured(tree, pictures))
+    )
 
 
 def _collection_page(collection: CollectionStore, limits: ReportLimits) -> Page:
-    from sobolev_batch.results.report.collection import CollectionContent
+    from sobolev_batch.results.report.collection import league_content
 
-    content = CollectionContent.from_store(collection, Status.of_collection(collection), limits)
-    charts = league_data(content.leagues, content.name, content.orders)
-    return Page(_filled("league", content, charts, pictures=league_pictures(content.leagues)), content.omissions)
+    content = league_content(collection, Status.of_collection(collection), limits)
+    charts = league_data(content["leagues"], content["name"], content["orders"])
+    return Page(
+        _filled("league", content, charts, pictures=league_pictures(content["leagues"])), tuple(content["omissions"])
+    )
 
 
 def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) -> str:

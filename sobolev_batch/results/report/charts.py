@@ -17,7 +17,7 @@ from PIL import Image
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.curves import LEAGUE
-from sobolev_batch.results.figures.pair_plots import Embedding, clustered_order
+from sobolev_batch.results.figures.pair_plots import clustered_order, embedded
 from sobolev_batch.results.figures.plots import PLOTS
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
@@ -178,13 +178,13 @@ def _matrices(tree: xr.DataTree, orders: list[float], limits: ReportLimits) -> J
 
 
 def _matrix(matrix: Matrix) -> Json:
-    embedding = Embedding.from_distances(matrix.values)
+    points, explained = embedded(matrix.values)
     return {
         "values": [_numbers(row[:i]) for i, row in enumerate(matrix.values)],
         "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(matrix.errors)],
         "clustered": clustered_order(matrix.values).tolist(),
-        "points": [_numbers(axis, digits=5) for axis in embedding.points.T],
-        "explained": None if math.isnan(embedding.explained) else round(embedding.explained, 4),
+        "points": [_numbers(axis, digits=5) for axis in points.T],
+        "explained": None if math.isnan(explained) else round(explained, 4),
     }
 
 
@@ -258,10 +258,6 @@ def study_pictures(selection: Selection, views: Views) -> Pictures:
         if name != "transform"
     }
     return {**pictures, "witness": _witness_pictures(views)}
-
-
-def _text(text: str, order: float | None) -> str:
-    return text if order is None else f"{text}, order {order:g}"
 
 
 def unpictured(tree: xr.DataTree, pictures: Pictures) -> Iterator[str]:

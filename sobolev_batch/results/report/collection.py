@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -54,90 +53,43 @@ _NO_LEAGUE = "Methods cannot be compared over the objects."
 _MOST_NAMED = 3
 
 
-@dataclass(frozen=True)
-class CollectionContent:
-    """Texts and tables of the report of a collection, none of them escaped.
+def league_content(collection: CollectionStore, status: Status, limits: ReportLimits) -> dict[str, Any]:
+    """Return the texts and tables of a collection that its template takes, none of them escaped.
 
-    Attributes:
-        title: Title of the collection.
-        name: Name of the collection, for names of files.
-        leagues: League of each order; none where methods cannot be compared.
-        no_league: Why there is none, else empty.
-        sentences: A sentence for each order.
-        differences: For each order, a sentence for each pair of methods that differ.
-        note: What the numbers of the league mean.
-        orders: Orders as they are shown.
-        league: Methods, at each order.
-        pairs: Pairs of methods, at each order; None where there is one method.
-        objects: Objects with their best methods, at each order.
-        failed: Reason for each mesh or object that failed or is missing.
-        not_compared: Comparisons of each mesh that could not be made, and why.
-        summary: Key figures, by keyword.
-        settings: Settings of the collection, by keyword.
-        run: Facts about the latest run, by keyword.
-        versions: Versions, by library.
-        study_text: Collection as TOML.
-        omissions: What the page leaves out.
+    Raises:
+        InputError: No object has tables yet.
     """
-
-    title: str
-    name: str
-    leagues: tuple[League, ...]
-    no_league: str
-    sentences: tuple[str, ...]
-    differences: tuple[tuple[str, ...], ...]
-    note: str
-    orders: tuple[str, ...]
-    league: PageTable
-    pairs: PageTable | None
-    objects: PageTable
-    failed: PageTable | None
-    not_compared: PageTable | None
-    summary: Mapping[str, str]
-    settings: Mapping[str, str]
-    run: Mapping[str, str]
-    versions: Mapping[str, str]
-    study_text: str
-    omissions: tuple[str, ...]
-
-    @classmethod
-    def from_store(cls, collection: CollectionStore, status: Status, limits: ReportLimits) -> Self:
-        """Return the content for the store of a collection.
-
-        Raises:
-            InputError: No object has tables yet.
-        """
-        tables = tables_of(collection.begun)
-        try:
-            leagues, no_league = leagues_of(tables, collection.objects), ""
-        except InputError as error:
-            leagues, no_league = (), str(error)
-        orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
-        objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
-        at_orders = [league.order for league in leagues]
-        ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
-        shown, failures = limits.reasons, status.failed
-        return cls(
-            title=collection.title,
-            name=collection.name,
-            leagues=leagues,
-            no_league=no_league,
-            sentences=tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
-            differences=tuple(tuple(pair_lines(one)) for one in leagues),
-            note=LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
-            orders=tuple(minus(f"{s:g}") for s in orders),
-            league=PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
-            pairs=PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
-            objects=PageTable("objects", _OBJECT_COLUMNS, objects, orders),
-            failed=reasons_table("failed", "mesh", dict(list(failures.items())[:shown])),
-            not_compared=reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:shown])),
-            summary=dict(_summary(tables, orders)),
-            settings=dict(_settings(collection.table)),
-            run=dict(run_facts(status)),
-            versions=open_store(collection.location.below(next(iter(tables)))).attrs["versions"],
-            study_text=study_text(collection.table),
-            omissions=tuple(_omissions(collection, status, leagues, shown)),
-        )
+    tables = tables_of(collection.begun)
+    try:
+        leagues, no_league = leagues_of(tables, collection.objects), ""
+    except InputError as error:
+        leagues, no_league = (), str(error)
+    orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
+    objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
+    at_orders = [league.order for league in leagues]
+    ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
+    shown, failures = limits.reasons, status.failed
+    return {
+        "title": collection.title,
+        "name": collection.name,
+        "leagues": leagues,
+        "no_league": no_league,
+        "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
+        "differences": tuple(tuple(pair_lines(one)) for one in leagues),
+        "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
+        "orders": tuple(minus(f"{s:g}") for s in orders),
+        "league": PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
+        "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
+        "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
+        "failed": reasons_table("failed", "mesh", dict(list(failures.items())[:shown])),
+        "not_compared": reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:shown])),
+        "summary": dict(_summary(tables, orders)),
+        "settings": dict(_settings(collection.table)),
+        "run": dict(run_facts(status)),
+        "versions": open_store(collection.location.below(next(iter(tables)))).attrs["versions"],
+        "study_text": study_text(collection.table),
+        "omissions": tuple(_omissions(collection, status, leagues, shown)),
+    }
 
 
 def _at(leagues: Sequence[League], order: float) -> League | None:

@@ -101,7 +101,7 @@ def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
         return f"No mesh could be compared with {name}."
     if closest is None:
         return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
-    best, rivals = closest.mesh, closest.rivals
+    best, rivals = closest
     # On one line, in a sentence.
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
     doubt = f", and the errors leave open whether {rivals[0]} is nearer" if rivals else ""
@@ -135,7 +135,7 @@ def _nearest_row(label: str, members: pd.DataFrame) -> Row:
     if closest is None:
         is_known = members["distance"].notna().any()
         return _absent(label, "no distance is above its error" if is_known else "no distance is known")
-    best, rivals = closest.mesh, closest.rivals
+    best, rivals = closest
     return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
 
 
@@ -192,86 +192,42 @@ def _names(labels: Sequence[str]) -> str:
     return ", ".join(labels[:_MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-@dataclass(frozen=True)
-class Content:
-    """Texts and tables of a report, none of them escaped.
+def study_content(tree: xr.DataTree, status: Status, limits: ReportLimits) -> dict[str, Any]:
+    """Return the texts and tables of an open store that its template takes, none of them escaped.
 
-    Attributes:
-        title: Title of the study.
-        name: Name of the study, for names of files.
-        reference: Label of its reference.
-        settings: Settings of the study, by keyword.
-        summary: Key figures, by keyword.
-        orders: Orders as they are shown.
-        verdict: Verdict on the study.
-        convergence: Convergence tables of all orders.
-        meshes: Sizes and times of each mesh.
-        failed: Reason for each mesh that failed or is missing.
-        not_compared: Comparisons of each mesh that could not be made, and why.
-        doubtful: Why one doubts that a mesh can be compared with the reference.
-        rtol: Accuracy that the study asks for, or None.
-        has_proximity: True if the tables end with Hausdorff and Chamfer distances.
-        run: Facts about the latest run, by keyword.
-        versions: Versions, by library.
-        study_text: Study as TOML.
+    Raises:
+        InputError: The store has no tables yet.
     """
-
-    title: str
-    name: str
-    reference: str
-    settings: Mapping[str, str]
-    summary: Mapping[str, str]
-    orders: tuple[str, ...]
-    verdict: StudyVerdict
-    convergence: PageTable
-    meshes: PageTable
-    failed: PageTable | None
-    not_compared: PageTable | None
-    doubtful: PageTable | None
-    rtol: float | None
-    has_proximity: bool
-    run: Mapping[str, str]
-    versions: Mapping[str, str]
-    study_text: str
-
-    @classmethod
-    def from_tree(cls, tree: xr.DataTree, status: Status, limits: ReportLimits) -> Content:
-        """Return the content for an open store.
-
-        Raises:
-            InputError: The store has no tables yet.
-        """
-        meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
-        attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
-        families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
-        orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
-        frame, failed = table(tree), _failures(meshes)
-        return cls(
-            title=attributes["title"],
-            name=attributes["study"]["table"]["study"]["name"],
-            reference=convergence.attrs["reference"],
-            settings=dict(_settings(attributes, meshes)),
-            summary=dict(_summary(meshes, convergence, orders)),
-            orders=orders,
-            verdict=StudyVerdict.from_table(frame, failed),
-            convergence=convergence_table(tree, frame, families, limits.convergence_rows // len(orders)),
-            meshes=_meshes_table(meshes, families, limits.mesh_rows),
-            failed=reasons_table("failed", "mesh", failed),
-            not_compared=reasons_table("lacking", "mesh", status.not_compared),
-            doubtful=reasons_table("doubtful", "mesh", placement_doubts(tree)),
-            rtol=convergence.attrs.get("rtol"),
-            has_proximity=has_proximity(tree),
-            run=dict(run_facts(status)),
-            versions=attributes["versions"],
-            study_text=study_text(attributes["study"]["table"]),
-        )
-
-    @property
-    def omissions(self) -> tuple[str, ...]:
-        """Notes on what the tables leave out."""
-        tables = {"distances": self.convergence, "meshes and timings": self.meshes}
-        cut = (f"the table of {name}: {table.omitted:,} more meshes" for name, table in tables.items() if table.omitted)
-        return (*cut, *([f"verdict: only {self.verdict.omitted} are shown"] if self.verdict.omitted else []))
+    meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
+    attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
+    families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
+    orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
+    frame, failed = table(tree), _failures(meshes)
+    verdict = StudyVerdict.from_table(frame, failed)
+    distances = convergence_table(tree, frame, families, limits.convergence_rows // len(orders))
+    sizes = _meshes_table(meshes, families, limits.mesh_rows)
+    tables = {"distances": distances, "meshes and timings": sizes}
+    cut = [f"the table of {name}: {table.omitted:,} more meshes" for name, table in tables.items() if table.omitted]
+    return {
+        "title": attributes["title"],
+        "name": attributes["study"]["table"]["study"]["name"],
+        "reference": convergence.attrs["reference"],
+        "settings": dict(_settings(attributes, meshes)),
+        "summary": dict(_summary(meshes, convergence, orders)),
+        "orders": orders,
+        "verdict": verdict,
+        "convergence": distances,
+        "meshes": sizes,
+        "omissions": [*cut, *([f"verdict: only {verdict.omitted} are shown"] if verdict.omitted else [])],
+        "failed": reasons_table("failed", "mesh", failed),
+        "not_compared": reasons_table("lacking", "mesh", status.not_compared),
+        "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
+        "rtol": convergence.attrs.get("rtol"),
+        "has_proximity": has_proximity(tree),
+        "run": dict(run_facts(status)),
+        "versions": attributes["versions"],
+        "study_text": study_text(attributes["study"]["table"]),
+    }
 
 
 def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:

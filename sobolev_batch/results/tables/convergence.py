@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -76,19 +75,6 @@ standard error."""
 _ACCURACY_NOTE = """\
 The study asks for an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
-
-
-@dataclass(frozen=True, eq=False)
-class Nearest:
-    """The mesh that is nearest to the reference.
-
-    Attributes:
-        mesh: Its row of `table`.
-        rivals: Labels of meshes of which errors leave open whether they are nearer, the nearest first.
-    """
-
-    mesh: pd.Series
-    rivals: tuple[str, ...]
 
 
 _RELATIVE = ["relative", "relative_error"]
@@ -282,8 +268,11 @@ def _cell(column: Column, row: Mapping[Any, Any]) -> str:
     return column.text(row) + (_MARKS[row["mark"]] if column.is_marked else "")
 
 
-def nearest(frame: pd.DataFrame) -> Nearest | None:
-    """Return the nearest mesh among rows of `table` of one order; None where no distance is above its error."""
+def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
+    """Return the nearest mesh among rows of `table` of one order; None where no distance is above its error.
+
+    Beside its row are the labels of meshes of which errors leave open whether they are nearer, the nearest first.
+    """
     rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
     resolved = rows[rows["resolved"].astype(bool)]
     if not len(resolved):
@@ -291,7 +280,7 @@ def nearest(frame: pd.DataFrame) -> Nearest | None:
     best = resolved.iloc[0]
     others = rows[rows["mesh"] != best["mesh"]]
     rivals = others[others["distance"] - others["error"] < best["distance"] + best["error"]]
-    return Nearest(best, tuple(rivals["mesh"]))
+    return best, tuple(rivals["mesh"])
 
 
 def _nearest(frame: pd.DataFrame) -> str:
@@ -299,7 +288,7 @@ def _nearest(frame: pd.DataFrame) -> str:
     closest = nearest(frame)
     if closest is None:
         return ""
-    best, rivals = closest.mesh, closest.rivals
+    best, rivals = closest
     amount = percent(best["relative"], best["relative_error"])
     doubt = f"; its errors leave open whether {rivals[0]} is nearer" if rivals else ""
     return f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."

@@ -161,10 +161,8 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     sections = []
     for order in chosen:
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
-        rows = _Rows.from_distances(distances, values, errors)
         caption = prose([f"Sobolev distances of order {order:g}, {unit}"], style)
-        tables = [rows.table(columns, style) for columns in rows.column_groups(style)]
-        sections.append("\n\n".join([caption, *tables]))
+        sections.append("\n\n".join([caption, *_tables(distances, values, errors, style)]))
     notes = _NOTE.splitlines()
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])
@@ -182,53 +180,34 @@ def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Rea
     return values, errors, "in the square root of a unit length"
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Cells of a printed matrix, of which a symmetric one has only those below the diagonal.
+def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format) -> list[str]:
+    """Return a matrix as tables that follow each other, each with as many columns as a line of text has room for.
 
-    Attributes:
-        names: Number and label of each row.
-        cells: Text of each cell, row by row; empty on and above the diagonal of a symmetric matrix.
-        numbers: Number of the row that has the label of each column.
-        is_symmetric: True if rows and columns are the same meshes.
+    A symmetric matrix has only the cells below its diagonal.
     """
-
-    names: list[str]
-    cells: list[list[str]]
-    numbers: list[int]
-    is_symmetric: bool
-
-    @classmethod
-    def from_distances(cls, distances: xr.Dataset, numbers: Reals, errors: Reals) -> _Rows:
-        """Return the rows of numbers between the meshes of some distances."""
-        labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
-        symmetric = labels == others
-        names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
-        cells = [
-            [
-                "" if symmetric and i <= j else concise(float(numbers[i, j]), float(errors[i, j])) or "missing"
-                for j in range(len(others))
-            ]
-            for i in range(len(labels))
+    labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
+    is_symmetric = labels == others
+    names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
+    cells = [
+        [
+            "" if is_symmetric and i <= j else concise(float(numbers[i, j]), float(errors[i, j])) or "missing"
+            for j in range(len(others))
         ]
-        return cls(names, cells, [labels.index(other) + 1 for other in others], symmetric)
-
-    def column_groups(self, style: Format) -> list[list[int]]:
-        """Return the columns that stand beside each other: as many as a line of text has room for."""
-        columns = [j for j in range(len(self.numbers)) if any(row[j] for row in self.cells)]
-        if style != "text":
-            return [columns]
-        name_width = max(map(len, self.names)) + 2
-        cell_width = max(len(row[j]) for row in self.cells for j in columns) + 2
-        count = max(1, (LINE_LENGTH - name_width) // cell_width)
-        return [columns[start : start + count] for start in range(0, len(columns), count)]
-
-    def table(self, columns: Sequence[int], style: Format) -> str:
+        for i in range(len(labels))
+    ]
+    columns = [j for j in range(len(others)) if any(row[j] for row in cells)]
+    room = max(1, len(columns))
+    if style == "text":
+        cell_width = max((len(row[j]) for row in cells for j in columns), default=0) + 2
+        room = max(1, (LINE_LENGTH - max(map(len, names)) - 2) // cell_width)
+    tables = []
+    for group in [columns[start : start + room] for start in range(0, max(1, len(columns)), room)]:
         # The mesh of the first column has no cells below the diagonal, and is named all the same.
-        named = columns[:1] if self.is_symmetric else []
+        named = group[:1] if is_symmetric else []
         rows = [
-            [name, *(row[j] for j in columns)]
-            for i, (name, row) in enumerate(zip(self.names, self.cells, strict=True))
-            if i in named or any(row[j] for j in columns)
+            [name, *(row[j] for j in group)]
+            for i, (name, row) in enumerate(zip(names, cells, strict=True))
+            if i in named or any(row[j] for j in group)
         ]
-        return printed_table(rows, ["", *(str(self.numbers[j]) for j in columns)], style)
+        tables.append(printed_table(rows, ["", *(str(labels.index(others[j]) + 1) for j in group)], style))
+    return tables
