@@ -42,9 +42,6 @@ from .results.figures.plots import plot_matrix as plot_matrix
 from .results.figures.plots import plot_spectrum as plot_spectrum
 from .results.figures.plots import plot_transform as plot_transform
 from .results.figures.witness_plots import plot_witness as plot_witness
-from .results.tables.league import League as League
-from .results.tables.league import compare_studies as compare_studies
-from .results.tables.league import league as league
 from .results.meshes.export import write_witness as write_witness
 from .results.open import open_store as open_store
 from .results.plan import CollectionPlan as CollectionPlan
@@ -57,6 +54,9 @@ from .results.store_accessor import StoreAccessor as StoreAccessor
 from .results.tables.convergence import smallest_below as smallest_below
 from .results.tables.convergence import table as table
 from .results.tables.evolution import evolution as evolution
+from .results.tables.league import League as League
+from .results.tables.league import compare_studies as compare_studies
+from .results.tables.league import league as league
 from .results.tables.matrix import matrix as matrix
 from .spectral.fields import fourier_transform as fourier_transform
 from .spectral.lattice import Lattice as Lattice

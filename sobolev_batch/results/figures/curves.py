@@ -12,6 +12,7 @@ from matplotlib.ticker import PercentFormatter
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.selection import Selection, spread
 from sobolev_batch.results.figures.style import (
+    LEGEND_BESIDE,
     Plot,
     Reals,
     draw_curve,
@@ -267,7 +268,10 @@ def draw_transform(selection: Selection, families: Sequence[str], axes: Axes) ->
     is_first = list(families) == panels[0] and len(panels) < len(members)
     note = f"{len(panels)} of {len(members)} families" if is_first else ""
     set_title(axes, shortened(", ".join(families), 60), note, omission)
-    axes.legend(fontsize="small", loc="upper right")
+    # Panels have curves of their own, and legends beside them where there is room: axes take 3 / 4 of a figure.
+    is_wide = inches(axes)[0] >= 0.75 * LEGEND_BESIDE
+    beside = {"bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0, "frameon": False} if is_wide else {}
+    axes.legend(fontsize="small", loc="upper left" if is_wide else "best", **beside)
     axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
     axes.set_ylabel("Re of the transform")
     axes.grid(visible=True, alpha=0.3)

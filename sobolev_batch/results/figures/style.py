@@ -41,7 +41,7 @@ _DASHES = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1)))
 _LONGEST_LABEL = 24
 # Inches: a legend stands beside the panels of a figure of this width, else below them; sizes of a line, of a handle
 # and of a character; and the fractions of the height that it may take.
-_LEGEND_BESIDE, _LEGEND_LINE, _LEGEND_HANDLE, _LEGEND_CHARACTER = 5.0, 0.17, 0.5, 0.07
+LEGEND_BESIDE, _LEGEND_LINE, _LEGEND_HANDLE, _LEGEND_CHARACTER = 5.0, 0.17, 0.5, 0.07
 _HIGHEST_BESIDE, _HIGHEST_BELOW = 0.9, 0.4
 # An error bar makes the axis no longer than this below its value, as a fraction of it; the rest is cut off.
 _SHOWN_OF_BARS = 0.25
@@ -129,7 +129,7 @@ def _add_legend(figure: Figure) -> None:
         return
     width, height = figure.get_size_inches()
     lines = int(_HIGHEST_BESIDE * height / _LEGEND_LINE)
-    is_beside = width >= _LEGEND_BESIDE and len(entries) <= lines
+    is_beside = width >= LEGEND_BESIDE and len(entries) <= lines
     column = _LEGEND_HANDLE + _LEGEND_CHARACTER * max(map(len, entries))
     columns = 1 if is_beside else max(1, int(width / column))
     most = lines if is_beside else max(2, columns * int(_HIGHEST_BELOW * height / _LEGEND_LINE))
@@ -227,7 +227,7 @@ class Output:
     @contextmanager
     def drawing(self) -> Iterator[None]:
         """Draw and save with text that can be read at this size, and edited in an SVG; nothing stays set afterwards."""
-        is_narrow = self.size is not None and self.size[0] < _LEGEND_BESIDE
+        is_narrow = self.size is not None and self.size[0] < LEGEND_BESIDE
         settings: dict[Any, Any] = {"font.size": _SMALL_FONT_SIZE if is_narrow else _FONT_SIZE, "svg.fonttype": "none"}
         with mpl.rc_context(settings):
             yield
