@@ -6,7 +6,6 @@ import logging
 import os
 import re
 import signal
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,16 @@ from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Watch
 from tests.faults.fatal import Moment, fatal
-from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.processes import (
+    PATIENCE_SECONDS,
+    SCHEDULER,
+    WORKER,
+    dask,
+    scheduler_address,
+    stop,
+    tcp_cluster,
+    wait_until,
+)
 from tests.support.stores import assert_same_fields, assert_same_tables
 
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
@@ -118,10 +126,7 @@ def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path,
 def test_a_cluster_without_workers_is_told() -> None:
     def told(address: str, needs_gpu: bool) -> str:
         with Client(address) as client, Watch(client, needs_gpu, 60).kept() as kept:
-            for _ in range(PATIENCE_SECONDS):
-                if kept.obstacle or threading.Event().wait(1.0):
-                    break
-            return kept.obstacle
+            return wait_until(lambda: kept.obstacle)
 
     with tcp_cluster() as (address, _):
         assert told(address, False) == "no worker is left; waiting for one to start"

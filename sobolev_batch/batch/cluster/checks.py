@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import uuid
 from collections.abc import Iterable, Mapping
 
 from distributed import Client
@@ -24,8 +22,6 @@ _OF_NUMBERS = (
 )
 # Not every study needs these. Processes that have them must have the same.
 _OF_EXTRAS = ("pyacvd", "vtk")
-# One for each process that imports this; a forked process has its parent's, but another number.
-_PROCESS = uuid.uuid4().hex
 
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:
@@ -92,30 +88,23 @@ def require_store_access(client: Client, location: Location, lock: Lock) -> None
     Raises:
         StoreError: A worker does not see it; the message names the worker.
     """
-    for worker, answer in client.run(_look, location, lock, on_error="return").items():
-        if isinstance(answer, BaseException):
+    for worker, problem in client.run(_problem, location, lock, on_error="return").items():
+        if isinstance(problem, BaseException):
             # A worker that has just gone says nothing about the store; tasks will tell.
-            _log.warning("the worker %s does not say whether it reaches %s: %s", worker, location, answer)
-            continue
-        process, problem = answer
-        if location.is_in_memory and process != _this_process():
+            _log.warning("the worker %s does not say whether it reaches %s: %s", worker, location, problem)
+        elif problem and location.is_in_memory:
             raise StoreError(
                 f"{location}: what is written there stays in the memory of one process, and the worker {worker} is "
                 "another one; name a folder or an s3:// URL, or leave out the client"
             )
-        if problem:
+        elif problem:
             raise StoreError(f"the worker {worker} cannot use the store: {problem}")
 
 
-def _look(location: Location, lock: Lock) -> tuple[str, str]:
-    """Return the process that runs this, and why it does not see the store."""
+def _problem(location: Location, lock: Lock) -> str:
+    """Return why the process that runs this does not see the store; empty if it does."""
     try:
         sees_lock = lock.is_held(location)
     except StoreError as error:
-        return _this_process(), str(error)
-    elsewhere = f"{location} is another place there; name one that all machines share"
-    return _this_process(), "" if sees_lock else elsewhere
-
-
-def _this_process() -> str:
-    return f"{_PROCESS}/{os.getpid()}"
+        return str(error)
+    return "" if sees_lock else f"{location} is another place there; name one that all machines share"

@@ -6,11 +6,10 @@ A location holds no credentials, so it can be stored, logged and sent to a worke
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 from fsspec import available_protocols
 from zarr.abc.store import Store as ZarrStore
@@ -22,13 +21,6 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
 
 
-class Fence(Protocol):
-    """Condition on every write to a location."""
-
-    def require(self, location: Location) -> None:
-        """Raise a `StoreError` unless the location may be written."""
-
-
 @dataclass(frozen=True)
 class Location:
     """Location of a store. It is cheap to make, to compare and to pickle, and nothing is accessed in advance.
@@ -37,11 +29,11 @@ class Location:
 
     Attributes:
         name: Path, or URL such as s3://bucket/name.zarr, without credentials.
-        fence: Condition on every write, if there is one.
+        fence: Function that raises a `StoreError` unless the location may be written; called before every write.
     """
 
     name: str
-    fence: Fence | None = field(default=None, compare=False, repr=False)
+    fence: Callable[[Location], None] | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def parse(cls, store: str | Path | Location) -> Location:
@@ -83,7 +75,7 @@ class Location:
         """Return the same location for processes that were started in another folder."""
         return self if self.scheme else replace(self, name=str(Path(self.name).absolute()))
 
-    def fenced(self, fence: Fence) -> Location:
+    def fenced(self, fence: Callable[[Location], None]) -> Location:
         """Return the same location for writers that have to stop once a condition fails."""
         return replace(self, fence=fence)
 
@@ -199,7 +191,7 @@ class Location:
             verb: Kind of access: "read", or "written", which the fence has to allow.
         """
         if verb == "written" and self.fence is not None:
-            self.fence.require(self)
+            self.fence(self)
         try:
             yield
         except SobolevBatchError:

@@ -17,9 +17,10 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 from uuid import uuid4
@@ -37,28 +38,6 @@ LOCK_KEY = "claim.json"
 # Held during a takeover, since several drivers may try.
 _TAKEOVER_KEY = "claim.succession.json"
 LOCK_KEYS = frozenset({LOCK_KEY, _TAKEOVER_KEY})
-
-
-@dataclass(frozen=True)
-class RunFence:
-    """Condition that a run has the store to itself. Tasks take it along.
-
-    Attributes:
-        run: Run that has to hold the lock.
-    """
-
-    run: str
-
-    def require(self, location: Location) -> None:
-        """Check that the run still has the store.
-
-        Raises:
-            LockError: The run is over, its store was released, or another run has it.
-        """
-        lock = Lock.read(location)
-        if lock is None or lock.run != self.run:
-            others = "the store was released, or its run is over" if lock is None else f"{lock.driver} has it now"
-            raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 @dataclass(frozen=True)
@@ -108,9 +87,9 @@ class Lock:
             return cls("", "", "a process that has not written its name", "an unknown time")
 
     @property
-    def fence(self) -> RunFence:
-        """Condition that the run of this lock has the store."""
-        return RunFence(self.run)
+    def fence(self) -> Callable[[Location], None]:
+        """Condition that the run of this lock has the store, which tasks take along."""
+        return partial(_require_run, self.run)
 
     @property
     def holder_is_gone(self) -> bool:
@@ -141,6 +120,18 @@ class Lock:
         """
         if not self.is_held(location):
             raise LockError(f"{location}: the store was released, or removed, and is no longer that of this process")
+
+
+def _require_run(run: str, location: Location) -> None:
+    """Check that a run still has the store.
+
+    Raises:
+        LockError: The run is over, its store was released, or another run has it.
+    """
+    lock = Lock.read(location)
+    if lock is None or lock.run != run:
+        others = "the store was released, or its run is over" if lock is None else f"{lock.driver} has it now"
+        raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 @contextmanager

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from distributed import Client, LocalCluster
 
 from sobolev_batch import AddressError, ClusterError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
 from tests.support.recipes import write_study
@@ -118,67 +117,31 @@ def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def listening(*processes: psutil.Process) -> set[tuple[str, int]]:
-    """The addresses that processes and all that they started listen at."""
-    everyone = [one for process in processes for one in (process, *process.children(recursive=True))]
+def listening() -> set[tuple[str, int]]:
+    """The addresses that this process and all that it started listen at."""
     return {
         (connection.laddr.ip, connection.laddr.port)
-        for one in everyone
-        for connection in one.net_connections(kind="inet")
+        for process in (psutil.Process(), *psutil.Process().children(recursive=True))
+        for connection in process.net_connections(kind="inet")
         if connection.status == psutil.CONN_LISTEN
     }
 
 
-RUN = """
-import sys
-import sobolev_batch as sb
-
-def pause(progress):
-    if progress.stage == "fields" and progress.done == 1:
-        print(flush=True)
-        sys.stdin.readline()
-
-if __name__ == "__main__":
-    sb.run(sb.Study.from_toml(sys.argv[1]), sys.argv[2], workers=2, on_progress=pause)
-"""
-# The command itself, stopped where it would draw.
-COMMAND = """
-import sys
-from sobolev_batch import cli
-from sobolev_batch.cli import studies
-
-class Pausing(studies.Reporter):
-    def __call__(self, progress):
-        super().__call__(progress)
-        if progress.stage == "fields" and progress.done == 1:
-            print(flush=True)
-            sys.stdin.readline()
-
-if __name__ == "__main__":
-    studies.Reporter = Pausing
-    sys.argv[1:] = ["run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
-    cli.main()
-"""
-
-
-@pytest.mark.all
 @pytest.mark.parametrize(
-    ("script", "store", "least"),
-    [(RUN, "of-run.zarr", 4), (COMMAND, "of-command.zarr", 4), (RUN, "memory://of-threads", 2)],
-    ids=["run", "command", "threads"],
+    ("store", "least"), [pytest.param("", 4, marks=pytest.mark.all), ("memory://of-threads", 2)], ids=["run", "threads"]
 )
-def test_every_port_of_a_run_is_on_loopback(script: str, store: str, least: int, tmp_path: Path) -> None:
+def test_every_port_of_a_run_is_on_loopback(store: str, least: int, study: Study, store_path: Path) -> None:
     """Scheduler, its dashboard, each worker with its nanny and web pages; threads have web pages alone."""
-    write_study(tmp_path)
-    (tmp_path / "script.py").write_text(script)
-    command = [sys.executable, "script.py", "study.toml", store]
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        process.stdout.readline()  # it computes, and waits
-        found = listening(psutil.Process(process.pid))
-        errors = process.communicate("\n", timeout=PATIENCE_SECONDS)[1]
-    assert process.returncode == 0, errors
+    before, found = listening(), set[tuple[str, int]]()
+
+    def look(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done == 1:
+            found.update(listening() - before)
+        elif progress.stage == "cluster":
+            links.append(progress.label)
+
+    links: list[str] = []
+    run(study, store or store_path, workers=2, on_progress=look)
     assert {ip for ip, _ in found} <= {"127.0.0.1", "::1"}, found
     assert len(found) >= least, found
+    assert links[0] in {f"http://{ip}:{port}/status" for ip, port in found}

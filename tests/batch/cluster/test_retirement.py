@@ -9,20 +9,21 @@ import os
 import subprocess
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from distributed import Client, Worker
 
-from sobolev_batch import Study, icosphere, open_store, run
+from sobolev_batch import Study, icosphere, run
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, wait_until
-from tests.support.studies import small_table, variable
+from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.studies import small_table
 
 pytestmark = pytest.mark.all
 
@@ -67,114 +68,66 @@ def study(tmp_path: Path) -> Study:
 
 
 class Gate:
-    """Holds whoever loads a mesh file, once it is begun, until it is opened."""
+    """Holds the first who loads a mesh file, once it is begun, until it is opened."""
 
     def __init__(self, path: Path) -> None:
         self.path = gate.gate_of(path)
-        self.aside = path.with_suffix(".aside")
         os.mkfifo(self.path)
 
-    def set_aside(self) -> None:
-        """Let everybody pass but those who wait already."""
-        self.path.rename(self.aside)
+    def await_one(self) -> None:
+        """Wait until somebody is at the gate, and let everybody else pass."""
+        self.writer = wait_until(self._writer)
+        self.path.unlink()
 
-    def open(self) -> bool:
-        """Let those pass who wait; whether there are any."""
+    def _writer(self) -> int | None:
         try:
-            os.close(os.open(self.aside, os.O_WRONLY | os.O_NONBLOCK))
-        except OSError:
-            return False
-        return True
+            return os.open(self.path, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:  # nobody reads
+            return None
+
+    def open(self) -> None:
+        """Let those pass who wait."""
+        if self.writer is not None:
+            os.close(self.writer)
 
 
-def check_store(client: Client, study: Study, path: Path, other: Path) -> None:
-    """All meshes are complete, and their fields and distances those of an undisturbed run."""
-    run(study, other, client)
-    assert [record.status for record in Store.open(path).records() if record] == ["complete"] * 5
-    ours, theirs = open_store(path), open_store(other)
-    for group, name in (("fourier", "fourier"), ("distances", "distance")):
-        assert np.array_equal(variable(ours, group, name).values, variable(theirs, group, name).values)
-    assert np.isfinite(variable(ours, "fourier", "fourier").values).all()
-
-
-def test_a_task_of_a_retired_worker_is_done_by_one_that_joined_late(
-    cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
-) -> None:
-    processes = [cluster.start(), cluster.start()]
-    records: list[Any] = []
-    with Client(cluster.address) as ours:
-        ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
-        early = set(ours.scheduler_info(n_workers=-1)["workers"])
-        held: Gate | None = None
-
-        def disturb(progress: Progress) -> None:
-            nonlocal held
-            if progress.stage == "cluster":
-                held = Gate(study.folder / "0.off")  # what it depends on is known, nothing is submitted yet
-            if progress.record is not None:
-                records.append(progress.record)
-            if progress.stage == "fields" and progress.done == progress.total - 1:
-                assert held is not None
-                busy = [worker for worker, keys in ours.processing().items() if keys]
-                assert len(busy) == 1
-                held.set_aside()
-                cluster.start()
-                ours.wait_for_workers(3, timeout=PATIENCE_SECONDS)
-                # The one in the middle of its task, and the one that could have taken it.
-                ours.retire_workers(list(early))
-
-        summary = run(study, store_path, ours, on_progress=disturb)
-    assert len(summary.computed) == 5
-    assert summary.failed == {}
-    assert {record.worker for record in records[:-1]} <= early
-    assert records[-1].worker not in early
-    # What had begun on the retired worker ends there after all: it comes too late, and leaves the store alone.
-    assert held is not None
-    assert held.open()
-    for process in processes:
-        process.communicate(timeout=PATIENCE_SECONDS)
-    last = next(record for record in Store.open(store_path).records() if record and record.key == records[-1].key)
-    assert last.worker not in early
-    check_store(client, study, store_path, tmp_path / "undisturbed.zarr")
-
-
-def test_a_worker_at_the_end_of_its_lifetime_hands_on_its_work(
-    cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
+@pytest.mark.parametrize("way", ["retired", "at the end of its lifetime"])
+def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in(
+    way: str, cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
 ) -> None:
     leaving = cluster.start()
     left = threading.Event()
-
-    with Client(cluster.address) as ours, following(ours, "remove-worker", left):
+    gates: list[Gate] = []
+    with Client(cluster.address) as ours, following(ours, "remove-worker", left), ThreadPoolExecutor(1) as pool:
         ours.wait_for_workers(1, timeout=PATIENCE_SECONDS)
-        first = next(iter(ours.scheduler_info()["workers"]))
-        held: Gate | None = None
+        (first,) = ours.scheduler_info()["workers"]
+
+        def replace() -> None:
+            gates[0].await_one()
+            if way == "retired":
+                cluster.start()
+                ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
+                ours.retire_workers([first])
+            else:
+                ours.run(end_lifetime)
+                assert left.wait(timeout=PATIENCE_SECONDS)
+                cluster.start()
 
         def disturb(progress: Progress) -> None:
-            nonlocal held
             if progress.stage == "cluster":
-                held = Gate(study.folder / "0.off")
-                threading.Thread(target=replace, args=(held,)).start()
-
-        def replace(held: Gate) -> None:
-            wait_until(lambda: any(ours.run(executing).values()))
-            ours.run(end_lifetime)
-            assert left.wait(timeout=PATIENCE_SECONDS)
-            held.set_aside()
-            cluster.start()
+                gates.append(Gate(study.folder / "0.off"))
+                pool.submit(replace)
 
         summary = run(study, store_path, ours, on_progress=disturb)
-    assert len(summary.computed) == 5
-    assert held is not None
-    held.open()
+    assert (len(summary.computed), summary.failed) == (5, {})
+    # What had begun on the worker ends there after all: it comes too late, and leaves the store alone.
+    gates[0].open()
     leaving.communicate(timeout=PATIENCE_SECONDS)
-    workers = {record.worker for record in Store.open(store_path).records() if record}
-    assert workers - {first}
-    check_store(client, study, store_path, tmp_path / "undisturbed.zarr")
-
-
-def executing(dask_worker: Worker) -> int:
-    """Return how many tasks the worker is in the middle of."""
-    return len(dask_worker.state.executing)
+    assert {record.worker for record in Store.open(store_path).records() if record} - {first}
+    run(study, tmp_path / "undisturbed.zarr", client)
+    assert [record.status for record in Store.open(store_path).records() if record] == ["complete"] * 5
+    assert_same_fields(store_path, tmp_path / "undisturbed.zarr")
+    assert_same_tables(store_path, tmp_path / "undisturbed.zarr")
 
 
 def end_lifetime(dask_worker: Worker) -> None:

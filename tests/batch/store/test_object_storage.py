@@ -15,7 +15,6 @@ from threading import Barrier
 
 import fsspec
 import numpy as np
-import psutil
 import pytest
 import xarray as xr
 from distributed import Client
@@ -350,20 +349,6 @@ def test_a_store_in_memory_is_refused_where_workers_are_other_processes(client: 
         run(study, "memory://d/results.zarr", client, on_progress=steps.append)
     assert steps == []
     assert not fsspec.filesystem("memory").exists("/d")
-
-
-def test_a_cluster_of_threads_listens_on_loopback_only() -> None:
-    before = listening()
-    with thread_client(1) as client:
-        opened = listening() - before
-        assert client.dashboard_link in {f"http://{ip}:{port}/status" for ip, port in opened}
-        assert {ip for ip, _ in opened} == {"127.0.0.1"}
-
-
-def listening() -> set[tuple[str, int]]:
-    """The addresses at which this process takes connections."""
-    found = psutil.Process().net_connections(kind="inet")
-    return {(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN}
 
 
 def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
