@@ -90,9 +90,9 @@ class CollectionStore:
 
 
 def for_each_object(
-    collection: StudyCollection, location: Location, act: Callable[[Study, Location], Result]
+    collection: StudyCollection, location: Location, act: Callable[[str, Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Act on the study of each object and its store. An object that cannot be carried out stops no other.
+    """Act on the name, the study and the store of each object. An object that cannot be carried out stops no other.
 
     Returns:
         Results by the name of the object, and the reason for each object that has none.
@@ -105,7 +105,7 @@ def for_each_object(
     stores = CollectionStore.for_collection(location, collection).stores
     for name, study in collection.studies.items():
         try:
-            results[name] = act(study, stores[name])
+            results[name] = act(name, study, stores[name])
         except StoreError:
             raise
         except InputError as error:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Self
+from typing import TypeVar
 
 import numpy as np
 from distributed import Client
@@ -19,7 +20,7 @@ from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
-from sobolev_batch.batch.collection_store import CollectionStore
+from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
 from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
@@ -32,13 +33,15 @@ from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
-from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.html import reasons, table_html
 from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.errors.budget import NormEstimate
 
 _log = logging.getLogger(__name__)
+
+Entry = TypeVar("Entry")
 
 # A study whose distances fall short of the accuracy asked for is computed again on a larger lattice,
 # this often in all.
@@ -84,18 +87,6 @@ class Summary:
                 *reasons("not compared", self.not_compared),
                 *reasons("imprecise", errors),
             ],
-        )
-
-    @classmethod
-    def _of(cls, workspace: Workspace, computed: set[int]) -> Self:
-        labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
-        return cls(
-            workspace.store.path,
-            tuple(label for i, label in labels.items() if i in computed and label not in failed),
-            tuple(label for i, label in labels.items() if i not in computed),
-            failed,
-            _not_compared(workspace),
-            _imprecise(workspace),
         )
 
 
@@ -162,13 +153,13 @@ def run(
     2
     """
     require_give_up_after(give_up_after)
-    location, reusable = Location.parse(store), _Reusable.from_locations([Location.parse(other) for other in reuse])
+    location, reusable = Location.parse(store), _reusable_stores([Location.parse(other) for other in reuse])
     cluster: AbstractContextManager[Client]
     if client is None:
         # The workers of another cluster are asked before anything is computed.
-        for one in [study] if isinstance(study, Study) else study.studies.values():
-            if one.accuracy is not None and one.accuracy.asks_for_memory:
-                require_machine_memory(one.accuracy.allowed_bytes, "[accuracy]: memory")
+        for part in [study] if isinstance(study, Study) else study.studies.values():
+            if part.accuracy is not None and part.accuracy.asks_for_memory:
+                require_machine_memory(part.accuracy.allowed_bytes, "[accuracy]: memory")
         if memory is not None:
             # Otherwise a store would be made before the cluster refuses it.
             memory_limit(memory, workers or available_cores())
@@ -176,224 +167,198 @@ def run(
         cluster = thread_client(workers) if location.is_in_memory else local_client(workers, memory)
     else:
         location, cluster = location.absolute(), nullcontext(client)
-    for other in reusable.of_all():
-        Store.open(other)
-    job = _Job(cluster, client, on_progress or (lambda progress: None), give_up_after)
-    if isinstance(study, StudyCollection):
-        return job.run_every(study, location, reusable)
-    return job.run(study, location, reusable.of_all())
+    with ExitStack() as stack:
+        # One cluster serves all studies, and none is started where nothing is missing.
+        start = cache(lambda: stack.enter_context(cluster))
+        driver = Driver(start, give_up_after, on_progress or (lambda progress: None), client is not None)
+        if isinstance(study, StudyCollection):
+            return _run_collection(study, location, driver, reusable)
+        others = [place for stores in reusable for place in stores.values()]
+        return _run_study(study, location, driver, others)
 
 
-@dataclass(frozen=True)
-class _Reusable:
-    """Other stores, whose fields are taken over.
+def _reusable_stores(locations: Iterable[Location]) -> list[Mapping[str, Location]]:
+    """Return the stores at each location by the names of their objects; that of a single study has no name.
 
-    Attributes:
-        single: Stores of single objects.
-        collections: Stores of the objects of each collection, by name.
+    Raises:
+        StoreError: One of them does not exist or cannot be read.
     """
-
-    single: tuple[Location, ...]
-    collections: tuple[Mapping[str, Location], ...]
-
-    @classmethod
-    def from_locations(cls, locations: Sequence[Location]) -> Self:
-        """Return the stores at locations, of single objects or of collections."""
-        found = {location: CollectionStore.found(location) for location in locations}
-        return cls(
-            tuple(location for location, collection in found.items() if collection is None),
-            tuple(collection.begun for collection in found.values() if collection is not None),
-        )
-
-    def of_object(self, name: str) -> tuple[Location, ...]:
-        """Return the stores that may have fields of an object."""
-        return (*self.single, *(stores[name] for stores in self.collections if name in stores))
-
-    def of_all(self) -> tuple[Location, ...]:
-        """Return all stores."""
-        return (*self.single, *(store for stores in self.collections for store in stores.values()))
+    reusable: list[Mapping[str, Location]] = []
+    for location in locations:
+        collection = CollectionStore.found(location)
+        stores = {"": location} if collection is None else collection.begun
+        for place in stores.values():
+            Store.open(place)
+        reusable.append(stores)
+    return reusable
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Settings that all studies of one call of `run` share.
-
-    Attributes:
-        clients: Context that gives the client of the cluster.
-        client: Client that the caller has given, if any.
-        notify: Callback for each step.
-        give_up_after: Seconds after which what is silent is given up.
-    """
-
-    clients: AbstractContextManager[Client]
-    client: Client | None
-    notify: Notify
-    give_up_after: float
-
-    def run(self, study: Study, location: Location, others: Sequence[Location]) -> Summary:
-        """Run one study, and take over fields of other stores."""
-        lock = Lock.of_this_process()
-        require_usable(location)
-        with locked(location, lock):
-            if self.client is not None:
-                with Watch(self.client, False, self.give_up_after).kept():
-                    require_store_access(self.client, location, lock)
-            return carry_out(study, location, lock, self.clients, self.notify, self.give_up_after, others)
-
-    def telling(self, part: str) -> Self:
-        """Return the job of a part of a collection, whose progress names it."""
-        return replace(self, notify=lambda progress: self.notify(replace(progress, part=part)))
-
-    def run_every(self, collection: StudyCollection, location: Location, reusable: _Reusable) -> Summary:
-        """Run the study of each object of a collection. One that cannot be carried out stops no other."""
-        stores = CollectionStore.prepared(location, collection).stores
-        summaries: dict[str, Summary] = {}
-        failed: dict[str, str] = {}
-        with ExitStack() as stack:
-            job = replace(self, clients=_EnteredOnce(self.clients, stack))
-            for number, (name, study) in enumerate(collection.studies.items(), 1):
-                part = f"{name}, {number} of {len(stores)}"
-                try:
-                    summaries[name] = job.telling(part).run(study, stores[name], reusable.of_object(name))
-                except StoreError:
-                    # That of the next object would not fare better.
-                    raise
-                except InputError as error:
-                    _log.error("%s: %s", name, error)
-                    failed[name] = str(error)
-        return Summary(
-            str(location),
-            tuple(f"{name}/{label}" for name, summary in summaries.items() for label in summary.computed),
-            tuple(f"{name}/{label}" for name, summary in summaries.items() for label in summary.reused),
-            failed
-            | {f"{name}/{label}": why for name, summary in summaries.items() for label, why in summary.failed.items()},
-            {f"{name}/{label}": why for name, one in summaries.items() for label, why in one.not_compared.items()},
-            {f"{name}/{label}": error for name, one in summaries.items() for label, error in one.imprecise.items()},
-        )
-
-
-class _EnteredOnce(AbstractContextManager[Client]):
-    """A context that is entered when it is first needed, and left with a stack: one cluster for many studies."""
-
-    def __init__(self, clients: AbstractContextManager[Client], stack: ExitStack) -> None:
-        self._clients, self._stack = clients, stack
-        self._client: Client | None = None
-
-    def __enter__(self) -> Client:
-        if self._client is None:
-            self._client = self._stack.enter_context(self._clients)
-        return self._client
-
-    def __exit__(self, *error: object) -> None:
-        """Leave the context to the stack."""
-
-
-def carry_out(
-    study: Study,
-    location: Location,
-    lock: Lock,
-    clients: AbstractContextManager[Client],
-    notify: Notify,
-    give_up_after: float,
-    others: Sequence[Location] = (),
-) -> Summary:
-    """Run a study in a store that this process has locked; see `run`.
+def _run_study(study: Study, location: Location, driver: Driver, others: Sequence[Location]) -> Summary:
+    """Lock the store of a study and run it.
 
     Args:
-        study: Study to carry out.
-        location: Location of the store.
-        lock: Lock of the store.
-        clients: Context that gives the client, entered if anything is missing.
-        notify: Callback for each step.
-        give_up_after: Seconds after which what is silent is given up.
-        others: Other stores, whose fields are taken over.
+        study: Study to run.
+        location: Location of its store.
+        driver: Driver of the run.
+        others: Other stores, whose fields are copied.
     """
-    plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
-    # Planning may take minutes.
-    lock.require(location)
-    workspace = Workspace.prepared(location.fenced(lock.fence), plan)
-    with Heartbeat(workspace.store, lock) as heartbeat:
-        workspace.withdraw_lost_fields()
-        if others:
-            workspace.withdraw_results_of(copy_fields(workspace, others))
-        if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
-            return Summary._of(workspace, set())
-        with clients as client, Watch(client, study.backend == "gpu", give_up_after).kept() as watch:
-            heartbeat.find_obstacle = lambda: watch.obstacle
-            heartbeat.cluster = client.scheduler.address
-            heartbeat.write("running")
-            notify(Progress("cluster", 0, 0, client.dashboard_link))
+    lock = Lock.of_this_process()
+    require_usable(location)
+    with locked(location, lock):
+        if driver.has_foreign_cluster:
+            client = driver.client()
+            with Watch(client, False, driver.give_up_after).kept():
+                require_store_access(client, location, lock)
+        return driver.run(study, location, lock, others)
 
-            def beat(progress: Progress) -> None:
-                heartbeat.require_lock()
-                heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
-                notify(progress)
 
-            cluster = Cluster.prepare(client, study.libraries, beat)
-            # Asked before anything is computed: a GPU that nobody has would be waited for.
-            cluster.workers.with_backend(study.backend)
-            cluster.workers.require_accuracy(study.accuracy)
-            return _Run(cluster, heartbeat).carry_out(workspace)
+def _run_collection(
+    collection: StudyCollection, location: Location, driver: Driver, reusable: Sequence[Mapping[str, Location]]
+) -> Summary:
+    """Run the study of each object of a collection; see `_run_study`."""
+    CollectionStore.prepared(location, collection)
+    names = list(collection.studies)
+
+    def run_object(name: str, study: Study, place: Location) -> Summary:
+        part = f"{name}, {names.index(name) + 1} of {len(names)}"
+        telling = replace(driver, notify=lambda progress: driver.notify(replace(progress, part=part)))
+        others = [stores[key] for stores in reusable for key in ("", name) if key in stores]
+        try:
+            return _run_study(study, place, telling, others)
+        except InputError as error:
+            _log.error("%s: %s", name, error)
+            raise
+
+    summaries, refused = for_each_object(collection, location, run_object)
+
+    def labels(of: Callable[[Summary], Iterable[str]]) -> tuple[str, ...]:
+        return tuple(f"{name}/{label}" for name, summary in summaries.items() for label in of(summary))
+
+    def entries(of: Callable[[Summary], Mapping[str, Entry]]) -> dict[str, Entry]:
+        return {f"{name}/{label}": entry for name, summary in summaries.items() for label, entry in of(summary).items()}
+
+    return Summary(
+        str(location),
+        labels(lambda summary: summary.computed),
+        labels(lambda summary: summary.reused),
+        refused | entries(lambda summary: summary.failed),
+        entries(lambda summary: summary.not_compared),
+        entries(lambda summary: summary.imprecise),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Run:
-    """The computation of everything that a workspace lacks.
+class Driver:
+    """The process that drives runs, and its cluster.
 
     Attributes:
-        cluster: Cluster to compute on.
-        heartbeat: Heartbeat of the run.
+        client: Function that returns the client of the cluster, called if anything is missing.
+        give_up_after: Seconds after which what is silent is given up.
+        notify: Callback for each step.
+        has_foreign_cluster: True if the caller has started the cluster, whose workers may see another store.
     """
 
-    cluster: Cluster
-    heartbeat: Heartbeat
+    client: Callable[[], Client]
+    give_up_after: float
+    notify: Notify = lambda progress: None
+    has_foreign_cluster: bool = False
 
-    def carry_out(self, workspace: Workspace) -> Summary:
-        """Compute, on larger lattices until the accuracy is reached, and measure proximities."""
-        rows = workspace.pending
-        workspace.withdraw_results_of(rows)
-        computed: set[int] = set()
-        for rounds_left in reversed(range(_MOST_ROUNDS)):
-            repaired, distances = self._repairing(workspace, rows)
-            computed.update(rows, repaired)
-            choice = _larger_lattice(workspace.plan, distances) if rounds_left else None
-            if choice is None:
-                break
-            # The records are laid out anew, that of the run with them.
-            with self.heartbeat.paused():
-                workspace = Workspace.prepared(workspace.store.location, workspace.plan.with_choice(choice))
-            self.heartbeat.write("running")
+    def run(self, study: Study, location: Location, lock: Lock, others: Sequence[Location] = ()) -> Summary:
+        """Run a study in a store that this process has locked; see `run`.
+
+        Args:
+            study: Study to run.
+            location: Location of the store.
+            lock: Lock of the store.
+            others: Other stores, whose fields are copied.
+        """
+        plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
+        # Planning may take minutes.
+        lock.require(location)
+        workspace = Workspace.prepared(location.fenced(lock.fence), plan)
+        with Heartbeat(workspace.store, lock) as heartbeat:
             workspace.withdraw_lost_fields()
-            rows = workspace.pending
-        measure_proximities(self.cluster, workspace)
-        return Summary._of(workspace, computed)
+            if others:
+                workspace.withdraw_results_of(copy_fields(workspace, others))
+            if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
+                return _summary(workspace, set())
+            client = self.client()
+            with Watch(client, study.backend == "gpu", self.give_up_after).kept() as watch:
+                heartbeat.find_obstacle = lambda: watch.obstacle
+                heartbeat.cluster = client.scheduler.address
+                heartbeat.write("running")
+                self.notify(Progress("cluster", 0, 0, client.dashboard_link))
 
-    def _compute(self, workspace: Workspace, rows: Sequence[int]) -> NormEstimate | None:
-        """Compute the fields of rows and the tables, and return the distances to the reference if they are new."""
-        compute_fields(self.cluster, workspace, rows)
-        return tabulate_fields(self.cluster, workspace)
+                def beat(progress: Progress) -> None:
+                    heartbeat.require_lock()
+                    heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
+                    self.notify(progress)
 
-    def _repairing(self, workspace: Workspace, rows: Sequence[int]) -> tuple[set[int], NormEstimate | None]:
-        """Compute, again with the rows that turn out damaged, and return these rows and what `_compute` does."""
-        repaired: set[int] = set()
-        for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
-            try:
-                return repaired, self._compute(workspace, rows)
-            except DamageError as error:
-                if not attempts_left:
-                    raise
-                _log.warning("%s", error)
-                # Where one is damaged, others may be.
-                rows = damaged_rows(self.cluster, workspace)
-                workspace.withdraw(rows, "its values are not what was stored")
-                repaired.update(rows)
-        raise AssertionError("unreachable: the last attempt returns or raises")
+                cluster = Cluster.prepare(client, study.libraries, beat)
+                # Asked before anything is computed: a GPU that nobody has would be waited for.
+                cluster.workers.with_backend(study.backend)
+                cluster.workers.require_accuracy(study.accuracy)
+                return _compute(cluster, heartbeat, workspace)
 
 
-def _not_compared(workspace: Workspace) -> dict[str, str]:
-    if workspace.plan.study.proximity is None:
-        return {}
-    return failed_proximities(dict(enumerate(workspace.labels)), workspace.complete)
+def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Summary:
+    """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities."""
+    rows = workspace.pending
+    workspace.withdraw_results_of(rows)
+    computed: set[int] = set()
+    for rounds_left in reversed(range(_MOST_ROUNDS)):
+        repaired, distances = _compute_repairing(cluster, workspace, rows)
+        computed.update(rows, repaired)
+        choice = _larger_lattice(workspace.plan, distances) if rounds_left else None
+        if choice is None:
+            break
+        # The records are laid out anew, that of the run with them.
+        with heartbeat.paused():
+            workspace = Workspace.prepared(workspace.store.location, workspace.plan.with_choice(choice))
+        heartbeat.write("running")
+        workspace.withdraw_lost_fields()
+        rows = workspace.pending
+    measure_proximities(cluster, workspace)
+    return _summary(workspace, computed)
+
+
+def _compute_repairing(
+    cluster: Cluster, workspace: Workspace, rows: Sequence[int]
+) -> tuple[set[int], NormEstimate | None]:
+    """Compute the fields of rows and the tables, and again the fields that turn out damaged.
+
+    Returns:
+        Rows that were damaged, and the distances to the reference if they are new.
+    """
+    repaired: set[int] = set()
+    for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
+        try:
+            compute_fields(cluster, workspace, rows)
+            return repaired, tabulate_fields(cluster, workspace)
+        except DamageError as error:
+            if not attempts_left:
+                raise
+            _log.warning("%s", error)
+            # Where one is damaged, others may be.
+            rows = damaged_rows(cluster, workspace)
+            workspace.withdraw(rows, "its values are not what was stored")
+            repaired.update(rows)
+    raise AssertionError("unreachable: the last attempt returns or raises")
+
+
+def _summary(workspace: Workspace, computed: set[int]) -> Summary:
+    labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
+    not_compared: Mapping[str, str] = {}
+    if workspace.plan.study.proximity is not None:
+        not_compared = failed_proximities(dict(enumerate(workspace.labels)), workspace.complete)
+    return Summary(
+        workspace.store.path,
+        tuple(label for i, label in labels.items() if i in computed and label not in failed),
+        tuple(label for i, label in labels.items() if i not in computed),
+        failed,
+        not_compared,
+        _imprecise(workspace),
+    )
 
 
 def _imprecise(workspace: Workspace) -> dict[str, float]:

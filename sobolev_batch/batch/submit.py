@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.cluster.workers import prepare_workers
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
-from sobolev_batch.batch.run import carry_out
+from sobolev_batch.batch.run import Driver
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
@@ -106,7 +106,7 @@ def submit(
         return _submit(study, location, client, timeout_seconds, give_up_after)
     CollectionStore.prepared(location, study)
     objects, refused = for_each_object(
-        study, location, lambda one, place: _submit(one, place, client, timeout_seconds, give_up_after)
+        study, location, lambda _, part, place: _submit(part, place, client, timeout_seconds, give_up_after)
     )
     surfaces, missing = (
         sum(getattr(submission, name) for submission in objects.values()) for name in ("surfaces", "missing")
@@ -170,7 +170,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
         acquire(location, lock)
         with worker_client() as client:
             study = Study.from_table(table, folder=folder)
-            carry_out(study, location, lock, nullcontext(client), lambda progress: None, give_up_after)
+            Driver(lambda: client, give_up_after).run(study, location, lock)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.

@@ -398,7 +398,7 @@ def plan(
     study = study if isinstance(study, Study | StudyCollection) else Study.from_toml(study)
     location = default_store(study) if store is None else Location.parse(store)
     if isinstance(study, StudyCollection):
-        return CollectionPlan(*for_each_object(study, location, lambda one, place: _plan(one, place, client)))
+        return CollectionPlan(*for_each_object(study, location, lambda _, part, place: _plan(part, place, client)))
     return _plan(study, location, client)
 
 
