@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.analysis.datasets import TableOrder
-from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe_failure
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.fields.memory import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
@@ -80,7 +80,7 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
         arguments = workspace.store, i, complete[i], key, pair, plan.similarity, points
         projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
         tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i]))
-    steps = Steps(cluster.notify, "proximity", len(tasks))
+    advance = cluster.count_steps("proximity", len(tasks))
     for task, outcome in cluster.run(tasks, max(task.projected_bytes for task in tasks)):
         record = outcome
         if not isinstance(outcome, Record):
@@ -89,7 +89,7 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
             record = replace(complete[task.row], proximity=ProximityRecord(keys[task.row], reason))
             workspace.store.write_record(task.row, record)
         workspace.records[task.row] = record
-        steps.advance(task.label)
+        advance(task.label, None)
 
 
 @dataclass(frozen=True)

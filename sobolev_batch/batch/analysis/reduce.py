@@ -21,7 +21,7 @@ from sobolev_batch.batch.analysis.datasets import (
 )
 from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.analysis.tiles import Reducer
-from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task
+from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import QUALITY, Store
 from sobolev_batch.batch.store.tables import hide_tables, table_attributes, write_table
@@ -59,14 +59,14 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     tasks = [Task(reducer.norms, (rows,), projected_bytes) for rows in reducer.row_batches(complete, threads)]
     if every_pair:
         tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(complete, threads)]
-    steps = Steps(cluster.notify, "reduction", len(tasks))
+    advance = cluster.count_steps("reduction", len(tasks))
     results = Results.empty(len(workspace.plan.study.orders), order.rows, every_pair=every_pair)
     for task, outcome in cluster.results(tasks, projected_bytes):
         if task.function == reducer.norms:
             results.enter_norms(outcome, *task.arguments)
         else:
             results.enter_tile(outcome, *task.arguments)
-        steps.advance()
+        advance("", None)
     results.enter_reference(workspace.reference)
     _write_tables(workspace, order, results)
     return NormEstimate(*results.to_reference)

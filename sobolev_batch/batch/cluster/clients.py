@@ -12,10 +12,9 @@ import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from ipaddress import IPv6Address, ip_address
 from multiprocessing import resource_tracker
-from typing import Any, Self
+from typing import Any
 
 import dask
 from dask.utils import parse_timedelta
@@ -190,9 +189,10 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         AddressError: The address is malformed, or its network would have to be trusted.
         ClusterError: Nothing answers there, or Dask's configuration does not fit.
     """
-    scheduler = Address.parse(address)
-    if not trust_network:
-        scheduler.require_private("the scheduler")
+    if trust_network:
+        _parts(address)
+    else:
+        require_private(address, "the scheduler")
     seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))
     check_connection(address, seconds)
     try:
@@ -206,71 +206,53 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         if not trust_network:
             # An address on loopback may be one end of a tunnel.
             for worker in workers:
-                Address.parse(worker).require_private("a worker")
+                require_private(worker, "a worker")
         yield client
 
 
-@dataclass(frozen=True)
-class Address:
-    """An address at which a process of a cluster listens.
+def require_private(name: str, who: str) -> None:
+    """Check that nobody else reaches an address: it asks for certificates, or is on loopback.
 
-    Attributes:
-        name: Address as it was given.
-        scheme: Protocol, such as tls.
-        host, port: Host and port; empty and 0 within a process.
+    Args:
+        name: Address, such as tls://host:8786; without a scheme, Dask's default is meant.
+        who: Process that listens there, for the message.
+
+    Raises:
+        AddressError: The address is malformed, or others may reach it.
+        ClusterError: The host does not exist.
     """
+    scheme, host, port = _parts(name)
+    if scheme in (*_ENCRYPTED, _WITHIN_A_PROCESS):
+        return
+    try:
+        infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise ClusterError(f"no Dask scheduler answers at {name!r}: there is no host {host!r}") from error
+    beyond = [str(place[0]) for *_, place in infos if not _is_loopback(str(place[0]))]
+    if beyond:
+        raise AddressError(
+            f"{who} at {name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
+            "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "
+            "--trust-network (in Python trust_network=True) where nobody else is on that network"
+        )
 
-    name: str
-    scheme: str
-    host: str
-    port: int
 
-    @classmethod
-    def parse(cls, name: str) -> Self:
-        """Return the address with this name; without a scheme, Dask's default is meant.
-
-        Raises:
-            AddressError: The name is malformed.
-        """
-        scheme, rest = parse_address(name)
-        if scheme == _WITHIN_A_PROCESS:
-            return cls(name, scheme, "", 0)
-        if scheme not in (*_ENCRYPTED, *_PLAIN):
-            raise _malformed(name, f"{scheme!r} is not one of {', '.join((*_ENCRYPTED, *_PLAIN))}")
-        try:
-            host, port = parse_host_port(rest)
-        except ValueError as error:
-            raise _malformed(name, str(error)) from error
-        if not host or any(character.isspace() or character in "/@" for character in host):
-            raise _malformed(name, f"{host!r} is no host")
-        if not 0 < port < 65536:
-            raise _malformed(name, f"{port} is no port")
-        return cls(name, scheme, host, port)
-
-    def require_private(self, who: str) -> None:
-        """Check that nobody else reaches this address: it asks for certificates, or is on loopback.
-
-        Args:
-            who: Process that listens, for the message.
-
-        Raises:
-            AddressError: Others may reach it.
-            ClusterError: The host does not exist.
-        """
-        if self.scheme in (*_ENCRYPTED, _WITHIN_A_PROCESS):
-            return
-        try:
-            infos = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
-        except (OSError, UnicodeError) as error:
-            raise ClusterError(f"no Dask scheduler answers at {self.name!r}: there is no host {self.host!r}") from error
-        hosts = [str(socket_address[0]) for *_, socket_address in infos]
-        beyond = [host for host in hosts if not _is_loopback(host)]
-        if beyond:
-            raise AddressError(
-                f"{who} at {self.name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
-                "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "
-                "--trust-network (in Python trust_network=True) where nobody else is on that network"
-            )
+def _parts(name: str) -> tuple[str, str, int]:
+    """Return scheme, host and port of an address; within a process, there are no host and no port."""
+    scheme, rest = parse_address(name)
+    if scheme == _WITHIN_A_PROCESS:
+        return scheme, "", 0
+    if scheme not in (*_ENCRYPTED, *_PLAIN):
+        raise _malformed(name, f"{scheme!r} is not one of {', '.join((*_ENCRYPTED, *_PLAIN))}")
+    try:
+        host, port = parse_host_port(rest)
+    except ValueError as error:
+        raise _malformed(name, str(error)) from error
+    if not host or any(character.isspace() or character in "/@" for character in host):
+        raise _malformed(name, f"{host!r} is no host")
+    if not 0 < port < 65536:
+        raise _malformed(name, f"{port} is no port")
+    return scheme, host, port
 
 
 def check_connection(address: str, seconds: float) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, Literal, Self
 from uuid import uuid4
 
@@ -43,20 +44,6 @@ class Progress:
 
 
 Notify = Callable[[Progress], None]
-
-
-class Steps:
-    """The steps of one stage, counted and reported."""
-
-    def __init__(self, notify: Notify, stage: Stage, total: int) -> None:
-        """Report that the stage begins."""
-        self._notify, self._stage, self._total, self._done = notify, stage, total, 0
-        notify(Progress(stage, 0, total))
-
-    def advance(self, label: str = "", record: Record | None = None) -> None:
-        """Report one more step."""
-        self._done += 1
-        self._notify(Progress(self._stage, self._done, self._total, label, record))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +91,12 @@ class Cluster:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
         return cls(client, prepare_workers(client, libraries), notify)
 
+    def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
+        """Report that a stage of so many steps begins, and return a function that reports each by label and record."""
+        done = count(1)
+        self.notify(Progress(stage, 0, total))
+        return lambda label, record: self.notify(Progress(stage, next(done), total, label, record))
+
     def run(self, tasks: Iterable[Task], projected_bytes: float = 0.0) -> Iterator[tuple[Task, Any]]:
         """Have tasks done. Those whose workers died are tried again alone, after all others.
 
@@ -145,7 +138,7 @@ class Cluster:
         remaining = iter(tasks)
         completed = as_completed(loop=self.client.loop)
 
-        def hand_out(count: int) -> list[tuple[Task, ClusterError]]:
+        def hand_out(number: int) -> list[tuple[Task, ClusterError]]:
             """Submit so many tasks, and return those before them that fit into no worker."""
             refused = []
             for task in remaining:
@@ -157,8 +150,8 @@ class Cluster:
                 future = self._submit(task, claims_memory, {}, task.label)
                 running[future] = task
                 completed.add(future)
-                count -= 1
-                if not count:
+                number -= 1
+                if not number:
                     break
             return refused
 

@@ -6,59 +6,51 @@ import os
 import socket
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from threading import Lock
 
 from sobolev_batch.errors import BackendError
 from sobolev_batch.spectral.backends.cuda import INSTALL
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
-# The device of this process. It has one at most, since CUDA settles on the devices that it sees at its start.
-_own_devices: set[str] = set()
+# The device of this process and its lock. It has one at most, since CUDA settles on the devices that it sees at its
+# start.
+_own: dict[str, socket.socket] = {}
 _locking = Lock()
 
 
-@dataclass(frozen=True, eq=False)
-class GpuLock:
-    """A GPU that belongs to this process until it ends or releases it.
+def lock_gpu(devices: Sequence[str]) -> str | None:
+    """Lock the first device that no other process of this host has, and make it the only visible one.
 
-    The lock is a socket bound to a name that Linux keeps in memory: it is exclusive, needs no permissions,
-    leaves no file, and ends with the process however that ends. Containers share it if they share the network of the
-    host. Others have temporary folders of their own, too, so that no file would serve them better.
+    The device belongs to this process until it ends or releases it. The lock is a socket bound to a name that Linux
+    keeps in memory: it is exclusive, needs no permissions, leaves no file, and ends with the process however that ends.
+    Containers share it if they share the network of the host. A file would not serve others better, since they have
+    temporary folders of their own.
 
-    Attributes:
-        device: UUID of the GPU.
+    Args:
+        devices: UUIDs of the devices.
+
+    Returns:
+        UUID of the device, or None where all are locked or this process has one already.
     """
-
-    device: str
-    _socket: socket.socket
-
-    @classmethod
-    def acquire(cls, devices: Sequence[str]) -> GpuLock | None:
-        """Lock the first device that no other process of this host has, and make it the only visible one.
-
-        Returns:
-            The lock, or None where all devices are locked or this process has one already.
-        """
-        if not sys.platform.startswith("linux"):
-            return None
-        with _locking:
-            for device in () if _own_devices else devices:
-                name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-                try:
-                    name.bind(f"\0sobolev-batch/{device}")
-                except OSError:
-                    name.close()
-                    continue
-                _own_devices.add(device)
-                os.environ[_VISIBLE] = device
-                return cls(device, name)
+    if not sys.platform.startswith("linux"):
         return None
+    with _locking:
+        for device in () if _own else devices:
+            name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                name.bind(f"\0sobolev-batch/{device}")
+            except OSError:
+                name.close()
+                continue
+            _own[device] = name
+            os.environ[_VISIBLE] = device
+            return device
+    return None
 
-    def release(self) -> None:
-        """Let another process have the device."""
-        self._socket.close()
-        _own_devices.discard(self.device)
+
+def release_gpu(device: str) -> None:
+    """Let another process have a device that this process has locked."""
+    _own.pop(device).close()
 
 
 def visible_devices() -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
 from sobolev_batch.batch.cluster.checks import require_same_versions
-from sobolev_batch.batch.cluster.gpus import GpuLock, visible_devices
+from sobolev_batch.batch.cluster.gpus import lock_gpu, release_gpu, visible_devices
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import BackendError, ClusterError, InputError
 from sobolev_batch.machine import MachineMemory
@@ -161,7 +161,7 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
         self.backend: Backend = CPU
         self.note = ""
         self.allowed_bytes = 0.0
-        self._lock: GpuLock | None = None
+        self._device: str | None = None
         self._ready: asyncio.Event | None = None
 
     def __reduce__(self) -> tuple[type[BackendPlugin], tuple[()]]:
@@ -193,22 +193,22 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
     def teardown(self, worker: Worker) -> None:
         """Release the GPU."""
-        if self._lock is not None:
-            self._lock.release()
+        if self._device is not None:
+            release_gpu(self._device)
 
     def _find_backend(self) -> None:
-        lock = None
+        device = None
         try:
             devices = visible_devices()
-            lock = GpuLock.acquire(devices)
-            if lock is None:
+            device = lock_gpu(devices)
+            if device is None:
                 raise BackendError(f"no GPU left: other workers have all of the {len(devices)} that it may use")
             backend = gpu_backend()
-            self.backend, self.note, self._lock = backend, backend.description, lock
+            self.backend, self.note, self._device = backend, backend.description, device
         except BackendError as error:
             self.note = str(error)
-            if lock is not None:
-                lock.release()
+            if device is not None:
+                release_gpu(device)
 
 
 def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from sobolev_batch.batch.cluster.execution import Cluster, Steps, Task, describe_failure
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.fields.memory import TaskSizes, reference_in_tasks, size_rows
 from sobolev_batch.batch.fields.tasks import (
     FieldSettings,
@@ -82,13 +82,13 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
         ClusterError: The scheduler was lost, or the lattice fits into no worker.
     """
     plan, store, rows = workspace.plan, workspace.store, workspace.rows
-    steps = Steps(cluster.notify, "fields", len(pending))
+    advance = cluster.count_steps("fields", len(pending))
     workers = cluster.workers.with_backend(plan.study.backend)
     sizes, refused = size_rows(plan, [rows[i] for i in pending], workers)
 
     def take(i: int, record: Record) -> None:
         workspace.records[i] = record
-        steps.advance(rows[i].label, record)
+        advance(rows[i].label, record)
 
     def give_up(i: int, reason: str) -> None:
         record = Record(key=rows[i].key, status="failed", reason=reason, finished=utc_now())

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from sobolev_batch import AddressError, ClusterError, InputError
-from sobolev_batch.batch.cluster.clients import Address, remote_client
+from sobolev_batch.batch.cluster.clients import remote_client, require_private
 
 MALFORMED = ["", "tcp://", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
 MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "tcp://a b:1", "tcp://me@host:1", "a://b://c:1"]
@@ -21,11 +21,6 @@ def test_malformed(name: str) -> None:
         pass
 
 
-def test_parts() -> None:
-    assert Address.parse("host:8786") == Address("host:8786", "tcp", "host", 8786)
-    assert Address.parse("tls://[::1]:1") == Address("tls://[::1]:1", "tls", "::1", 1)
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -34,7 +29,7 @@ def test_parts() -> None:
     ],
 )
 def test_private(name: str) -> None:
-    Address.parse(name).require_private("the scheduler")
+    require_private(name, "the scheduler")
 
 
 @pytest.mark.parametrize("name", ["tcp://192.0.2.1:1", "192.0.2.1:1", "ws://[2001:db8::1]:1", "tcp://0.0.0.0:1"])
@@ -52,15 +47,14 @@ def test_all_that_a_name_stands_for_counts(places: list[str], private: bool, mon
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (place, port)) for place in places]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    address = Address.parse("tcp://scheduler:8786")
     if private:
-        address.require_private("the scheduler")
+        require_private("tcp://scheduler:8786", "the scheduler")
     else:
         with pytest.raises(AddressError, match=r"\(192\.0\.2\.1\)"):
-            address.require_private("the scheduler")
+            require_private("tcp://scheduler:8786", "the scheduler")
 
 
 def test_a_host_that_is_not_there_is_no_wrong_input() -> None:
     with pytest.raises(ClusterError, match=r"there is no host 'example\.invalid'") as caught:
-        Address.parse("tcp://example.invalid:1").require_private("the scheduler")
+        require_private("tcp://example.invalid:1", "the scheduler")
     assert not isinstance(caught.value, InputError)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from sobolev_batch import BackendError
-from sobolev_batch.batch.cluster.gpus import GpuLock, chosen_devices, visible_devices
+from sobolev_batch.batch.cluster.gpus import chosen_devices, lock_gpu, release_gpu, visible_devices
 
 HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 
@@ -86,9 +86,8 @@ def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 WORKER = """
 import os, sys
-from sobolev_batch.batch.cluster.gpus import GpuLock
-lock = GpuLock.acquire(sys.argv[1:])
-print(lock.device if lock else None, os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+from sobolev_batch.batch.cluster.gpus import lock_gpu
+print(lock_gpu(sys.argv[1:]), os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
 sys.stdin.read()
 """
 
@@ -126,10 +125,8 @@ def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free() 
 def test_a_device_that_is_released_can_be_locked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "before")
     device = f"GPU-{os.getpid()}-released"
-    first = GpuLock.acquire([device])
-    assert first is not None
-    assert GpuLock.acquire([device]) is None
-    first.release()
-    second = GpuLock.acquire([device])
-    assert second is not None
-    second.release()
+    assert lock_gpu([device]) == device
+    assert lock_gpu([device]) is None
+    release_gpu(device)
+    assert lock_gpu([device]) == device
+    release_gpu(device)
