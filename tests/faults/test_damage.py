@@ -155,12 +155,6 @@ def test_tables_and_coordinates_are_named_never_read_damaged_and_made_again(
     assert np.isfinite(norm(field, -3.0)["error"].item())
 
 
-def test_a_run_with_nothing_to_do_sees_a_damaged_quality(store: Path, study: Study, threads: Client) -> None:
-    flip(store / "fourier/quality/c/0")
-    assert run(study, store, threads).computed == ()
-    assert verify(store).is_sound
-
-
 def test_a_damaged_record_counts_as_none(store: Path, study: Study, threads: Client) -> None:
     for row, damage in enumerate((truncate, empty, flip, delete)):
         damage(store / f"records/record/c/{row}")
