@@ -16,10 +16,10 @@ from distributed import Client
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
-from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
+from sobolev_batch.batch.cluster.workers import require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
 from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
 from sobolev_batch.batch.storage.location import Location

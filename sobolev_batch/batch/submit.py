@@ -14,9 +14,8 @@ from uuid import uuid4
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
-from sobolev_batch.batch.cluster.checks import require_store_access
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
-from sobolev_batch.batch.cluster.workers import prepare_workers
+from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
 from sobolev_batch.batch.run import Driver
 from sobolev_batch.batch.storage.location import Location

@@ -9,8 +9,8 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import ClusterError, Study, run
-from sobolev_batch.batch.cluster import checks
-from sobolev_batch.batch.cluster.checks import require_same_versions
+from sobolev_batch.batch.cluster import workers
+from sobolev_batch.batch.cluster.workers import require_same_versions
 from sobolev_batch.batch.store.store import Store
 
 
@@ -47,7 +47,7 @@ def test_differences_are_reported_before_anything_is_computed(
 
 
 def test_a_checkout_with_other_numerics(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "NUMERICS_VERSION", -1)
+    monkeypatch.setattr(workers, "NUMERICS_VERSION", -1)
     with pytest.raises(ClusterError, match=r"numerics of sobolev-batch \d+ at the worker .*, -1 here"):
         require_same_versions(client)
 
