@@ -36,13 +36,13 @@ class CollectionStore:
     table: Mapping[str, Any]
 
     @property
-    def begun(self) -> dict[str, Location]:
+    def existing_stores(self) -> dict[str, Location]:
         """Stores of the objects that have one, by name: none has until its reference was made."""
         stores = {name: Store(place) for name, place in self.stores.items()}
         return {name: store.location for name, store in stores.items() if store.exists() and not store.is_unfinished}
 
     @classmethod
-    def found(cls, location: Location) -> CollectionStore | None:
+    def read(cls, location: Location) -> CollectionStore | None:
         """Return the store of a collection at a location; None where there is none."""
         content = location.read(ROOT)
         document = _parsed(content) if content is not None else {}
@@ -63,13 +63,13 @@ class CollectionStore:
         Raises:
             StoreError: Something else is there, or the location cannot be written.
         """
-        found = cls.found(location)
-        if found is None:
+        present = cls.read(location)
+        if present is None:
             location.require_free()
-        elif found.name != collection.name:
+        elif present.name != collection.name:
             raise StoreError(
-                f"{location}: the store of another collection is there, {found.name!r}, not {collection.name!r}; name "
-                "another store, or remove this one"
+                f"{location}: the store of another collection is there, {present.name!r}, not {collection.name!r}; "
+                "name another store, or remove this one"
             )
         entry = {
             "name": collection.name,

@@ -185,8 +185,8 @@ def _reusable_stores(locations: Iterable[Location]) -> list[Mapping[str, Locatio
     """
     reusable: list[Mapping[str, Location]] = []
     for location in locations:
-        collection = CollectionStore.found(location)
-        stores = {"": location} if collection is None else collection.begun
+        collection = CollectionStore.read(location)
+        stores = {"": location} if collection is None else collection.existing_stores
         for place in stores.values():
             Store.open(place)
         reusable.append(stores)

@@ -111,7 +111,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     >>> found.is_sound, found.complete, found.total
     (True, 2, 2)
     """
-    collection = CollectionStore.found(Location.parse(store))
+    collection = CollectionStore.read(Location.parse(store))
     if collection is None:
         return _verify_study(store, on_progress)
     verified = {

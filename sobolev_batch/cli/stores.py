@@ -189,11 +189,11 @@ def table_command(
     from sobolev_batch.results.tables.matrix import format_matrix
 
     chosen = orders or None
-    collection = CollectionStore.found(store)
+    collection = CollectionStore.read(store)
     if collection is not None:
         if matrix or over_time or below is not None:
             raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
-        echo_lines(format_tables(collection.begun, style, chosen, x=x))
+        echo_lines(format_tables(collection.existing_stores, style, chosen, x=x))
         return
     tree = open_store(store)
     if over_time:
@@ -265,7 +265,7 @@ def plot_command(
 
     written_as = Output(formats or ("png",), None if size is None else parse_size(size))
     _require_folder(output)
-    if CollectionStore.found(store) is not None:
+    if CollectionStore.read(store) is not None:
         if meshes:
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
         leagues = league(store, orders or None, x=x or "triangles", methods=families or None)

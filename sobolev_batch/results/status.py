@@ -266,5 +266,5 @@ def status(store: AnyStore) -> Status:
     done; by process ...
     """
     place = location_of(store)
-    collection = CollectionStore.found(Location.parse(place))
+    collection = CollectionStore.read(Location.parse(place))
     return Status.from_store(place) if collection is None else Status.of_collection(collection)

@@ -144,7 +144,7 @@ def make_report(
             "the extra has it: pip install 'sobolev-batch[report]'"
         )
     limits = limits or ReportLimits()
-    collection = CollectionStore.found(Location.parse(location_of(store)))
+    collection = CollectionStore.read(Location.parse(location_of(store)))
     if collection is None:
         return _study_page(store, folder, witnesses, up, limits)
     if witnesses:

@@ -59,7 +59,7 @@ def league_content(collection: CollectionStore, status: Status, limits: ReportLi
     Raises:
         InputError: No object has tables yet.
     """
-    tables = tables_of(collection.begun)
+    tables = tables_of(collection.existing_stores)
     try:
         leagues, no_league = leagues_of(tables, collection.objects), ""
     except InputError as error:

@@ -154,9 +154,9 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.found(Location.parse(store))
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
     if collection is not None:
-        return _joined(tables_of(collection.begun, order, x=x))
+        return _joined(tables_of(collection.existing_stores, order, x=x))
     tree = as_tree(store)
     convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
     labels = convergence["mesh"].values

@@ -364,10 +364,10 @@ def _stores(store: AnyCollection | AnyStore) -> Mapping[str, AnyStore]:
         return {"": store}
     if not isinstance(store, str | Path | Location):
         return store
-    collection = CollectionStore.found(Location.parse(store))
+    collection = CollectionStore.read(Location.parse(store))
     if collection is None:
         return {"": store}
-    return dict(collection.begun)
+    return dict(collection.existing_stores)
 
 
 def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
@@ -427,10 +427,10 @@ def stores_of(store: AnyCollection) -> tuple[dict[str, AnyStore], tuple[str, ...
     if isinstance(store, Mapping):
         return dict(store), tuple(store)
     location = Location.parse(store)
-    found = CollectionStore.found(location)
-    if found is None:
+    collection = CollectionStore.read(location)
+    if collection is None:
         raise StoreError(
             f"{location}: no store of a collection is there; run a study with several objects, or give the stores of "
             "single objects by their names"
         )
-    return dict(found.begun), found.objects
+    return dict(collection.existing_stores), collection.objects
