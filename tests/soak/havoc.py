@@ -9,52 +9,41 @@ import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import psutil
 
 
-@dataclass(frozen=True)
-class HavocPlan:
-    """After how many requests to the storage each kill comes, in order.
-
-    Attributes:
-        workers, drivers: of a worker, and of the driver.
-    """
-
-    workers: tuple[int, ...]
-    drivers: tuple[int, ...]
-
-    @classmethod
-    def drawn(cls, seed: int, requests: range, workers: int, drivers: int) -> HavocPlan:
-        """Some kills, at random among these requests."""
-        chosen = random.Random(seed).sample(requests, workers + drivers)
-        return cls(tuple(sorted(chosen[:workers])), tuple(sorted(chosen[workers:])))
-
-
 class Havoc:
-    """Kills worker processes of this process's cluster, and a driver, as a plan says.
+    """Kills worker processes of this process's cluster, and a driver, at requests to the storage that a seed chooses.
 
     It counts requests rather than seconds, so that the kills are spread over the work, however long that
     takes; and it strikes while a request is under way. One worker is left each time: a run on a cluster
     that has none does not begin.
 
+    Args:
+        seed: Seed of the choice among requests and workers.
+        requests: Numbers of the requests among which the kills come.
+        kills, driver_kills: Number of kills of workers and of drivers.
+        workers: Function that returns the ids of the cluster's worker processes, whether they are alive or not.
+        known: Function that returns how many of them its scheduler knows.
+
     Attributes:
-        workers, drivers: killed so far.
+        workers, drivers: Numbers of workers and drivers that were killed.
     """
 
-    def __init__(self, plan: HavocPlan, seed: int, workers: Callable[[], list[int]], known: Callable[[], int]) -> None:
-        """Take up a plan.
-
-        Args:
-            plan: when to kill.
-            seed: of the choice among the workers.
-            workers: the ids of the processes that the cluster has for workers, whether they are alive or not.
-            known: how many of them its scheduler knows of.
-        """
+    def __init__(
+        self,
+        seed: int,
+        requests: range,
+        kills: int,
+        driver_kills: int,
+        workers: Callable[[], list[int]],
+        known: Callable[[], int],
+    ) -> None:
         self.workers = self.drivers = 0
-        self._workers_due, self._drivers_due = deque(plan.workers), deque(plan.drivers)
         self._random = random.Random(seed)
+        chosen = self._random.sample(requests, kills + driver_kills)
+        self._workers_due, self._drivers_due = deque(sorted(chosen[:kills])), deque(sorted(chosen[kills:]))
         self._pids, self._known = workers, known
         self._driver: subprocess.Popen[str] | None = None
         self._requests = 0

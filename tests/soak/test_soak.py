@@ -10,7 +10,6 @@ import pytest
 from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
 from tests.soak.corruptions import BAD, answer_to, corruptions
-from tests.soak.havoc import HavocPlan
 from tests.soak.sequences import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, strikes_of
 from tests.soak.trial import Outcome, soak
 
@@ -50,13 +49,6 @@ def test_what_is_lost_would_be_noticed(outcome: Outcome, folder: Path) -> None:
     found = list(differences(Location.parse(other), Location.parse(clean)))
     assert found[:3] == ["bumpy/000004: missing", "bumpy/000002: another field", "bumpy/000003: another field"]
     assert [difference.split(":")[0] for difference in found[3:]] == ["norms"]
-
-
-def test_kills_depend_on_the_seed_alone() -> None:
-    plan = HavocPlan.drawn(3, range(100, 1000), 5, 2)
-    assert plan == HavocPlan.drawn(3, range(100, 1000), 5, 2) != HavocPlan.drawn(4, range(100, 1000), 5, 2)
-    assert (len(plan.workers), len(plan.drivers)) == (5, 2)
-    assert set(plan.workers + plan.drivers) <= set(range(100, 1000))
 
 
 def test_a_cluster_that_is_struck_loses_nothing(tmp_path: Path) -> None:

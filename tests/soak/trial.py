@@ -14,7 +14,7 @@ from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage.location import Location
 from tests.soak.comparison import differences
-from tests.soak.havoc import Havoc, HavocPlan
+from tests.soak.havoc import Havoc
 from tests.soak.meshes import write_study
 from tests.support.object_storage import BUCKET, HEALTHY, Kind, Rule, Server, serving, taken_for_s3
 
@@ -52,18 +52,20 @@ def soak(folder: Path, meshes: int, seed: int, kills: int, driver_kills: int, ra
     path = write_study(folder, meshes, seed)
     clean = Location.parse(folder / "clean.zarr")
     soaked = Location.parse(f"s3://{BUCKET}/soaked.zarr")
-    # Each mesh takes a look at its record before anything is computed, then its field and its record are written,
-    # its field is read. There are some more requests at the beginning and at the end, so that all kills come.
-    plan = HavocPlan.drawn(seed, range(meshes, 4 * meshes), kills, driver_kills)
     with serving(seed) as storage, taken_for_s3({**storage.environment(), **_QUIET}):
         with local_client(_WORKERS) as client:
             started = time.monotonic()
             run(Study.from_toml(path), clean, client)
             clean_seconds = time.monotonic() - started
             nannies = client.cluster.workers
+            # Each mesh takes a look at its record before anything is computed, then its field and its record are
+            # written, its field is read. There are some more requests at the beginning and at the end, so that all
+            # kills come.
             havoc = Havoc(
-                plan,
                 seed,
+                range(meshes, 4 * meshes),
+                kills,
+                driver_kills,
                 lambda: [nanny.pid or 0 for nanny in nannies.values()],
                 lambda: len(client.cluster.scheduler.workers),
             )
