@@ -109,7 +109,10 @@ class Device:
     def backend(self) -> Gpu:
         """The backend that computes on this device."""
         cuda = SimpleNamespace(
-            runtime=SimpleNamespace(memGetInfo=lambda: (self.capacity - self.used, self.capacity)),
+            runtime=SimpleNamespace(
+                memGetInfo=lambda: (self.capacity - self.used, self.capacity),
+                getDeviceProperties=lambda number: {"name": b"fake", "totalGlobalMem": self.capacity},
+            ),
             memory=SimpleNamespace(OutOfMemoryError=OutOfMemoryError),
             Device=lambda number: nullcontext(),
             Stream=SimpleNamespace(null=nullcontext()),
