@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
@@ -15,10 +13,10 @@ from sobolev_batch.spectral.backends.backends import CPU, NufftSpec
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import KERNEL, LENGTH, described, lattice_attributes, order_axis
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, OperandLike, pair_of, point_array, read_blocks
-from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.settings import TransformSettings, thread_count
+from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import require_points_inside
 
 # Fraction of a given memory for blocks of fields; the rest is for the NUFFT.
@@ -85,11 +83,16 @@ def witness(
     first, second = pair_of(a, b, lattice, orders)
     lattice = Lattice.from_field(first)
     require_points_inside(coordinates, lattice)
-    evaluation = Evaluation(coordinates, SobolevWeights(lattice, orders), settings, threads, allowed_bytes)
+    weights = SobolevWeights(lattice, orders)
+    execution = Execution(threads=thread_count(threads), allowed_bytes=allowed_bytes)
+    largest = BLOCK_SAMPLES
+    if allowed_bytes is not None:
+        sample_bytes = _SAMPLE_BYTES + len(orders) * np.dtype(dtype).itemsize
+        largest = max(1, min(BLOCK_SAMPLES, int(_BLOCK_FRACTION * allowed_bytes / sample_bytes)))
     values = np.zeros((len(orders), coordinates.shape[1]))
     # FINUFFT refuses to evaluate nothing.
-    for block, (of_a, of_b) in read_blocks(lattice, first, second, largest=evaluation.largest) if values.size else ():
-        values += evaluation.of_block(block, of_a - of_b)
+    for block, (of_a, of_b) in read_blocks(lattice, first, second, largest=largest) if values.size else ():
+        values += _block_values(coordinates, weights, block, of_a - of_b, settings, execution)
     dims, labels, _ = axis = order_axis(order)
     values = values.astype(np.float32 if dtype == "complex64" else np.float64)
     places = {name: ("point", row, described(name, LENGTH)) for name, row in zip("xyz", coordinates, strict=True)}
@@ -108,50 +111,30 @@ def witness(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Evaluation of witness functions at points, one block of the difference of two fields after the other.
-
-    Attributes:
-        coordinates: Points, float64 (3, n), contiguous, n > 0, within the half period.
-        weights: Weights of the shells of the fields' lattice.
-        settings: eps and dtype of the NUFFT.
-        threads: Threads of the NUFFT; one per core by default.
-        allowed_bytes: Memory that a block may take, besides points, result and the fields themselves.
-    """
-
-    coordinates: NDArray[np.float64]
-    weights: SobolevWeights
-    settings: TransformSettings
-    threads: int | None = None
-    allowed_bytes: float | None = None
-
-    @property
-    def largest(self) -> int:
-        """Largest number of samples that a block should have."""
-        if self.allowed_bytes is None:
-            return BLOCK_SAMPLES
-        sample_bytes = _SAMPLE_BYTES + len(self.weights.orders) * np.dtype(self.settings.dtype).itemsize
-        return max(1, min(BLOCK_SAMPLES, int(_BLOCK_FRACTION * self.allowed_bytes / sample_bytes)))
-
-    def of_block(self, block: Block, difference: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-        """Return the contribution of a block to the witness functions, (orders, n)."""
-        lattice, dtype = self.weights.lattice, self.settings.dtype
-        weighted = difference * lattice.trapezoid_weights(block)
-        shells = lattice.shells(block)
-        coefficients = np.empty((len(self.weights.orders), *block.shape), dtype=dtype)
-        for row, weight in zip(coefficients, self.weights.per_shell, strict=True):
-            np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-        threads = thread_count(self.threads)
-        batching = Batching(NufftSpec(block.shape, self.settings.eps, dtype, threads=threads))
-        if self.allowed_bytes is not None:
-            count = self.coordinates.shape[1]
-            allowed_bytes = (1 - _BLOCK_FRACTION) * self.allowed_bytes
-            batching = fastest_batching(batching, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
-        return evaluate_at(self.coordinates, coefficients, lattice, block, batching)
+def _block_values(
+    coordinates: Reals,
+    weights: SobolevWeights,
+    block: Block,
+    difference: NDArray[np.complexfloating],
+    settings: TransformSettings,
+    execution: Execution,
+) -> Reals:
+    """Return the contribution of a block of the difference of two fields to the witness functions, (orders, n)."""
+    lattice = weights.lattice
+    weighted = difference * lattice.trapezoid_weights(block)
+    shells = lattice.shells(block)
+    coefficients = np.empty((len(weights.orders), *block.shape), dtype=settings.dtype)
+    for row, weight in zip(coefficients, weights.per_shell, strict=True):
+        np.multiply(weighted, weight[shells], out=row, casting="same_kind")
+    batching = Batching(NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads))
+    if execution.allowed_bytes is not None:
+        count = coordinates.shape[1]
+        allowed_bytes = (1 - _BLOCK_FRACTION) * execution.allowed_bytes
+        batching = fastest_batching(batching, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
+    return evaluate_at(coordinates, coefficients, lattice, block, batching)
 
 
-def _coordinates(points: ArrayLike) -> NDArray[np.float64]:
+def _coordinates(points: ArrayLike) -> Reals:
     """Return points (n, 3) as one contiguous row per axis (3, n).
 
     Raises:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends import backends, cuda
+from sobolev_batch.spectral.backends import backends
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.backends.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.fields import compute_field, field_for
@@ -305,9 +305,9 @@ def test_says_in_one_line_what_is_missing(
             raise found
         return found
 
-    monkeypatch.setattr(cuda, "importlib", SimpleNamespace(import_module=import_module))
+    monkeypatch.setattr(backends, "importlib", SimpleNamespace(import_module=import_module))
     with pytest.raises(BackendError, match=message):
-        cuda.load()
+        backends.load_cuda()
 
 
 # The real libraries, without a device.
@@ -396,11 +396,11 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     code = """
-from sobolev_batch.spectral.backends import cuda
+from sobolev_batch.spectral.backends import backends
 from sobolev_batch.spectral.backends.backends import Gpu
 from sobolev_batch.spectral.backends.backends import GPU_COSTS, NufftSpec
-cuda._require_device = lambda cupy: None
-backend = Gpu("gpu", "cufinufft", GPU_COSTS, cuda.load())
+backends._require_device = lambda cupy: None
+backend = Gpu("gpu", "cufinufft", GPU_COSTS, backends.load_cuda())
 try:
     backend.plan(NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
 except RuntimeError as error:
@@ -416,9 +416,9 @@ def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     code = """
 from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends import cuda
+from sobolev_batch.spectral.backends import backends
 try:
-    cuda.load()
+    backends.load_cuda()
 except BackendError:
     pass
 from cufinufft._cufinufft import NufftOpts
