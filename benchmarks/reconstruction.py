@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 import sobolev_batch as sb
 from benchmarks.table import Row, as_seconds, format_table
 from benchmarks.timing import Effort, elapsed_seconds
-from sobolev_batch.results.meshes.render import render
-from sobolev_batch.results.meshes.views import MeshView
+from sobolev_batch.results.figures.render import render
+from sobolev_batch.results.figures.views import MeshView
 
 _MEASURED_AT = (-2.0, -4.0)
 # Steps of the fits that are drawn.

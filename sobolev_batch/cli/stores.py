@@ -28,7 +28,7 @@ from sobolev_batch.results.tables.text import Format
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
     from sobolev_batch.results.figures.style import PictureFormat
-    from sobolev_batch.results.meshes.views import Axis
+    from sobolev_batch.results.figures.views import Axis
 
 _FOLLOW_SECONDS = 2.0
 _PICTURE_FORMATS = ("png", "svg", "pdf")
@@ -322,7 +322,7 @@ def witness_command(
     length. The study makes the meshes again; a mesh is skipped and named if that fails, or if it is not the one that
     was computed.
     """
-    from sobolev_batch.results.meshes.export import Exporter
+    from sobolev_batch.results.figures.export import Exporter
 
     exporter = Exporter.from_store(store, orders or None, folder)
     labels = exporter.labels(meshes)

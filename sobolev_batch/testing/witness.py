@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.meshes.export import VertexField
+from sobolev_batch.results.figures.export import VertexField
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Support

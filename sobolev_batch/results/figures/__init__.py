@@ -1,4 +1,4 @@
-"""Figures: plots of a store.
+"""Figures: plots of a store, and its meshes, made again and coloured by their witness functions.
 
-In: tables and spectra. Out: Matplotlib figures and files.
+In: tables, spectra and fields. Out: Matplotlib figures, pictures, PLY and VTK files.
 """

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.results.figures.render import Pictures, color_limits, render
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import (
     EXTENDS,
@@ -24,8 +25,7 @@ from sobolev_batch.results.figures.style import (
     set_title,
     shortened,
 )
-from sobolev_batch.results.meshes.render import Pictures, color_limits, render
-from sobolev_batch.results.meshes.views import COVERED_AREA, FRONT, PICTURES, Axis, MeshView, make_views
+from sobolev_batch.results.figures.views import COVERED_AREA, FRONT, PICTURES, Axis, MeshView, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.tables.groups import chosen_order, finished_group
 from sobolev_batch.surfaces.sources.names import file_stem

@@ -20,7 +20,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.meshes.views import Axis, make_views
+from sobolev_batch.results.figures.views import Axis, make_views
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, location_of, require_unchanged
 from sobolev_batch.results.report.charts import (
     chart_data,
@@ -30,7 +30,7 @@ from sobolev_batch.results.report.charts import (
     study_pictures,
     unpictured,
 )
-from sobolev_batch.results.report.elements import ReportLimits, utc_text
+from sobolev_batch.results.report.content import ReportLimits, utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.visible import visible
 

@@ -19,12 +19,12 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.curves import LEAGUE
 from sobolev_batch.results.figures.pair_plots import clustered_order, embedded
 from sobolev_batch.results.figures.plots import PLOTS
+from sobolev_batch.results.figures.render import render
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
+from sobolev_batch.results.figures.views import MeshView, Views
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
-from sobolev_batch.results.meshes.render import render
-from sobolev_batch.results.meshes.views import MeshView, Views
-from sobolev_batch.results.report.elements import ReportLimits
+from sobolev_batch.results.report.content import ReportLimits
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.groups import (

@@ -11,7 +11,7 @@ import pandas as pd
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import open_store
-from sobolev_batch.results.report.elements import (
+from sobolev_batch.results.report.content import (
     PageTable,
     ReportLimits,
     Row,

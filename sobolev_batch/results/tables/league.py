@@ -152,17 +152,12 @@ class League:
         rows = []
         for k, method in enumerate(methods):
             interval = Interval.from_values(scores.values[:, k], scores.errors[:, k], spreads[k]).exp()
-            rate = self._rate(method)
             rows.append(
                 {
                     "method": method,
                     "objects": count,
-                    "relative": interval.mean,
-                    "low": interval.low,
-                    "high": interval.high,
-                    "rate": rate.mean,
-                    "rate_low": rate.low,
-                    "rate_high": rate.high,
+                    **interval.named("relative"),
+                    **self._rate(method).named("rate", "rate_"),
                 }
             )
         frame = pd.DataFrame(rows).sort_values("relative", kind="stable", ignore_index=True)
@@ -189,9 +184,7 @@ class League:
                 {
                     "method": scores.methods[i],
                     "other": scores.methods[j],
-                    "ratio": interval.mean,
-                    "low": interval.low,
-                    "high": interval.high,
+                    **interval.named("ratio"),
                     "p": sign_flip_test(differences, errors),
                 }
             )
@@ -409,9 +402,7 @@ def _change(meshes: pd.DataFrame) -> dict[str, object]:
     return {
         "objects": len(by_object),
         "meshes": len(meshes),
-        "ratio": interval.mean,
-        "low": interval.low,
-        "high": interval.high,
+        **interval.named("ratio"),
         "p": sign_flip_test(ratios, errors),
         "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
         "worst_ratio": float(np.exp(worst["log_ratio"])),

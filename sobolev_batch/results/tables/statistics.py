@@ -138,6 +138,10 @@ class Interval:
         half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2)) * deviation / math.sqrt(count) + float(np.mean(errors))
         return cls(mean, mean - half, mean + half)
 
+    def named(self, name: str, prefix: str = "") -> dict[str, float]:
+        """Return the columns of a table: the mean by a name, and the ends low and high, with a prefix."""
+        return {name: self.mean, f"{prefix}low": self.low, f"{prefix}high": self.high}
+
     def exp(self) -> Interval:
         """Return the interval of the geometric mean, where this is one of logarithms."""
         return Interval(*(float(np.exp(value)) for value in (self.mean, self.low, self.high)))

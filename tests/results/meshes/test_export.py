@@ -16,8 +16,8 @@ from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from sobolev_batch.results.meshes.export import Exporter
-from sobolev_batch.results.meshes.views import witness_at_vertices
+from sobolev_batch.results.figures.export import Exporter
+from sobolev_batch.results.figures.views import witness_at_vertices
 from tests.support.spheres import CENTER, LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 
 Spheres = tuple[str, Path]
@@ -214,6 +214,6 @@ def test_without_a_reference_there_is_nothing_to_compare_with(
     place, folder = spheres
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    monkeypatch.setattr("sobolev_batch.results.meshes.export.as_tree", lambda _: tree)
+    monkeypatch.setattr("sobolev_batch.results.figures.export.as_tree", lambda _: tree)
     with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
         Exporter.from_store(place, folder=folder)

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
+from sobolev_batch.results.figures import render as rendering
+from sobolev_batch.results.figures.render import render
 from sobolev_batch.results.figures.selection import Selection
+from sobolev_batch.results.figures.views import MeshView, make_views
 from sobolev_batch.results.figures.witness_plots import write_witness_plots
-from sobolev_batch.results.meshes import render as rendering
-from sobolev_batch.results.meshes.render import render
-from sobolev_batch.results.meshes.views import MeshView, make_views
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
 

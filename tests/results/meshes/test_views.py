@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import icosphere
-from sobolev_batch.results.meshes.views import FRONT, MeshView
+from sobolev_batch.results.figures.views import FRONT, MeshView
 
 BALL = icosphere(4)
 TRIANGLES = BALL.triangles.astype(np.int32)

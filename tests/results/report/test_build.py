@@ -23,10 +23,10 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures.selection import Spectra
-from sobolev_batch.results.meshes.views import make_views
+from sobolev_batch.results.figures.views import make_views
 from sobolev_batch.results.report import build, charts
 from sobolev_batch.results.report.build import make_report
-from sobolev_batch.results.report.elements import ReportLimits
+from sobolev_batch.results.report.content import ReportLimits
 from sobolev_batch.results.status import Status
 from tests.support.browser import Browser, browser
 
@@ -350,7 +350,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
 @pytest.mark.all
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(Status.from_store(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
-    monkeypatch.setattr(Status, "of", lambda _: status)
+    monkeypatch.setattr(Status, "from_store", lambda _: status)
     text = make_report(store).text
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1

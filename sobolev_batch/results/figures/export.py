@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.meshes.views import MeshRebuilder, matching_labels, witness_at_vertices
+from sobolev_batch.results.figures.views import MeshRebuilder, matching_labels, witness_at_vertices
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.tables.groups import finished_group, reference_of
 from sobolev_batch.spectral.shells import Orders, check_orders

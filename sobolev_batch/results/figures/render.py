@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.meshes.views import MeshView
+from sobolev_batch.results.figures.views import MeshView
 
 # Pictures (k, height, width, 3) in red, green and blue.
 Pictures = NDArray[np.uint8]
