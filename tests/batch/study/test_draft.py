@@ -231,20 +231,6 @@ def test_names_that_a_study_or_a_terminal_cannot_take_are_left_out(tmp_path: Pat
     assert [family.name for family in sb.Study.from_toml(draft.path).families] == ["meshes"]
 
 
-def test_long_summaries_are_cut() -> None:
-    draft = sb.StudyDraft(
-        Path("study.toml"), [f"line {i}" for i in range(50)], {f"{i}.ply": "empty" for i in range(50)}
-    )
-    assert [line.split(":")[0] for line in str(draft).splitlines()] == [
-        "study.toml",
-        *(f"line {i}" for i in range(1, 11)),
-        "and 39 more",
-        *["left out"] * 11,
-        "next",
-        "      sobolev-batch run study.toml",
-    ]
-
-
 def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(sb.StudyError, match="no such folder"):
         sb.init_study(tmp_path / "nowhere", tmp_path / "study.toml")

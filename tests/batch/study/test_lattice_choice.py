@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import AccuracyError, Lattice, Sphere, Study, StudyError, distance, icosphere, open_store, run
+from sobolev_batch import AccuracyError, Lattice, Sphere, Study, distance, icosphere, open_store, run
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study import lattice_search as search_module
@@ -152,38 +152,3 @@ def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Pat
     convergence = open_store(store_path)["convergence"].to_dataset()
     assert convergence["within"].sel(mesh=["ico/0", "ico/1", "ico/2"]).all()
     assert (convergence["distance"].sel(mesh="ico/3") == 0).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"lattice": {"xi_max": 1.0, "M": 8}}, "either a .lattice. or an .accuracy. is needed"),
-        ({"accuracy": {"rtol": 2.0}}, "rtol must lie between 0 and 1, found 2.0"),
-        ({"accuracy": {"rtol": "small"}}, "accuracy.: rtol must be a number"),
-        ({"accuracy": {"rtol": 1e-3, "memory": 0}}, "accuracy.: memory: memory must be a positive number of bytes"),
-        ({"accuracy": {"rtol": 1e-3, "memory": "much"}}, "accuracy.: memory: memory must be .*, found 'much'"),
-        ({"accuracy": {"rtol": 1e-3, "atol": 1}}, "accuracy.: atol is unknown; did you mean rtol"),
-        ({"transform": {"eps": 1e-9}}, "an .accuracy. chooses eps and quadrature"),
-    ],
-)
-def test_malformed_accuracies_are_refused(changes: dict[str, Any], message: str) -> None:
-    table = {**small_table(), "accuracy": {"rtol": 1e-3}}
-    del table["lattice"]
-    with pytest.raises(StudyError, match=message):
-        Study.from_table({**table, **changes})
-
-
-def test_neither_lattice_nor_accuracy() -> None:
-    table = small_table()
-    del table["lattice"]
-    with pytest.raises(StudyError, match=r"either a \[lattice\] or an \[accuracy\] is needed"):
-        Study.from_table(table)
-
-
-def test_families_of_which_nothing_can_be_made_leave_no_choice(tmp_path: Path) -> None:
-    (tmp_path / "broken.off").write_text("OFF\n1 1 0\n")
-    table = {**small_table(), "accuracy": {"rtol": 1e-3}}
-    table["family"] = [{"name": "bad", "source": "files", "paths": ["broken.off"]}]
-    del table["lattice"]
-    with pytest.raises(StudyError, match="none of the study's surfaces can serve to choose a lattice"):
-        make_plan(Study.from_table(table, folder=tmp_path))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,6 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import (
-    Ellipsoid,
-    InputError,
     Interval,
     LatticeError,
     ParametrisedSurface,
@@ -25,9 +24,8 @@ from sobolev_batch import (
 )
 from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.spectral.adaptive.solve import DistanceTarget
-from sobolev_batch.surfaces.sources.registry import Member, SurfaceMember
-from tests.support.smooth_shapes import roof, roof_derivatives, turned_torus
+from sobolev_batch.surfaces.sources.registry import SurfaceMember
+from tests.support.smooth_shapes import roof, roof_derivatives
 from tests.support.studies import variable
 
 RING = {"R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}
@@ -98,19 +96,6 @@ def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path
 
 
 @pytest.mark.slow
-def test_only_what_changed_is_computed_again(threads: Client, store_path: Path) -> None:
-    def go(**changes: Any) -> tuple[str, ...]:
-        return run(Study.from_table(torus_table(scaling={"mode": "none"}, **changes)), store_path, threads).computed
-
-    family = [{"name": "f", "source": "ellipsoid", "axes": [1.0, 0.8, 0.5]}]
-    here = {"source": "torus", "R": 1.0, "r": 0.4}
-    assert go(family=family, reference=here) == ("f/ellipsoid", "reference")
-    assert go(family=family, reference=here) == ()
-    assert go(family=family, reference={**here, "r": 0.41}) == ("reference",)
-    assert go(family=[{**family[0], "axes": [0.8, 1.0, 0.5]}], reference={**here, "r": 0.41}) == ("f/ellipsoid",)
-
-
-@pytest.mark.slow
 def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]
@@ -140,40 +125,6 @@ def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_pat
     assert errors[0] == pytest.approx(errors[1], rel=3.0)
 
 
-# Sources of one's own.
-
-
-@dataclass(frozen=True)
-class Fixed:
-    """A source in the place of one from a registry."""
-
-    surface: ParametrisedSurface
-    identity: Mapping[str, Any]
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        return (SurfaceMember("own", -1, self.surface, self.identity),)
-
-
-def own(surface: ParametrisedSurface, **changes: Any) -> Study:
-    """The study of the torus with a surface of one's own as its reference."""
-    study = Study.from_table(torus_table(**changes))
-    source: Any = Fixed(surface, {"test": 1})
-    object.__setattr__(study, "reference", source)
-    return study
-
-
-@pytest.mark.slow
-def test_a_reference_of_one_s_own(threads: Client, store_path: Path) -> None:
-    family = [{"name": "turned", "source": "torus", "R": 1.0, "r": 0.4}]
-    surface = turned_torus(Torus(1.0, 0.4))
-    study = own(surface, family=family, lattice={"xi_max": 4.0, "M": 40})
-    summary = run(study, store_path, threads)
-    assert summary.computed == ("turned/torus", "reference")
-    norms = open_store(store_path)["norms"].to_dataset()["norm"]
-    # Turning a surface changes no norm but by what the cube cuts off its corners.
-    assert norms.sel(mesh="reference").values == pytest.approx(norms.sel(mesh="turned/torus").values, rel=1e-3)
-
-
 @pytest.mark.slow
 def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -182,7 +133,10 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     side = Interval(-0.9, 1.0)
     rough = ParametrisedSurface(roof, side, side, roof_derivatives)
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]
-    summary = run(own(rough, family=family), store_path, threads)
+    study = Study.from_table(torus_table(family=family))
+    member = SurfaceMember("own", -1, rough, {"test": 1})
+    object.__setattr__(study, "reference", SimpleNamespace(members=lambda folder: (member,)))
+    summary = run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
 
@@ -197,37 +151,3 @@ def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
     similarity = make_plan(Study.from_table(torus_table())).similarity
     assert (similarity.scale, similarity.origin) == (1 / 2.8, (5.0, 0.0, 1.0))
     assert make_plan(Study.from_table(egg_table())).similarity.scale == 0.5
-
-
-@pytest.mark.slow
-def test_error_targets_of_smooth_references_are_met_by_settings() -> None:
-    table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
-    del table["lattice"]
-    plan = make_plan(Study.from_table(table))
-    target = plan.distance_target(next(row for row in plan.rows if row.label == "reference"))
-    assert isinstance(target, DistanceTarget)
-    assert plan.sample is not None
-    assert np.abs(plan.sample.exact).max() > 0
-    error_target = target.error_target(Torus(2.0 / 2.8, 0.8 / 2.8))
-    assert all(norm > 0 for norm in error_target.norms)
-
-
-def test_smooth_surfaces_cannot_be_decimated() -> None:
-    family = [{"name": "f", "source": "decimate", "mesh": {"source": "torus", **RING}, "triangles": [100]}]
-    plan = make_plan(Study.from_table(torus_table(family=family)))
-    with pytest.raises(InputError, match="torus is no mesh; its triangles are needed"):
-        plan.rows[0].member.load()
-
-
-def test_ellipsoids_and_their_levels_are_the_library_s() -> None:
-    plan = make_plan(Study.from_table(egg_table()))
-    assert [row.label for row in plan.rows] == [f"ico/{level}" for level in range(5)] + ["reference"]
-    assert plan.rows[-1].member.load() == Ellipsoid((2.0, 1.4, 0.8))
-    assert len({row.key for row in plan.rows}) == 6
-
-
-def test_the_study_of_a_torus_that_is_ready_to_run() -> None:
-    study = Study.from_toml(Path(__file__).parents[3] / "workflows" / "torus.toml")
-    plan = make_plan(study)
-    assert [row.label for row in plan.rows] == [*(f"grid/{level}" for level in range(6)), "reference"]
-    assert plan.rows[-1].member.load() == Torus(1.0, 0.4)

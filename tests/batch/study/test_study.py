@@ -104,7 +104,7 @@ def test_its_example_is_valid(tmp_path: Path) -> None:
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
 
 
-@pytest.mark.parametrize("name", ["icosphere", "cortex"])
+@pytest.mark.parametrize("name", ["icosphere", "cortex", "torus"])
 def test_the_workflows_are_valid(name: str) -> None:
     assert Study.from_toml(WORKFLOWS / f"{name}.toml").name == name
 
