@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER, LEAST_GIVE_UP_AFTER
-from sobolev_batch.results.tables.text import FORMATS
+from sobolev_batch.results.tables import FORMATS
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location

@@ -23,7 +23,7 @@ from sobolev_batch.cli.options import (
 )
 from sobolev_batch.cli.output import ProgressLine, echo, echo_lines, progress_bar
 from sobolev_batch.errors import SobolevBatchError, StoreError
-from sobolev_batch.results.tables.text import Format
+from sobolev_batch.results.tables import Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location

@@ -15,6 +15,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
 from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.groups import (
     EDGE_LENGTH,
     convergence_at,
@@ -28,7 +29,6 @@ from sobolev_batch.results.tables.groups import (
 )
 from sobolev_batch.results.tables.text import (
     Column,
-    Format,
     column_table,
     count,
     machine_table,

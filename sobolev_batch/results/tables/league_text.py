@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pandas as pd
 
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.league import League
 from sobolev_batch.results.tables.statistics import least_objects
-from sobolev_batch.results.tables.text import Column, Format, column_table, machine_table, prose
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose
 
 LEAGUE_NOTE = """\
 Relative distances are geometric means over the objects, at equal {x}. Their 95 % intervals

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.groups import (
     chosen_orders,
     complete_meshes,
@@ -22,15 +23,7 @@ from sobolev_batch.results.tables.groups import (
     reference_norm_at,
     reference_of,
 )
-from sobolev_batch.results.tables.text import (
-    LINE_LENGTH,
-    Format,
-    concise,
-    machine_table,
-    middle_cut,
-    printed_table,
-    prose,
-)
+from sobolev_batch.results.tables.text import LINE_LENGTH, concise, machine_table, middle_cut, printed_table, prose
 from sobolev_batch.spectral.errors.budget import quotients
 from sobolev_batch.spectral.shells import check_orders
 

@@ -7,19 +7,17 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 from tabulate import tabulate
 
+from sobolev_batch.results.tables import Format
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# Formats of tables; commands list them without importing what makes tables.
-Format = Literal["text", "csv", "json", "markdown", "latex"]
-FORMATS: tuple[Format, ...] = get_args(Format)
 
 # More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7

@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, matrix
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.groups import distances_at
 from sobolev_batch.results.tables.matrix import Matrix, format_matrix, matrix_frame
-from sobolev_batch.results.tables.text import Format
 
 ORDERS = [-4.0, -2.0]
 
