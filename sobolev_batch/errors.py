@@ -45,7 +45,7 @@ class AccuracyError(InputError):
 
 
 class StudyError(InputError):
-    """A study file is malformed, or asks for something that does not exist."""
+    """A study file is malformed, or requests something that does not exist."""
 
 
 class StoreError(InputError):

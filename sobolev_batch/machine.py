@@ -89,8 +89,8 @@ def require_machine_memory(needed_bytes: float, what: str, advice: str = "") -> 
     """Refuse to take more memory than there is.
 
     Args:
-        needed_bytes: Memory that is asked for.
-        what: What asks for it, as the subject of a message.
+        needed_bytes: Memory that is requested.
+        what: What requests it, as the subject of a message.
         advice: What follows "ask for less" in the message.
 
     Raises:

@@ -266,10 +266,10 @@ REFUSED = [
     ("run broken.toml", "[lattice]: m is unknown; did you mean M?"),
     ("run study.toml --store taken", "not empty and holds no store"),
     ("run study.toml --store /proc/x.zarr", "/proc/x.zarr: the store cannot be written"),
-    (f"run other.toml --store {STORE}", "a store of another study is there"),
+    (f"run other.toml --store {STORE}", "it holds a store of another study"),
     ("run study.toml --store huge.zarr --memory 1000TB", "memory of a worker of 1.0PB is more than there is"),
     ("run greedy.toml", "memory of 1.0PB is more than there is"),
-    ("status nothing.zarr", "no store of a study is there"),
+    ("status nothing.zarr", "it holds no store of a study"),
     (f"table {STORE} --below much", "found 'much'"),
     (f"table {STORE} --order -0.4", "below -1/2, found -0.4"),
     (f"plot {STORE} --output study.toml", "study.toml: no files can be written there"),
@@ -316,7 +316,7 @@ def test_wrong_input_gives_one_line_or_the_usage_and_status_2(folder: Path, line
 def test_a_process_ends_in_the_same_way(folder: Path) -> None:
     done = command("status", "nothing.zarr", folder=folder)
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.match(r"^error: .*no store of a study is there.*\n$", done.stderr)
+    assert re.match(r"^error: .*it holds no store of a study.*\n$", done.stderr)
     assert "Traceback" in command("--debug", "status", "nothing.zarr", folder=folder).stderr
 
 

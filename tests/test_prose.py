@@ -1,4 +1,4 @@
-"""Turns of phrase that make prose hard to read do not become more, in the package and in its pages."""
+"""Turns of phrase that make prose hard to read are in no module, message or page."""
 
 from __future__ import annotations
 
@@ -8,30 +8,34 @@ import pytest
 
 from tests.support.repository import PACKAGE, ROOT
 
-# Each with the number of places that have it still. It may only fall: write another sentence.
+# Folders and files that are still to be rewritten; none may be added.
+UNREVISED = (
+    "batch/fields/tasks.py",
+    "spectral/adaptive/",
+    "spectral/errors/budget.py",
+    "spectral/octaves/",
+)
+# By what to write in their place.
 PATTERNS = {
-    "so many, so much": (r"\bso (?:many|much)\b", 32),
-    "a genitive at the beginning": (
-        r"(?:^|[.:;]\s+)Of (?:an?|the|its|this|these|those|each|every|all)\b[^.;:\n]*, ",
-        7,
-    ),
-    "of which, of whom": (r"\bof wh(?:ich|om)\b", 28),
-    "is there, stands in, for a position": (r"\b(?:is|are) there\b|\bstands? (?:in|on|at|beside|under|there)\b", 31),
-    "can be had": (r"\bbe had\b", 7),
-    "falls short": (r"\bfalls? short\b", 15),
-    "a study or an option asks for": (r"\bask(?:s|ed) for\b", 73),
-    "as far as": (r"\bas far as\b", 16),
-    "too at the end": (r", too\b", 13),
+    "a number, or 'this many'": r"\bso (?:many|much)\b",
+    "the subject first": r"(?:^|[.:;]\s+)Of (?:an?|the|its|this|these|those|each|every|all)\b[^.;:\n]*, ",
+    "a second sentence, or 'whose'": r"\bof wh(?:ich|om)\b",
+    "'exists', 'holds', 'is'": r"\b(?:is|are) there\b|\bstands? (?:in|on|at|beside|under|there)\b",
+    "'attainable'": r"\bbe had\b",
+    "'misses', 'below the target'": r"\bfalls? short\b",
+    "'requests', 'requires'": r"\bask(?:s|ed) for\b",
+    "'where', or a distance": r"\bas far as\b",
+    "'also'": r", too(?=[.;:)]|$)",
 }
 
 
-@pytest.mark.parametrize("name", PATTERNS)
-def test_no_more_places_have_a_pattern(name: str) -> None:
-    pattern, most = PATTERNS[name]
+@pytest.mark.parametrize("remedy", PATTERNS)
+def test_no_place_has_a_pattern(remedy: str) -> None:
     places = [
-        f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, match.start()) + 1}"
+        f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, match.start()) + 1}: {match[0].strip()!r}"
         for path in sorted([*PACKAGE.rglob("*.py"), *(ROOT / "docs").glob("*.md"), ROOT / "README.md"])
+        if not path.relative_to(ROOT).as_posix().removeprefix(f"{PACKAGE.name}/").startswith(UNREVISED)
         for text in [path.read_text(encoding="utf-8")]
-        for match in re.finditer(pattern, text, re.MULTILINE)
+        for match in re.finditer(PATTERNS[remedy], text, re.MULTILINE)
     ]
-    assert len(places) <= most, f"{name}, in {len(places)} places where {most} are allowed: {', '.join(places)}"
+    assert not places, f"write {remedy} in place of\n" + "\n".join(places)

@@ -61,14 +61,14 @@ class CollectionStore:
         """Write down at a location which objects a collection has, and return its store.
 
         Raises:
-            StoreError: Something else is there, or the location cannot be written.
+            StoreError: The location holds something else, or cannot be written.
         """
         present = cls.read(location)
         if present is None:
             location.require_free()
         elif present.name != collection.name:
             raise StoreError(
-                f"{location}: the store of another collection is there, {present.name!r}, not {collection.name!r}; "
+                f"{location}: it holds the store of another collection, {present.name!r}, not {collection.name!r}; "
                 "name another store, or remove this one"
             )
         entry = {

@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 Entry = TypeVar("Entry")
 
-# A study whose distances fall short of the accuracy asked for is computed again on a larger lattice,
+# A study whose distances miss the accuracy requested is computed again on a larger lattice,
 # this often in all.
 _MOST_ROUNDS = 3
 # Fields that turn out damaged are computed again; where that goes on, something destroys them.
@@ -60,8 +60,8 @@ class Summary:
         reused: Labels of the meshes whose fields were already stored.
         failed: Reason for each mesh whose field could not be computed, by its label.
         not_compared: Reason for each mesh whose field is stored, but not the Hausdorff and Chamfer distances that the
-            study asks for.
-        imprecise: Largest relative error of the distances of each mesh that are less accurate than the study asks for.
+            study requests.
+        imprecise: Largest relative error of the distances of each mesh that are less accurate than the study requires.
 
     >>> import sobolev_batch as sb
     >>> summary = sb.Summary("results.zarr", computed=("ico/2",), reused=("ico/1",), failed={"f/a": "no triangles"})
@@ -116,8 +116,8 @@ def run(
         on_progress: Callback for each step; it is called in this thread.
         reuse: Paths or URLs of other stores. Fields that they have already are copied, not computed: of the same
             surface, reference, scaling, accuracy and lattice, whatever the mesh is called there. So the stores of parts
-            of a study become one. Of the store of a collection, those of the same object are. If the study asks for an
-            accuracy, a new store takes the lattice of the first one.
+            of a study become one. From the store of a collection, those of the same object are used. If the study
+            requests an accuracy, a new store takes the lattice of the first one.
         give_up_after: Time in seconds after which a worker that says nothing is given up: its tasks are given to
             others. A scheduler that says nothing for so long counts as lost.
 
@@ -127,10 +127,10 @@ def run(
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
-        AccuracyError: The accuracy that the study asks for is out of reach; nothing was computed.
+        AccuracyError: The accuracy that the study requests is out of reach; nothing was computed.
         StoreError: The store cannot be reached or written, belongs to another study, or is being
             written by another run (LockError).
-        ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice; or
+        ClusterError: No worker has the GPU that the study requests, or enough memory for its lattice; or
             the scheduler was lost.
         InputError: The memory is not a size, or too little for a worker; or the study or its workers ask for more than
             there is; or give_up_after is less than 10 seconds.
@@ -380,7 +380,7 @@ def _imprecise(workspace: Workspace) -> dict[str, float]:
 
 
 def _larger_lattice(plan: Plan, distances: NormEstimate | None) -> LatticeChoice | None:
-    """Return a larger lattice where distances to the reference miss the accuracy that is asked for."""
+    """Return a larger lattice where distances to the reference miss the accuracy that is requested."""
     if plan.study.accuracy is None or distances is None:
         return None
     complete = ~np.isnan(distances.values).any(axis=0)

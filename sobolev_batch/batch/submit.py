@@ -81,7 +81,7 @@ def submit(
 
     Raises:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
-        ClusterError: No worker has the GPU that the study asks for, or the scheduler did not take the study in time.
+        ClusterError: No worker has the GPU that the study requests, or the scheduler did not take the study in time.
         InputError: See `run`.
 
     >>> import tempfile

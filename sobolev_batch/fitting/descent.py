@@ -27,7 +27,7 @@ Notify = Callable[[Reals, float], None]
 _MEMORY = 20
 # Cost of a triangle that loses its area, relative to the squared distance at the start.
 _SHAPE_WEIGHT = 1e-3
-# A descent ends when the distance has fallen by less than this fraction over so many steps.
+# A descent ends when the distance has fallen by less than this fraction over this many steps.
 _LEAST_PROGRESS, _PATIENCE = 0.01, 10
 # A triangle may lose this fraction of its quality freely, and any down to this quality.
 _FREE_LOSS, _GOOD = 0.5, 0.3

@@ -23,7 +23,7 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
 
-# Relative errors of distances that are asked for, one after the other.
+# Relative errors of distances that are requested, one after the other.
 _RTOLS = (0.02, 0.1)
 # Beyond this relative distance at the coarse order, a mesh is far from its target.
 _FAR = 0.05

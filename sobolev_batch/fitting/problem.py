@@ -47,7 +47,7 @@ _MOST_INTERVALS = 96
 _ALIASING, _ROOM = 1e-2, 1.2
 # Errors of fields, as fractions of the distance at the start and at the start of a stage.
 _TARGET_FRACTION, _MESH_FRACTION = 2e-3, 0.02
-# A distance of so many errors of its fields is not lowered any further.
+# A distance of this many errors of its fields is not lowered any further.
 _LEAST_ERRORS = 5.0
 
 
@@ -265,7 +265,7 @@ def _centering(start: Mesh, target: Surface) -> Similarity:
 
 
 def fit_lattice(mesh: Mesh, target: Surface, orders: tuple[float, ...]) -> Lattice:
-    """Return a lattice for fits: it reaches to wavelengths of an edge, as far as a moderate M allows."""
+    """Return a lattice for fits: it reaches to wavelengths of an edge, or to those that a moderate M allows."""
     extent = Extent.union([mesh.extent, target.extent])
     support = Support(np.array(mesh.area + target.area), _ROOM * extent.widths, _ROOM * extent.reach)
     period = 2 * core_lattice(support, orders, Accuracy(_ALIASING)).half_period

@@ -21,10 +21,10 @@ from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
 
-# While the goal is so many times as large, all edges are split. A choice of triangles came no nearer then: fits pull
+# While the goal is larger by this factor, all edges are split. A choice of triangles came no nearer then: fits pull
 # vertices to where they are needed, and even splits leave better triangles.
 _EVEN_ABOVE = 4
-# Then a finer mesh has at most so many times the triangles of the one before.
+# Then a finer mesh has at most this factor times the triangles of the one before.
 _GROWTH = 2.0
 # The last factor may be a little larger, instead of a round for few triangles.
 _LAST_GROWTH = 1.15
@@ -198,7 +198,7 @@ def largest_while_refining(count: int, triangles: int) -> int:
 
 
 def _goals(count: int, triangles: int) -> list[int]:
-    """Return the number of triangles after each split of a mesh of so many triangles."""
+    """Return the number of triangles after each split of a mesh with this many triangles."""
     goals = []
     while count < triangles:
         if count * _EVEN_ABOVE <= triangles:

@@ -201,7 +201,7 @@ class _Areas:
         self.normals: Reals = normals / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
 
     def pulled_back(self, slopes: Reals, count: int) -> Reals:
-        """Return Σ slope · ∂area/∂vertex over the triangles for each of so many vertices (count, 3)."""
+        """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (count, 3)."""
         gradient = np.zeros((count, 3))
         for corner in range(3):
             opposite = self.corners[corner - 1] - self.corners[corner - 2]

@@ -26,7 +26,7 @@ _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticEr
 def open_store(store: str | Path | Location) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 
-    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study asks for it also
+    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study requests it also
     proximity. docs/store.md lists their variables with dimensions and units. Fields stay on disk until you ask for
     values of them; they have the accessor `field.sobolev`.
 

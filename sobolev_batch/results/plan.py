@@ -33,7 +33,7 @@ from sobolev_batch.visible import visible
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
-# Processor time to start a process with all libraries, and the time until a cluster of them is there.
+# Processor time to start a process with all libraries, and the time until a cluster of them has started.
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
@@ -211,7 +211,7 @@ class StudyPlan:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Reasons for the lattice, where the study asks for an accuracy."""
+        """Reasons for the lattice, where the study requests an accuracy."""
         return self._plan.choice.reasons
 
     @property
@@ -371,7 +371,7 @@ def plan(
 ) -> StudyPlan | CollectionPlan:
     """Return what running a study would do, without computing anything.
 
-    The reference is loaded, and a few other surfaces where the study asks for an accuracy. An object of a collection
+    The reference is loaded, and a few other surfaces where the study requests an accuracy. An object of a collection
     that cannot be carried out stops no other.
 
     Args:
@@ -381,9 +381,9 @@ def plan(
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
-        AccuracyError: The accuracy that the study asks for is out of reach.
-        InputError: The study asks for more memory than any worker has.
-        ClusterError: No worker has the GPU that the study asks for, or enough memory for its lattice.
+        AccuracyError: The accuracy that the study requests is out of reach.
+        InputError: The study requests more memory than any worker has.
+        ClusterError: No worker has the GPU that the study requests, or enough memory for its lattice.
         StoreError: The store cannot be reached, or the location holds something else.
 
     >>> import sobolev_batch as sb

@@ -36,7 +36,7 @@ class Status:
         total: Number of surfaces of the study.
         failed: Reason for each surface that could not be computed, by label.
         not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
-            study asks for.
+            study requests.
         run: Record of the latest run, or None.
         reduced: True once the store has tables.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.

@@ -168,7 +168,7 @@ def field_for(
     *,
     sample: Sample | None = None,
 ) -> Field:
-    """Return the field of a surface with an error within a target, as far as its probe can tell.
+    """Return the field of a surface with an error within a target, by the estimate of its probe.
 
     Args:
         surface: Surface in units of length.

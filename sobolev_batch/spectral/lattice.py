@@ -56,7 +56,7 @@ class Block:
         """Return equal blocks of at most ``largest_size`` samples that make up this one.
 
         They differ in shape only at the high ends, as the chunks of a regular grid do. The slow axes are split
-        first, so that a block is contiguous in memory as far as possible.
+        first, so that a block is as contiguous in memory as possible.
         """
         shape = list(self.shape)
         for axis in range(3):

@@ -202,7 +202,7 @@ def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
 
 
 def test_the_store_of_another_collection_is_refused(store: Path, client: Client) -> None:
-    with pytest.raises(sb.StoreError, match="the store of another collection is there, 'small', not 'other'"):
+    with pytest.raises(sb.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
         sb.run(collection(spheres(a=1.0), "other"), store, client)
 
 
@@ -214,7 +214,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
 
 
 def test_what_is_no_collection_is_said(finished_store: Path) -> None:
-    with pytest.raises(sb.StoreError, match="no store of a collection is there"):
+    with pytest.raises(sb.StoreError, match="it holds no store of a collection"):
         sb.league(finished_store)
 
 

@@ -111,7 +111,7 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(
     table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
     with pytest.raises(StudyError, match="matches no file"):
         submit(Study.from_table(table, folder=tmp_path), store_path, threads)
-    with pytest.raises(ClusterError, match="asks for backend 'gpu'"):
+    with pytest.raises(ClusterError, match="requests backend 'gpu'"):
         submit(Study.from_table(small_table(transform={"backend": "gpu"})), store_path, threads)
     assert not store_path.exists()
 

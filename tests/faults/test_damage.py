@@ -254,7 +254,7 @@ def test_fields_that_are_replaced_are_not_described_any_more(store: Path, thread
 def test_damaged_metadata_are_told(damage: Damage, store: Path, study: Study, threads: Client) -> None:
     damage(store / "zarr.json")
     for use in (Store.open, open_store):
-        with pytest.raises(StoreError, match=r"results\.zarr: .*no store of a study is there"):
+        with pytest.raises(StoreError, match=r"results\.zarr: .*it holds no store of a study"):
             use(store)
     if damage is delete:
         with pytest.raises(StoreError, match=r"results\.zarr: .*holds no store"):

@@ -14,7 +14,7 @@ from tests.support.commands import call, write_toml
     ("place", "message"),
     [
         ("typo/results.zarr", "there is no folder {folder}/typo to hold the store; make it first"),
-        ("file", "a file is there"),
+        ("file", "it is a file"),
         ("folder", "not empty and holds no store"),
         pytest.param(
             *("/proc/results.zarr", "/proc/results.zarr: the store cannot be written"),

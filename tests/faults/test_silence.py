@@ -131,7 +131,7 @@ def test_a_cluster_without_workers_is_told() -> None:
     with tcp_cluster() as (address, _):
         assert told(address, False) == "no worker is left; waiting for one to start"
     with tcp_cluster([]) as (address, _):
-        assert told(address, True).startswith("no worker with a GPU is left, and the study asks for one")
+        assert told(address, True).startswith("no worker with a GPU is left, and the study requests one")
 
 
 @pytest.mark.parametrize("seconds", [0, 9.9, float("nan"), -1])

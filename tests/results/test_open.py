@@ -17,7 +17,7 @@ from tests.support.studies import small_table
 
 
 def test_opening_nothing(tmp_path: Path) -> None:
-    with pytest.raises(sb.StoreError, match="no store of a study is there"):
+    with pytest.raises(sb.StoreError, match="it holds no store of a study"):
         sb.open_store(tmp_path)
 
 

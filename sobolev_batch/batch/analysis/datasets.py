@@ -152,7 +152,7 @@ def convergence_dataset(
         to_reference: Distances to the reference.
         sizes: Mean edge lengths (meshes,).
         families: Meshes of each family that goes from coarse to fine.
-        accuracy: Accuracy that the study asks for, if any.
+        accuracy: Accuracy that the study requests, if any.
     """
     reference, proportion = to_reference.reference, to_reference.proportion
     distances, errors = to_reference.distances.values, to_reference.distances.errors

@@ -1,4 +1,4 @@
-"""Hausdorff and Chamfer distances of meshes from the reference, where a study asks for them.
+"""Hausdorff and Chamfer distances of meshes from the reference, where a study requests them.
 
 One task measures those of a mesh, from both meshes and no field, and adds them to the mesh's completion record. A
 table is made from the records.
@@ -39,7 +39,7 @@ _GROUP = "proximity"
 
 
 def have_proximities(workspace: Workspace) -> bool:
-    """Return True where the store has all distances that the study asks for, and readers find them."""
+    """Return True where the store has all distances that the study requests, and readers find them."""
     attributes = table_attributes(workspace.store, _GROUP)
     if workspace.plan.study.proximity is None:
         return attributes is None
@@ -48,7 +48,7 @@ def have_proximities(workspace: Workspace) -> bool:
 
 
 def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
-    """Measure the distances that the records lack, and write their table, or remove one that nobody asks for.
+    """Measure the distances that the records lack, and write their table, or remove one that nobody requests.
 
     Raises:
         StoreError: The store could not be read or written.
@@ -164,7 +164,7 @@ def measure_proximity(
 
 
 def _keys(workspace: Workspace) -> dict[int, str]:
-    """Return the key of the distances of each mesh that the study asks for: a digest of all they depend on."""
+    """Return the key of the distances of each mesh that the study requests: a digest of all they depend on."""
     points, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
     if points is None or reference not in complete:
         return {}

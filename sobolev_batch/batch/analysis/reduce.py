@@ -121,7 +121,7 @@ class Results:
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
     def enter_reference(self, reference: int) -> None:
-        """Enter the distances to the row of the reference, once all norms are there."""
+        """Enter the distances to the row of the reference, once all norms are entered."""
         if self.distances.shape[-1] == self.distances.shape[-2]:
             # The direct sums are the more exact ones, and the same numbers in both tables.
             place = self.places[reference]

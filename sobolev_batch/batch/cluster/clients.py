@@ -211,7 +211,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
 
 
 def require_private(name: str, who: str) -> None:
-    """Check that nobody else reaches an address: it asks for certificates, or is on loopback.
+    """Check that nobody else reaches an address: it demands certificates, or is on loopback.
 
     Args:
         name: Address, such as tls://host:8786; without a scheme, Dask's default is meant.

@@ -1,4 +1,4 @@
-"""Tasks on a cluster: handed out so many at a time, in the memory that there is, and their outcomes taken back.
+"""Tasks on a cluster: handed out a few at a time, in the free memory, and their outcomes taken back.
 
 Each step is reported to those who watch.
 """
@@ -92,7 +92,7 @@ class Cluster:
         return cls(client, prepare_workers(client, libraries), notify)
 
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
-        """Report that a stage of so many steps begins, and return a function that reports each by label and record."""
+        """Report that a stage of this many steps begins, and return a function that reports each by label and record."""
         done = count(1)
         self.notify(Progress(stage, 0, total))
         return lambda label, record: self.notify(Progress(stage, next(done), total, label, record))
@@ -139,7 +139,7 @@ class Cluster:
         completed = as_completed(loop=self.client.loop)
 
         def hand_out(number: int) -> list[tuple[Task, ClusterError]]:
-            """Submit so many tasks, and return those before them that fit into no worker."""
+            """Submit `count` tasks, and return those before them that fit into no worker."""
             refused = []
             for task in remaining:
                 try:

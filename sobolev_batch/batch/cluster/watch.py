@@ -138,7 +138,7 @@ class Watch:
         if not workers:
             return "no worker is left; waiting for one to start"
         if self._needs_gpu and not any(worker["resources"].get(GPU) for worker in workers.values()):
-            return "no worker with a GPU is left, and the study asks for one; waiting for one to start"
+            return "no worker with a GPU is left, and the study requests one; waiting for one to start"
         return ""
 
     def _silent_workers(self, silences: Mapping[str, _Silence]) -> str:

@@ -139,7 +139,7 @@ class Workers:
         """Return the workers that can serve a study with this backend.
 
         Raises:
-            ClusterError: The study asks for a GPU, and no worker has one.
+            ClusterError: The study requests a GPU, and no worker has one.
         """
         if backend != "gpu":
             return self
@@ -150,7 +150,7 @@ class Workers:
                 for member in self.members[:_MOST_NAMED]
             )
             raise ClusterError(
-                f"the study asks for backend 'gpu', and none of the {len(self.members)} workers can compute on one. "
+                f"the study requests backend 'gpu', and none of the {len(self.members)} workers can compute on one. "
                 f"{reasons}{'; ...' if len(self.members) > _MOST_NAMED else ''}. "
                 "Start a worker on a machine with an NVIDIA GPU and the extra gpu, or ask for backend 'auto'"
             )

@@ -166,7 +166,7 @@ class Location:
             return self._storage.names()
 
     def require_free(self, besides: Collection[str] = ()) -> None:
-        """Check that a store may be created here, as far as one can tell without writing.
+        """Check that a store may be created here, without writing.
 
         Args:
             besides: Names that may exist already.

@@ -32,7 +32,7 @@ from sobolev_batch.errors import DamageError, StoreError
 
 T = TypeVar("T")
 
-# zarr gives files such names, too, until they are complete.
+# zarr also gives files such names until they are complete.
 PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
 
 BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
@@ -40,7 +40,7 @@ _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 # A run that cannot go on should say so within a minute, and a question is to be answered sooner.
 LONGEST_SECONDS, _ANSWER_SECONDS = 40.0, 20
 _SLOWEST_BYTES_PER_SECOND = 500_000
-# s3fs asks for the size of every key first, to read ranges of 50 MB of larger ones at once.
+# s3fs requests the size of every key first, to read ranges of 50 MB of larger ones at once.
 _RANGE_BYTES = 50 << 20
 # Another attempt would not change these answers.
 _FINAL = (PermissionError, FileNotFoundError, NotADirectoryError)
@@ -169,7 +169,7 @@ class Folder:
         """Check that the folder exists or can be made."""
         path = Path(self._path)
         if path.exists() and not path.is_dir():
-            raise StoreError(f"{path}: a file is there; name a folder that is new or holds a store")
+            raise StoreError(f"{path}: it is a file; name a folder that is new or holds a store")
         parent = path.absolute().parent
         if not parent.is_dir():
             raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")

@@ -290,7 +290,7 @@ def _check_same_study(store: Store, plan: Plan) -> None:
     differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
     if differences:
         raise StoreError(
-            f"{store.path}: a store of another study is there, with {'; '.join(differences)}. "
+            f"{store.path}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
 

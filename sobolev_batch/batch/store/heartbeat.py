@@ -116,7 +116,7 @@ def release(store: str | Path | Location, *, force: bool = False) -> Lock | None
 
     Args:
         store: Path or URL of the store.
-        force: Whether to remove the lock of a run that was alive a moment ago, too.
+        force: Whether to also remove the lock of a run that was alive a moment ago.
 
     Returns:
         The lock, or None if the store had none. Its `driver` names the process that held it since the UTC time `since`.

@@ -95,7 +95,7 @@ class Record:
         worker: Address of the worker that finished it.
         backend: Backend of the transform.
         finished: Time at which it was finished, in UTC.
-        proximity: Hausdorff and Chamfer distances from the reference, where the study asks for them.
+        proximity: Hausdorff and Chamfer distances from the reference, where the study requests them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")

@@ -127,7 +127,7 @@ class Store:
             StoreError: No store of this package's schema exists.
         """
         if not self.exists() or self.documents[""].get("node_type") != "group":
-            raise StoreError(f"{self.path}: no store of a study is there")
+            raise StoreError(f"{self.path}: it holds no store of a study")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if COLLECTION in attributes:
             names = ", ".join(attributes[COLLECTION].get("objects", ())[:3])
@@ -320,7 +320,7 @@ class Store:
             document = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
             problem = f"{key} is damaged ({error})"
-            raise DamageError(f"{self.path}: no store of a study is there: {problem}", problem) from error
+            raise DamageError(f"{self.path}: it holds no store of a study: {problem}", problem) from error
         check_documents(self.path, {name: document})
         return document
 
@@ -475,7 +475,7 @@ class Store:
         return ""
 
     def rows_with_complete_fields(self) -> set[int]:
-        """Return the rows of which every block exists in its full length. No block is read."""
+        """Return the rows whose blocks all exist in their full length. No block is read."""
         rows = set(range(self.document(FIELD)["shape"][0]))
         for name in (FIELD, OCTAVES) if self.has_octaves else (FIELD,):
             rows -= {index[0] for index in self.incomplete_chunks(name, self.location.sizes(f"{name}/c"))}

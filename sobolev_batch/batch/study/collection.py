@@ -137,7 +137,7 @@ class StudyCollection:
         studies: dict[str, Study] = {}
         for section in objects:
             own = {method: meshes for (name, method), meshes in listed.items() if name == section.name}
-            # Files of objects with longer names match the templates of this object, too.
+            # Files of objects with longer names also match the templates of this object.
             longer = [other.name for other in objects if section.name in other.name and other.name != section.name]
             try:
                 table_of_object = _Part(section, common, own, longer, folder).table()

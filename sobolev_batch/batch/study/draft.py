@@ -38,7 +38,7 @@ name = {name}
 
 [accuracy]                 # of the distance of every mesh to the reference
 rtol = 1e-2                # the largest relative error: 1 % of the distance itself
-best_effort = true         # where that is out of reach, compute the nearest that can be had and mark it
+best_effort = true         # where that is out of reach, compute the nearest attainable accuracy and mark it
 
 [norm]
 orders = [-2.0, -4.0]      # -2 weighs details, -4 the overall form; -1.5 sees finer details and takes longer
@@ -303,7 +303,7 @@ def _count(number: int) -> str:
 
 
 def _size(files: Sequence[MeshFile]) -> str:
-    """Return how many meshes there are, and of which sizes."""
+    """Return the number and the sizes of the meshes."""
     counts = sorted(file.triangles for file in files)
     sizes = f"{counts[0]:,}" if counts[0] == counts[-1] else f"{counts[0]:,} to {counts[-1]:,}"
     return f"{_count(len(files))}, {sizes} triangles"

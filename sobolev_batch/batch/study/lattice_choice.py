@@ -76,7 +76,7 @@ class LatticeChoice:
         return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"], tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
-        """Return a larger or finer lattice for distances (orders, meshes) that fall short of an accuracy.
+        """Return a larger or finer lattice for distances (orders, meshes) that miss an accuracy.
 
         Return None if none of them does, if the lattice does not limit them, or if no larger one fits into the memory.
         """
@@ -107,7 +107,7 @@ class LatticeChoice:
     def _with_finer_octaves(
         self, tail: TailSampling, distances: NormEstimate, accuracy: Accuracy
     ) -> LatticeChoice | None:
-        """Return the choice with more samples or octaves, or a finer lattice, for distances that fall short."""
+        """Return the choice with more samples or octaves, or a finer lattice, for distances that miss an accuracy."""
         short = _short_by_frequencies(distances, accuracy)
         if not short.any():
             return None
@@ -151,7 +151,7 @@ def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, A
 
 
 def _short_by_frequencies(distances: NormEstimate, accuracy: Accuracy) -> NDArray[np.bool_]:
-    """Tell which distances fall short of an accuracy that other frequencies could give them.
+    """Tell which distances miss an accuracy that other frequencies could give them.
 
     The distance of a copy up to rounding is lost in the errors of the fields themselves.
     """

@@ -1,4 +1,4 @@
-"""The search for the lattice of a study that asks for an accuracy.
+"""The search for the lattice of a study that requests an accuracy.
 
 A few of its surfaces, the pilots, are compared with the reference. The most demanding of these pairs decides.
 """
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 # Pilots are the coarsest and the finest member of this many families.
 _MOST_FAMILIES = 6
-# A surface that reaches this many times as far as the reference is in another unit, or another object.
+# A surface larger than the reference by this factor is in another unit, or another object.
 _FARTHEST = 8.0
 # Memory that a pilot may take to be made, and that all surfaces together may take whose extents are looked at.
 _MOST_BYTES = 1e9
@@ -117,7 +117,7 @@ class Survey:
             return None
         times = surface.extent.reach / self.reference.reach
         if times > _FARTHEST:
-            self.set_aside[label] = f"it reaches {times:.3g} times as far as the reference; are both in the same unit?"
+            self.set_aside[label] = f"its extent is {times:.3g} times that of the reference; are both in the same unit?"
             return None
         self.extents[label] = surface.extent
         return surface
@@ -126,7 +126,7 @@ class Survey:
 def choose_lattice(
     study: Study, similarity: Similarity, reference: Surface, members: Members, basis: str
 ) -> LatticeChoice:
-    """Choose lattice, octaves and dtype for the accuracy that a study asks for.
+    """Choose lattice, octaves and dtype for the accuracy that a study requests.
 
     The coarsest and the finest member of each family are compared with the reference on a small lattice. Where one
     lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
@@ -145,7 +145,7 @@ def choose_lattice(
     """
     accuracy = study.accuracy
     if accuracy is None:
-        raise ValueError("only a study that asks for an accuracy leaves a choice")
+        raise ValueError("only a study that requests an accuracy leaves a choice")
     survey = Survey(members, similarity, reference.extent)
     pilots = survey.pilots()
     survey.look_at_others(pilots)
@@ -179,24 +179,24 @@ def choose_lattice(
             raise _worst(shortfalls)
         return best
     choice, short = search.best_for_most()
-    notes = [f"{label} will fall short of rtol {accuracy.rtol:g}" for label in short if choice is not None]
+    notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
         # Fewer digits of all of them, from the easiest on.
         for rtol in coarser_than(accuracy.rtol):
             aimed, _ = search.aiming_at(rtol).best_for_most()
             if aimed is None:
                 break
-            choice, notes = aimed, [f"all fall short of rtol {accuracy.rtol:g}; this is for {rtol:g}"]
+            choice, notes = aimed, [f"all miss rtol {accuracy.rtol:g}; this is for {rtol:g}"]
     choice = choice or search.largest()
     return replace(choice, reasons=(*choice.reasons, *notes))
 
 
-# A choice, if there is one for any pair, and why each pair that falls short does, by the label of its surface.
+# A choice, if there is one for any pair, and why each pair misses the accuracy that does, by the label of its surface.
 _Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
 
 
 def _worst(shortfalls: Mapping[str, AccuracyError]) -> AccuracyError:
-    """Return why the pair falls short that needs the largest rtol."""
+    """Return why the pair that needs the largest rtol misses its accuracy."""
     return max(shortfalls.values(), key=lambda shortfall: shortfall.reachable)
 
 
@@ -206,7 +206,7 @@ class _Search:
 
     Attributes:
         study: Study.
-        accuracy: Accuracy that it asks for, and no best effort.
+        accuracy: Accuracy that it requests, and no best effort.
         problems: Pair of each pilot with the reference, by label.
         basis: Digest of what the choice is made from.
     """
@@ -217,7 +217,7 @@ class _Search:
     basis: str
 
     def best(self) -> _Outcome:
-        """Return the first choice that is enough for all pairs, else the one of which most can be had."""
+        """Return the first choice that is enough for all pairs, else the most accurate attainable one."""
         ways = [self._on_one_lattice]
         if self._distances and permits_octaves(self.accuracy):
             ways.insert(0 if any(map(prefers_octaves, self.problems.values())) else 1, self._in_octaves)
@@ -229,7 +229,7 @@ class _Search:
         return min(outcomes, key=lambda outcome: _worst(outcome[1]).reachable)
 
     def best_for_most(self) -> tuple[LatticeChoice | None, list[str]]:
-        """Return a choice that is enough for all pairs but some that fall short, and their labels; None if all do."""
+        """Return a choice that is enough for all pairs but some that miss it, and their labels; None if all do."""
         search, short = self, list[str]()
         for _ in range(_MOST_RETRIES + 1):
             choice, shortfalls = search.best()
@@ -335,7 +335,7 @@ class _Search:
         return LatticeChoice(lattice, dtype, tuple(closest.tolist()), reasons, self.basis)
 
     def _dtype(self, singles: Iterable[bool]) -> ComplexDtype:
-        """Return the dtype that was asked for, or single precision where that is enough for every pair."""
+        """Return the dtype that was requested, or single precision where that is enough for every pair."""
         if self.study.dtype is not None:
             return self.study.dtype
         return "complex64" if all(singles) else "complex128"

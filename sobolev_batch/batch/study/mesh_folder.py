@@ -29,7 +29,7 @@ _LONGEST_NAME = 100
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file: its path below the folder, with slashes, and its number of triangles as far as a look shows it."""
+    """A mesh file: its path below the folder, with slashes, and its number of triangles if a look shows it."""
 
     path: str
     triangles: int

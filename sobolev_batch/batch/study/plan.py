@@ -65,7 +65,7 @@ class Plan:
         choice: Lattice and dtype of all fields.
         reference_area: Area of the reference, in squared units of length.
         reference_extent: Extent of the reference, in units of length.
-        sample: Sample of the reference, if an accuracy is asked for.
+        sample: Sample of the reference, if an accuracy is requested.
     """
 
     study: Study
@@ -85,7 +85,7 @@ class Plan:
 
     @property
     def transform(self) -> TransformSettings:
-        """Settings of the transforms. If an accuracy is asked for, eps and tolerance are chosen for each field."""
+        """Settings of the transforms. If an accuracy is requested, eps and tolerance are chosen for each field."""
         given = self.study.transform
         return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
 
@@ -105,7 +105,7 @@ class Plan:
         return (self.lattice.half.size + (0 if self.tail is None else self.tail.size)) * self.item_bytes
 
     def distance_target(self, row: Row) -> DistanceTarget | None:
-        """Return the accuracy that the field of a row is computed for, if an accuracy is asked for."""
+        """Return the accuracy that the field of a row is computed for, if an accuracy is requested."""
         if self.study.accuracy is None:
             return None
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
@@ -120,7 +120,7 @@ class Plan:
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
     """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
 
-    The reference is loaded, since the similarity depends on it, and a few pilots if an accuracy is asked for. No
+    The reference is loaded, since the similarity depends on it, and a few pilots if an accuracy is requested. No
     other surface is loaded.
 
     Args:

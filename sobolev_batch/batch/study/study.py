@@ -60,11 +60,11 @@ class Study:
     Attributes:
         name: Word or line that identifies the study; a store remembers it.
         title: Free text.
-        lattice: Lattice of all fields; None if an accuracy is asked for.
+        lattice: Lattice of all fields; None if an accuracy is requested.
         octaves: Number of octaves that are sampled beyond a given lattice.
         accuracy: Accuracy of the distances to the reference; None if the lattice is given.
         transform: Accuracy, dtype and quadrature of the transforms.
-        dtype: Dtype that was asked for, if any.
+        dtype: Dtype that was requested, if any.
         backend: Backend of the transforms; "auto" leaves it to each worker.
         orders: Sobolev orders s < -1/2.
         pairs: "all" for the distances of all pairs of meshes, "reference" for those to the reference alone.
@@ -72,7 +72,7 @@ class Study:
         reference: Surface that they are compared with.
         scaling: Similarity transform of all surfaces; None takes the reference's bounding sphere to the unit sphere.
         proximity: Number of points that are drawn on each mesh for its Hausdorff and Chamfer distances from the
-            reference; None if these are not asked for.
+            reference; None if these are not requested.
         folder: Folder in which relative paths start.
         table: The study as it was written.
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.

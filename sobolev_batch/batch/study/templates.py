@@ -68,7 +68,7 @@ def as_written(path: Path, folder: Path) -> str:
 
 
 def _pattern(template: str) -> str:
-    """Return the regular expression of a template. A placeholder that is there again stands for the same name."""
+    """Return the regular expression of a template. A repeated placeholder stands for the same name."""
     seen: set[str] = set()
     pattern = ""
     for part in _PART.split(Path(template).as_posix()):

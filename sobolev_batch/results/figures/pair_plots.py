@@ -108,7 +108,7 @@ def draw_map(selection: Selection, order: float, axes: Axes) -> None:
 
 
 def clustered_order(distances: Reals) -> NDArray[np.intp]:
-    """Return an order of meshes in which similar ones stand beside each other.
+    """Return an order of meshes with similar ones beside each other.
 
     Hierarchical clustering by mean distances, its leaves in the order that makes neighbours closest
     (Z. Bar-Joseph et al. 2001, doi:10.1093/bioinformatics/17.suppl_1.S22).

@@ -67,9 +67,9 @@ def write_plots(
 ) -> tuple[tuple[Path, ...], Mapping[str, Sequence[str]]]:
     """Write the plots of a store into a folder, with a panel for each order or family.
 
-    The files are convergence, transform, spectrum and energy, which has one panel; where the study asks for the
+    The files are convergence, transform, spectrum and energy, which has one panel; where the study requests the
     distances of all pairs, matrix and map too, and where meshes have times, over-time. Each has the suffixes that the
-    output asks for.
+    output requests.
 
     Returns:
         Paths of the pictures, and what each of them leaves out, by its name.
@@ -292,7 +292,7 @@ def plot_transform(store: AnyStore, family: Families = None, ax: Axes | None = N
 
     Args:
         store: Path, URL or opened DataTree of the store.
-        family: Families of meshes, by names or globs, of which up to five are drawn; default the first family that has
+        family: Families of meshes, by names or globs; up to five are drawn; default the first family that has
             any.
         ax: Axes to draw on.
 

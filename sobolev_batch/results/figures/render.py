@@ -48,7 +48,7 @@ def render(
         side: Longer side of each picture, in pixels.
         common: Colour all meshes on one scale.
         program: Program that draws.
-        timeout_seconds: Time for all pictures, each of which takes a processor a second or two.
+        timeout_seconds: Time for all pictures, at a second or two of a processor each.
 
     Raises:
         InputError: VTK is not installed, or cannot draw on this machine.

@@ -167,7 +167,7 @@ class Spectra:
 
     @property
     def omission(self) -> str:
-        """Note on the meshes that were not chosen; empty where all are there."""
+        """Note on the meshes that were not chosen; empty where all were."""
         return f"{len(self.labels)} of {self.total} meshes" if len(self.labels) < self.total else ""
 
     @property
@@ -185,7 +185,7 @@ class Spectra:
 
 
 def _spread_over_families(labels: Sequence[tuple[str, str]], most: int) -> list[str]:
-    """Return so many labels at most, of all families alike, in the order given.
+    """Return a limited number of labels, of all families alike, in the order given.
 
     Args:
         labels: Family and label of each mesh.
@@ -205,5 +205,5 @@ def _spread_over_families(labels: Sequence[tuple[str, str]], most: int) -> list[
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """Return so many items at most: the first, the last, and others evenly between."""
+    """Return a limited number of items: the first, the last, and others evenly between."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))]

@@ -39,7 +39,7 @@ _COLORS = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#7
 _MARKERS = "osD^vPX"
 _DASHES = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1)))
 _LONGEST_LABEL = 24
-# Inches: a legend stands beside the panels of a figure of this width, else below them; sizes of a line, of a handle
+# Inches: a legend is drawn beside the panels of a figure of this width, else below them; sizes of a line, of a handle
 # and of a character; and the fractions of the height that it may take.
 LEGEND_BESIDE, _LEGEND_LINE, _LEGEND_HANDLE, _LEGEND_CHARACTER = 5.0, 0.17, 0.5, 0.07
 _HIGHEST_BESIDE, _HIGHEST_BELOW = 0.9, 0.4
@@ -50,7 +50,7 @@ _OUT_OF_SIGHT = 1e-30
 _NUMBER = r"(\d+\.?\d*|\.\d+)"
 _PER_INCH = {"in": 1.0, "cm": 2.54, "mm": 25.4}
 _SMALLEST_INCHES, _LARGEST_INCHES = 1.0, 40.0
-# Dots per inch: of a PNG for screens, and of one for paper, where a size is asked for, and of images in PDF and SVG.
+# Dots per inch: of a PNG for screens, and of one for paper, where a size is requested, and of images in PDF and SVG.
 _SCREEN_DPI, _PAPER_DPI = 150, 300
 # Points; figures narrower than a page have the smaller one.
 _FONT_SIZE, _SMALL_FONT_SIZE = 10.0, 8.0

@@ -27,7 +27,7 @@ from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
 from sobolev_batch.surfaces.sources.registry import Member
 
-# Labels of which a message gives examples.
+# Labels that a message lists as examples.
 _MOST_LISTED = 3
 
 

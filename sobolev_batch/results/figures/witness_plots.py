@@ -100,7 +100,7 @@ def write_witness_plots(
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder.
 
-    Each mesh gets a file witness-* with colours and a view of its own; several also stand beside each other in the
+    Each mesh gets a file witness-* with colours and a view of its own; several are also drawn beside each other in the
     file witness, seen from the front and on one scale of colours, at the first order.
 
     Args:

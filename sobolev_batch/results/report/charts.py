@@ -264,7 +264,7 @@ def unpictured(tree: xr.DataTree, pictures: Pictures) -> Iterator[str]:
     """Yield what the pictures of an open store leave out, for people."""
     orders = finished_group(tree, "convergence", load=False).sizes["order"]
     if orders > MOST_PICTURED_ORDERS:
-        yield f"pictures for paper: only those of {MOST_PICTURED_ORDERS} of {orders} orders are there"
+        yield f"pictures for paper: only those of {MOST_PICTURED_ORDERS} of {orders} orders are included"
     yield from (f"pictures of meshes for paper: {one.text}" for one in pictures["witness"] if one.source is None)
 
 

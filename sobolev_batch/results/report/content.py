@@ -279,7 +279,7 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]
 
 
 def _imprecise_rows(rows: pd.DataFrame) -> Iterator[Row]:
-    """Yield the meshes whose distances have larger errors than the study asks for."""
+    """Yield the meshes whose distances have larger errors than the study requests."""
     short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
     if len(short):
         yield _absent("above rtol", _names(short["mesh"].tolist()))
@@ -345,7 +345,7 @@ def study_content(tree: xr.DataTree, status: Status, limits: ReportLimits) -> di
 
 
 def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:
-    """Return the convergence table of an open store, from the rows of `table`, with so many of each order."""
+    """Return the convergence table of an open store, from the rows of `table`, with a limited number of each order."""
     orders, most = frame["order"].drop_duplicates().tolist(), max(1, most)
     longest = int(frame.groupby("order").size().max())
     rows = with_remarks(frame).groupby("order", sort=False).head(most)

@@ -58,7 +58,7 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-# Where the study asks for them.
+# Where the study requests them.
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 _NOTE = """\
 Relative distances are fractions of the reference's norm. Errors are meant as bounds,
@@ -73,7 +73,7 @@ Hausdorff is a lower bound: the largest distance from any vertex or sampled poin
 the other mesh. Chamfer is the mean distance of sampled points, both ways, with its
 standard error."""
 _ACCURACY_NOTE = """\
-The study asks for an error of at most {rtol:g} of each distance; a distance
+The study requests an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
 
 
@@ -114,7 +114,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
-        store: Path, URL or opened DataTree of the store. Of the store of a collection, the rows of all objects that
+        store: Path, URL or opened DataTree of the store. From the store of a collection, the rows of all objects that
             have tables follow each other, and the first column, object, names theirs.
         order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
             fields, which takes about as long as reading them.
@@ -134,8 +134,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
           squares add up to its square;
         - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
           for another x, since the others grow;
-        - resolved (the distance exceeds its error) and within (the error is as small as the study asks for);
-        - where the study asks for [proximity]: hausdorff, chamfer and chamfer_error.
+        - resolved (the distance exceeds its error) and within (the error is as small as the study requests);
+        - where the study requests [proximity]: hausdorff, chamfer and chamfer_error.
 
         Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the
         reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
@@ -271,7 +271,7 @@ def _cell(column: Column, row: Mapping[Any, Any]) -> str:
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
     """Return the nearest mesh among rows of `table` of one order; None where no distance is above its error.
 
-    Beside its row are the labels of meshes of which errors leave open whether they are nearer, the nearest first.
+    Beside its row are the labels of meshes that may be nearer within the errors, the nearest first.
     """
     rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
     resolved = rows[rows["resolved"].astype(bool)]
@@ -295,7 +295,7 @@ def _nearest(frame: pd.DataFrame) -> str:
 
 
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
-    """Return the columns of which an open store has the numbers, for a page, which may be narrow."""
+    """Return the columns whose numbers an open store has, for a page, which may be narrow."""
     columns = [*_COLUMNS, *(_PROXIMITY_COLUMNS if has_proximity(tree) else ())]
     return tuple(sorted(columns, key=lambda column: (column is not _MESH, not column.is_marked)))
 

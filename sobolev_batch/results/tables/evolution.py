@@ -19,7 +19,7 @@ from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import quoted
 
-# A mesh that is so many times as far away as at its first time is worth a new one.
+# A mesh whose distance has grown by this factor since its first time is worth a new one.
 REMESHING_FACTOR = 2.0
 _NUMBERS = ("distance", "error", "relative", "relative_error")
 _NOTE = """\

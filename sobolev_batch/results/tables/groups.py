@@ -179,7 +179,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
             ``computed`` of the table lists those that were computed from the fields.
 
     Raises:
-        InputError: The store has no tables yet; or other orders are asked for, and the tree does not say where it was
+        InputError: The store has no tables yet; or other orders are requested, and the tree does not say where it was
             opened.
         OrderError: An order is not below -1/2.
         DamageError: A field is not what was stored.
@@ -250,7 +250,7 @@ def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
 
 
 def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:
-    """Return the orders that are asked for, and those of them that the store lacks."""
+    """Return the orders that are requested, and those of them that the store lacks."""
     own: list[float] = stored["order"].values.tolist()
     chosen = own if order is None else list(check_orders(order))
     return chosen, tuple(dict.fromkeys(s for s in chosen if s not in own))

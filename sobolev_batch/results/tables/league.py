@@ -421,7 +421,7 @@ def stores_of(store: AnyCollection) -> tuple[dict[str, AnyStore], tuple[str, ...
     collection = CollectionStore.read(location)
     if collection is None:
         raise StoreError(
-            f"{location}: no store of a collection is there; run a study with several objects, or give the stores of "
+            f"{location}: it holds no store of a collection; run a study with several objects, or give the stores of "
             "single objects by their names"
         )
     return dict(collection.existing_stores), collection.objects

@@ -59,7 +59,7 @@ class Matrix:
     def from_tree(
         cls, tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
     ) -> Matrix | None:
-        """Return the matrix of an open store; None where the study asks for distances to the reference alone.
+        """Return the matrix of an open store; None where the study requests distances to the reference alone.
 
         Args:
             tree: Open store.
@@ -92,7 +92,7 @@ def matrix(
 
     Returns:
         A symmetric frame of float64 in the study's unit of length, with the labels of meshes as index "mesh" and
-        columns "other". The columns are the reference alone where the study asks for no more. NaN where a
+        columns "other". The columns are the reference alone where the study requests no more. NaN where a
         mesh failed. The frame's ``attrs`` have the order and the reference's label.
 
     Raises:

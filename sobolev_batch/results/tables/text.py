@@ -148,7 +148,7 @@ def _bracketed(value: float, error: str, power: int, last: int) -> str:
 
 
 def duration(seconds: float, digits: int = 3) -> str:
-    """Return a duration in the largest unit of which it has two or more.
+    """Return a duration in the largest unit that it holds twice or more.
 
     >>> duration(42), duration(5400), duration(1e6), duration(1e6, digits=2)
     ('42 s', '90 min', '11.6 days', '12 days')
@@ -302,7 +302,7 @@ LINE_LENGTH = 100
 _SHORTEST_LABEL = 20
 # Spaces between columns, and beside headers, by tabulate.
 _GAP, _PADDING = 2, 2
-# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia the wide ones, too.
+# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
 _FORMULA_SIGNS = tuple("=+-@＝＋－＠")
 # What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
 # underscores within words do not begin.
@@ -389,7 +389,7 @@ def _with_short_labels(rows: Sequence[Sequence[str]], headers: Sequence[str]) ->
 
 
 def prose(lines: Iterable[str], style: Format) -> str:
-    """Return lines that stand beside tables; LaTeX takes them as comments."""
+    """Return lines printed beside tables; LaTeX takes them as comments."""
     return "\n".join(f"{'% ' * (style == 'latex')}{_escaped(line, style)}" for line in lines)
 
 

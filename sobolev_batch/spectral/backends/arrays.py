@@ -52,7 +52,7 @@ def cosine_and_sine(angles: Array) -> tuple[Array, Array]:
     """Return cosine and sine of angles in radians, to two or three rounding errors of 1.
 
     Both come from the tangent of half the angle: NumPy vectorises the tangent of doubles, but neither
-    cosine nor sine, each of which takes seven times as long.
+    cosine nor sine, which each take seven times as long.
     """
     tangents = np.tan(0.5 * angles)
     squares = tangents * tangents

@@ -27,7 +27,7 @@ Reals = NDArray[np.float64]
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
-# Standard errors by which the mean of few draws, some of which may carry it, is raised. Of 720 errors of NUFFTs of
+# Standard errors by which the mean of few draws is raised, as some may carry it. Of 720 errors of NUFFTs of
 # smooth surfaces, five exceeded the mean by six of them, two by eight.
 _CAUTION = 8.0
 # Ranges of |ξ| that represent an error of the same size at every frequency.
@@ -104,7 +104,7 @@ def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Re
 
 
 def draw_count(terms: int) -> int:
-    """Return the number of frequencies to probe so many triangles at: fewer where each costs more."""
+    """Return the number of frequencies to probe a mesh of this many triangles at: fewer where each costs more."""
     return int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
 
 

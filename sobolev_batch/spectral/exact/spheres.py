@@ -119,7 +119,7 @@ def _integral(function: Callable[[float], float], low: float, high: float) -> fl
     from scipy.integrate import IntegrationWarning, quad
 
     with warnings.catch_warnings():
-        # The tolerance asks for the last digits; quad warns if rounding prevents one of them.
+        # The tolerance requires the last digits; quad warns if rounding prevents one of them.
         warnings.simplefilter("ignore", IntegrationWarning)
         return float(quad(function, low, high, epsabs=0, epsrel=1e-13, limit=200)[0])
 

@@ -286,7 +286,7 @@ def _halves(a: Reals) -> Pair:
 _LEAST_PRODUCT = 2e-3
 # If the longest edge is below this many radians, most triangles would go through the stable form.
 _FINE_MESH = 0.5
-# Pairs of a triangle and a frequency at a time, and so many triangles at most: their temporaries stay in cache. Those
+# Most pairs of a triangle and a frequency at a time, and most triangles: their temporaries stay in cache. Those
 # of all triangles of a fine mesh, on every thread, would take gigabytes.
 _SAMPLED_PAIRS = 1 << 14
 

@@ -394,7 +394,7 @@ class Proportion:
 def proportion(a: OperandLike, b: OperandLike, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
     """Return the distance ||a - b||_s split into a pure change of total area and the rest.
 
-    Of all multiples of b, c b with c = <a, b>_s/<b, b>_s is nearest to a. Then a - b = (c - 1) b + (a - c b),
+    The multiple of b nearest to a is c b with c = <a, b>_s/<b, b>_s. Then a - b = (c - 1) b + (a - c b),
     and both parts are orthogonal in the norm of order s.
 
     Args:

@@ -29,7 +29,7 @@ from sobolev_batch.surfaces.sources.reduced import decimated
 _VALUES_ACCURACY = 1e-2
 # No values are exact to less than this fraction of the area.
 _ROUNDING = 1e-13
-# A search ends where the distance is this near to the one wanted, in logarithms, or after so many changed meshes. It
+# A search ends where the distance is this near to the one wanted, in logarithms, or after this many changed meshes. It
 # has failed if the distance is still farther off than the last number.
 _CLOSENESS, _MOST_STEPS, _FAILED = 0.02, 8, 0.1
 # Largest factor from one changed mesh to the next.
@@ -155,7 +155,7 @@ class _Reference:
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """Distances to the reference by the amount of a change of it, each of which is computed once.
+    """Distances to the reference by the amount of a change, each computed once.
 
     Attributes:
         distances: Function of the amount that returns distances (orders,).

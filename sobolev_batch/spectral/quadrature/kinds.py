@@ -43,7 +43,7 @@ _NODES = 1 << 14
 # The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of the
 # degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that showed most of it.
 _SMOOTH_DEGREE = 16
-# A parametrised surface has at least so many nodes.
+# A parametrised surface has at least this many nodes.
 _FEWEST_NODES = 500
 
 

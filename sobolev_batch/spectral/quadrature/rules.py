@@ -156,7 +156,7 @@ def measure_largest_errors(rule: TriangleRule) -> Reals:
     """Return the largest relative error of a rule on triangles of each size (160,).
 
     On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
-    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon, of which symmetry leaves one twelfth to
+    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon; symmetry leaves one twelfth of it to
     sample.
     """
     fractions = np.linspace(0.5, 1.0, 5)

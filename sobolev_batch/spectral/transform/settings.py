@@ -167,7 +167,7 @@ def choose_settings(
 def _nufft_eps(
     area: float, points: float, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> float:
-    """Return the largest eps with which the NUFFT of so many points keeps to its fraction of a target."""
+    """Return the largest eps with which the NUFFT of this many points keeps to its fraction of a target."""
     masses = weight_masses(lattice, target.orders)
     spread = _NUFFT_ERROR + 1 / math.sqrt(points)
     eps = float(np.min(_NUFFT_FRACTION * np.array(target.norms) / (area * spread * np.sqrt(masses))))

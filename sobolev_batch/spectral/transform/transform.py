@@ -111,7 +111,7 @@ def projected_bytes(
         block: Block of the lattice.
         settings: Accuracy and dtype.
         execution: Allowed memory and batch.
-        triangles: Number of triangles of the mesh, each of which takes some bytes while its rule is chosen.
+        triangles: Number of triangles of the mesh, at some bytes each while its rule is chosen.
     """
     whole = Batching(NufftSpec(block.shape, settings.eps, settings.dtype), execution.batch)
     needed: float = whole.projected_bytes(Workload(triangles=triangles), CPU.costs)
@@ -231,7 +231,7 @@ def _require_reach(reach: float, lattice: Lattice, subject: str, pronoun: str) -
 
 # Triangles of a mesh differ in size, which their rules follow; those of this sphere stand for them.
 _STAND_IN_LEVEL = 2
-# A sphere, transformed in a fraction of a second, of which spreading its points takes most.
+# A sphere, transformed in a fraction of a second, mostly spreading its points.
 _TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
 _NANO = 1e-9
 

@@ -19,7 +19,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.raw_files import Raw, parse_xml, unpacked_limit
 
 _MOST_DIMENSIONS = 6
-# Arrays of a file, for each of which the library makes objects of kilobytes.
+# Arrays of a file; the library makes objects of kilobytes for each.
 _MOST_ARRAYS = 10_000
 _CHUNK_BYTES = 1 << 20
 # lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; but lh.aparc.annot has values at vertices.
@@ -70,7 +70,7 @@ class _XmlCheck:
             raise MeshError(f"the GIFTI header announces {self._announced} arrays, found {self._arrays}")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
-        # The library, too, takes the text before an inner element as all of the data.
+        # The library also takes the text before an inner element as all of the data.
         self._flush()
         if name == "GIFTI" and "NumberOfDataArrays" in attributes:
             self._announced = int(attributes["NumberOfDataArrays"])
@@ -115,7 +115,7 @@ class _XmlCheck:
                     f"array {self._arrays} of the file unpacks to more than the {self._bytes} bytes announced"
                 )
             if self._unpacked + total > self._limit:
-                raise MeshError(f"its arrays unpack to more than {self._limit} bytes: no mesh file shrinks so much")
+                raise MeshError(f"its arrays unpack to more than {self._limit} bytes: no mesh file shrinks that far")
         self._unpacked += total
 
 

@@ -146,7 +146,7 @@ def require_writable(path: str | Path) -> Path:
     """Return a path whose suffix names a format that can be written, in a folder that files can be made in.
 
     Raises:
-        InputError: It is none, or something else than a file is there.
+        InputError: It is none, or the path is no file.
         MeshError: No file can be made in its folder.
     """
     path = Path(path)
@@ -156,7 +156,7 @@ def require_writable(path: str | Path) -> Path:
         raise InputError(f"{path}: there is no folder {path.parent}")
     with _new_file_beside(path):
         if path.exists() and not path.is_file():
-            raise InputError(f"{path}: something that is no file is there already; name another file")
+            raise InputError(f"{path}: it exists already and is no file; name another file")
     return path
 
 

@@ -21,7 +21,7 @@ from sobolev_batch.surfaces.formats.raw_files import Raw
 from sobolev_batch.surfaces.formats.text_formats import LONGEST_LINE
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
-# A header ends within so many bytes: room for a thousand lines, and quick to look through.
+# A header ends within this many bytes: room for a thousand lines, and quick to look through.
 HEADER_BYTES = 1 << 16
 
 _END = b"end_header"

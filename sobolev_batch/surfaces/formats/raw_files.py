@@ -207,7 +207,7 @@ def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes
             data.write(chunk)
             if data.tell() > most:
                 raise MeshError(
-                    f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks so much"
+                    f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks that far"
                 )
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())

@@ -89,7 +89,7 @@ class Edges:
         return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
 
     def best(self, scores: Reals, triangles: int) -> Marks:
-        """Mark the edges of the triangles with the largest scores, as many as lead to at most so many triangles.
+        """Mark the edges of the triangles with the largest scores, as many as lead to at most that many triangles.
 
         Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner.
 

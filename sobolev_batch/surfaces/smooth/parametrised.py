@@ -28,7 +28,7 @@ _CHECKS = 7
 
 @dataclass(frozen=True, eq=False)
 class ParametrisedSurface(Smooth):
-    """A surface x(u, v), as a reference or for comparison; its transform is good to the ``eps`` asked for.
+    """A surface x(u, v), as a reference or for comparison; its transform is good to the ``eps`` requested.
 
     The parametrisation must cover the surface once, and be smooth: at the ends of parameters too, and across
     those of periodic ones. Poles are allowed: an end of u or v may be one point, as on a sphere in its angles.

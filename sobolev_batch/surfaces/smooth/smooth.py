@@ -33,7 +33,7 @@ _BATCH = 1 << 16
 _SETTLED, _UNSETTLED = 1e-12, 1e-3
 _FIRST_NODES = 31
 _MOST_AREA_NODES = 1 << 20
-# Extents are sought on a grid of so many points along each parameter, then on small ones around the best.
+# Extents are sought on a grid of this many points along each parameter, then on small ones around the best.
 _GRID, _ZOOM_GRID, _ZOOMS = 65, 9, 12
 
 

@@ -31,7 +31,7 @@ _UNKNOWN_KEY = "a_key_that_no_source_has"
 def check_source(source: Source, folder: str | Path = ".", *, broken: Iterable[Source] = ()) -> None:
     """Check that a source and its members keep the promises that studies rely on.
 
-    Run it in the tests of a package that adds a source, on a few small members, some of which differ in a
+    Run it in the tests of a package that adds a source, on a few small members; some must differ in a
     single parameter. It lists the members twice. It makes every surface twice, once from a pickled member in
     another working directory, and compares the two.
 

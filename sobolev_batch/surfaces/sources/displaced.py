@@ -194,7 +194,7 @@ def carried(points: Reals, time: float, period: float, strength: float) -> Reals
 
     Args:
         points: Points at time 0, (n, 3).
-        time: Time at which they are asked for.
+        time: Time at which they are requested.
         period: Period T.
         strength: Strength k, in radians per unit of time.
 

@@ -122,7 +122,7 @@ def read_mesh_list(path: Path) -> tuple[ListedMesh, ...]:
             if length > _LARGEST_FILE_BYTES:
                 raise StudyError(f"a list has at most {_LARGEST_FILE_BYTES} bytes, found {length}")
             # As texts: a name such as 007 stays what it is. Without a header pandas refuses lines that are longer than
-            # the first one, and gives no other name to a column that is there twice.
+            # the first one, and gives no other name to a repeated column.
             cells = pd.read_csv(
                 file, header=None, dtype=str, keep_default_na=False, encoding="utf-8-sig", skipinitialspace=True
             )

@@ -10,7 +10,7 @@ import reprlib
 import unicodedata
 from collections.abc import Iterable
 
-# A file's stem has up to 255 bytes; a path that stands in for it may be longer.
+# A file's stem has up to 255 bytes; a path in its place may be longer.
 _LONGEST_LABEL = 1000
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60

@@ -289,7 +289,7 @@ def checked_times(value: object, most: int = MOST_ENTRIES) -> tuple[float, ...]:
     """Return a list of times as floats.
 
     Raises:
-        ValueError: It is no list of up to so many different finite numbers.
+        ValueError: It is no list of finite numbers, all different, of at most this length.
     """
     if not isinstance(value, list | tuple) or not value:
         raise ValueError("must be a list of numbers, such as [0.0, 0.5, 1.0]")

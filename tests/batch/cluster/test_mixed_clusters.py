@@ -94,5 +94,5 @@ def test_a_store_that_a_gpu_filled_is_taken_over_by_any_backend(device: str, sto
     with tcp_cluster([]) as (address, _), remote_client(address) as client:
         again = run(study_on("cpu"), store_path, client)
         assert (again.computed, len(again.reused)) == ((), 6)
-        with pytest.raises(ClusterError, match="asks for backend 'gpu'"):
+        with pytest.raises(ClusterError, match="requests backend 'gpu'"):
             run(study_on("gpu", norm={"orders": [-4.0]}), store_path, client)

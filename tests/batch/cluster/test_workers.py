@@ -37,7 +37,7 @@ def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
         with pytest.raises(ClusterError) as caught:
             run(study_on("gpu"), store_path, client)
         message = str(caught.value)
-        assert "the study asks for backend 'gpu', and none of the 2 workers can compute on one" in message
+        assert "the study requests backend 'gpu', and none of the 2 workers can compute on one" in message
         assert message.count("(declares a GPU)") == 1
         assert "ask for backend 'auto'" in message
         summary = run(study_on("auto"), store_path, client)

@@ -204,7 +204,7 @@ def test_places_that_hold_something_else(server: Server, url: str) -> None:
         prepare_store(url, plan)
     assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == 1
     prepare_store(url + "/below", plan)
-    with pytest.raises(StoreError, match="a store of another study is there, with the study 'small', not 'other'"):
+    with pytest.raises(StoreError, match="it holds a store of another study, with the study 'small', not 'other'"):
         prepare_store(url + "/below", make_plan(Study.from_table(small_table(study={"name": "other"}))))
 
 
@@ -223,7 +223,7 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
         port = closed.getsockname()[1]
     unknown = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
     cases: list[tuple[tuple[str, ...], dict[str, str], str]] = [
-        (("status", there), {}, "no store of a study is there"),
+        (("status", there), {}, "it holds no store of a study"),
         (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
@@ -337,7 +337,7 @@ def test_a_store_in_memory_is_computed_by_threads(study: Study, finished_store: 
     assert_same(xr.open_datatree(place, engine="zarr"), open_store(finished_store))
     with thread_client(2) as client:
         assert len(run(study, "memory://b/results.zarr", client).computed) == 5
-    with pytest.raises(StoreError, match="no store of a study is there"):
+    with pytest.raises(StoreError, match="it holds no store of a study"):
         open_store("memory://c/results.zarr")
 
 

@@ -108,7 +108,7 @@ def test_new_meshes_become_new_rows(store_path: Path) -> None:
 
 def test_refuses_places_that_hold_something_else(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("text")
-    with pytest.raises(StoreError, match="a file is there"):
+    with pytest.raises(StoreError, match="it is a file"):
         prepare_store(tmp_path / "file", small_plan())
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -134,7 +134,7 @@ def test_refuses_a_place_below_a_file(tmp_path: Path) -> None:
 
 
 def test_opening_what_is_no_store(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no store of a study is there"):
+    with pytest.raises(StoreError, match="it holds no store of a study"):
         Store.open(tmp_path / "nothing.zarr")
 
 

@@ -42,7 +42,7 @@ def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Pat
     survey = Survey(found, sb.Similarity(), sb.Sphere().extent)
     assert set(survey.pilots()) == {"f/z", "f/y"}
     assert set(survey.set_aside) == {"f/broken", "f/inches"}
-    assert "reaches 25.4 times as far as the reference" in survey.set_aside["f/inches"]
+    assert "its extent is 25.4 times that of the reference" in survey.set_aside["f/inches"]
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_wrong_meshes_fail_by_their_own_names_and_the_others_have_their_accuracy
 def test_a_plan_tells_what_is_doubtful(folder: Path) -> None:
     plan = sb.plan(study(folder), folder / "s.zarr")
     assert set(plan.doubtful) == {"f/broken", "f/inches"}
-    assert "doubtful:      f/inches: it reaches 25.4 times as far" in str(plan)
+    assert "doubtful:      f/inches: its extent is 25.4 times that" in str(plan)
 
 
 def test_only_wrong_meshes_are_refused_with_a_reason(folder: Path) -> None:

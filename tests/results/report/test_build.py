@@ -386,7 +386,7 @@ def test_a_page_shows_one_state_of_a_store(
 
 
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(StoreError, match="no store of a study is there"):
+    with pytest.raises(StoreError, match="it holds no store of a study"):
         make_report(tmp_path)
     monkeypatch.setattr(build, "make_report", lambda *_, **__: build.Page("", ()))
     with pytest.raises(StoreError, match="cannot be written there"):

@@ -51,7 +51,7 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(sb.InputError, match="there is no folder"):
         sb.write_mesh(MESH, tmp_path / "nowhere" / "mesh.ply")
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(sb.InputError, match="something that is no file is there already"):
+    with pytest.raises(sb.InputError, match="it exists already and is no file"):
         sb.write_mesh(MESH, tmp_path / "folder.ply")
     with pytest.raises(sb.MeshError, match="cannot be written there: File name too long"):
         sb.write_mesh(MESH, tmp_path / f"{'x' * 300}.ply")
