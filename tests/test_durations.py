@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.support.durations import recorded_seconds
 from tests.support.repository import ROOT
 
-# Of three processes for two cores, in some twelve minutes of a slow machine.
+# Of three processes for two cores.
 MOST_SECONDS, MOST_SECONDS_OF_A_FILE = 2100.0, 135.0
 
 
