@@ -12,7 +12,7 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, ValidationError
 
 from sobolev_batch.batch.study.refusals import joined, refusals
-from sobolev_batch.batch.study.schema import Name, Section, read_toml, require_modest, without_frames
+from sobolev_batch.batch.study.schema import Name, Section, plain_tables, read_toml, require_modest
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, as_written, filled, holds, names_of
 from sobolev_batch.errors import InputError, StudyError
@@ -115,8 +115,8 @@ class StudyCollection:
 
     @classmethod
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
-        table = without_frames(table)
         require_modest(table)
+        table = plain_tables(table)
         _require_sections(table)
         common = {key: value for key, value in table.items() if key not in ("object", "objects")}
         listed = _listed_meshes(table.get("objects"), folder)

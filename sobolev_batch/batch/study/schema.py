@@ -231,39 +231,32 @@ def _line_at(message: str, text: str) -> str:
     return f": {quoted(text.splitlines()[int(position[1]) - 1].strip())}" if position else ""
 
 
-def without_frames(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a study with each DataFrame in its sections as the list of its rows, without what it does not know."""
-    return {
-        name: [_plain_section(entry) for entry in section] if isinstance(section, list) else _plain_section(section)
-        for name, section in table.items()
-    }
+def plain_tables(value: Any) -> Any:
+    """Return tables as dictionaries, DataFrames as lists of rows, values of NumPy as Python's, and paths as texts."""
+    if isinstance(value, Mapping):
+        return {key: plain_tables(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_tables(entry) for entry in value]
+    if isinstance(value, pd.DataFrame):
+        return _rows_of(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def _plain_section(section: Any) -> Any:
-    if not isinstance(section, Mapping):
-        return section
-    return {key: _rows_of(value) if isinstance(value, pd.DataFrame) else value for key, value in section.items()}
-
-
-def _rows_of(frame: pd.DataFrame) -> list[dict[Any, Any]]:
-    """Return the rows of a frame, without what it does not know; dates and paths become texts."""
+def _rows_of(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a frame, without what it does not know; dates become texts."""
     repeated = frame.columns[frame.columns.duplicated()]
     if len(repeated):
         raise StudyError(f"a DataFrame has the column {quoted(repeated[0])} twice; rename one")
-    rows = frame.to_dict(orient="records")
-    return [{key: _plain_cell(value) for key, value in row.items() if not _is_unknown(value)} for row in rows]
-
-
-def _is_unknown(value: Any) -> bool:
-    return bool(pd.api.types.is_scalar(value) and pd.isna(value))
-
-
-def _plain_cell(value: Any) -> Any:
-    if isinstance(value, date):
-        return value.isoformat()
-    if isinstance(value, np.generic):
-        return value.item()
-    return os.fspath(value) if isinstance(value, os.PathLike) else value
+    return [
+        {
+            str(key): value.isoformat() if isinstance(value, date) else plain_tables(value)
+            for key, value in row.items()
+            if not (pd.api.types.is_scalar(value) and pd.isna(value))
+        }
+        for row in frame.to_dict(orient="records")
+    ]
 
 
 def require_modest(table: object) -> None:

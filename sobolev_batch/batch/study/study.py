@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, Self
 
-import numpy as np
 from pydantic import ValidationError
 
 from sobolev_batch.batch.study.refusals import joined, known_names, refusals, shown_value
@@ -20,9 +18,9 @@ from sobolev_batch.batch.study.schema import (
     FamilyReference,
     FamilySection,
     StudyDocument,
+    plain_tables,
     read_toml,
     require_modest,
-    without_frames,
 )
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -215,9 +213,8 @@ class Study:
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
         if not isinstance(table, Mapping):
             raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
-        table = without_frames(table)
         require_modest(table)
-        values = _plain(table)
+        values = plain_tables(table)
         # Families and the reference are looked at even where sections are wrong: all offenders are named.
         refused: list[str] = []
         document: StudyDocument | None = None
@@ -270,17 +267,6 @@ def _in_section(name: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise StudyError(f"[{name}]: {error}") from error
-
-
-def _plain(value: Any) -> Any:
-    """Return tables as dictionaries, paths as texts, and arrays and numbers of NumPy as lists and numbers."""
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 # Types of what a study is made of, for those who make one without a table.
