@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import dask
-import psutil
 import pytest
 import yaml
 from distributed import Client
 
 from sobolev_batch import ClusterError, open_store
 from sobolev_batch.batch.cluster.clients import check_connection, remote_client
-from tests.support.processes import PATIENCE_SECONDS, stop
+from tests.support.processes import PATIENCE_SECONDS, listening, stop
 from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, write_study
 
 pytestmark = pytest.mark.all
@@ -144,15 +143,7 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
 
 
 def test_nothing_listens_beyond_loopback(cluster: Cluster) -> None:
-    everyone = [psutil.Process(process.pid) for process in cluster.processes]
-    everyone += [child for process in everyone for child in process.children(recursive=True)]
-    listening = {
-        connection.laddr.ip
-        for process in everyone
-        for connection in process.net_connections(kind="inet")
-        if connection.status == psutil.CONN_LISTEN
-    }
-    assert listening == {"127.0.0.1"}
+    assert {ip for ip, _ in listening(*(process.pid for process in cluster.processes))} == {"127.0.0.1"}
 
 
 def test_a_client_without_certificate_is_refused(cluster: Cluster, certificates: Path) -> None:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -19,10 +18,9 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from tests.faults.fatal import Moment, fatal
-from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.stores import assert_same_fields, assert_same_tables
 
-_POLL_SECONDS = 0.05
 # Moved by so much, the mesh is another one, of equal size in the store.
 SHIFT = 0.125
 
@@ -75,9 +73,8 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
         tcp_cluster([]) as (address, (worker,)),
     ):
         driver = subprocess.Popen([sys.executable, "-c", DRIVER, address, str(study), str(store)])
-        while not (moment.pids and _is_stopped(worker.pid)):
-            assert driver.poll() is None
-            time.sleep(_POLL_SECONDS)
+        wait_until(lambda: moment.pids and _is_stopped(worker.pid))
+        assert driver.poll() is None
         driver.kill()
         driver.wait()
         write_mesh(tmp_path, SHIFT)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import dask as dask_settings
+import psutil
 from distributed import Client
 from distributed.utils import get_mp_context
 
@@ -52,6 +53,18 @@ def stop(process: subprocess.Popen[str]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
+
+
+def listening(*pids: int) -> set[tuple[str, int]]:
+    """Return the addresses at which processes, and all that they started, take connections."""
+    everyone = [psutil.Process(pid) for pid in pids]
+    everyone += [child for process in everyone for child in process.children(recursive=True)]
+    return {
+        (connection.laddr.ip, connection.laddr.port)
+        for process in everyone
+        for connection in process.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
 
 
 def scheduler_address(scheduler: subprocess.Popen[str]) -> str:

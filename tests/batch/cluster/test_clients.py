@@ -7,17 +7,24 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-import dask as dask_settings
 import numpy as np
-import psutil
 import pytest
 from distributed import Client, LocalCluster
 
 from sobolev_batch import AddressError, ClusterError, Study, open_store, run
-from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
-from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, tcp_cluster
+from tests.support.processes import (
+    PATIENCE_SECONDS,
+    SCHEDULER,
+    WORKER,
+    dask,
+    listening,
+    scheduler_address,
+    stop,
+    tcp_cluster,
+)
 from tests.support.recipes import write_study
 from tests.support.studies import variable
 
@@ -53,22 +60,6 @@ def test_a_scheduler_without_workers() -> None:
         remote_client(cluster.scheduler_address),
     ):
         pass
-
-
-def _die_once(mark: Path) -> int:
-    """End this process the first time; its id the second."""
-    if not mark.exists():
-        mark.touch()
-        os._exit(1)
-    return os.getpid()
-
-
-@pytest.mark.all
-def test_a_local_worker_that_died_is_not_given_up(tmp_path: Path) -> None:
-    # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
-    with dask_settings.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1) as client:
-        first = client.submit(os.getpid, pure=False).result(timeout=PATIENCE_SECONDS)
-        assert client.submit(_die_once, tmp_path / "mark").result(timeout=PATIENCE_SECONDS) != first
 
 
 @pytest.mark.all
@@ -117,26 +108,16 @@ def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def listening() -> set[tuple[str, int]]:
-    """The addresses that this process and all that it started listen at."""
-    return {
-        (connection.laddr.ip, connection.laddr.port)
-        for process in (psutil.Process(), *psutil.Process().children(recursive=True))
-        for connection in process.net_connections(kind="inet")
-        if connection.status == psutil.CONN_LISTEN
-    }
-
-
 @pytest.mark.parametrize(
     ("store", "least"), [pytest.param("", 4, marks=pytest.mark.all), ("memory://of-threads", 2)], ids=["run", "threads"]
 )
 def test_every_port_of_a_run_is_on_loopback(store: str, least: int, study: Study, store_path: Path) -> None:
     """Scheduler, its dashboard, each worker with its nanny and web pages; threads have web pages alone."""
-    before, found = listening(), set[tuple[str, int]]()
+    before, found = listening(os.getpid()), set[tuple[str, int]]()
 
     def look(progress: Progress) -> None:
         if progress.stage == "fields" and progress.done == 1:
-            found.update(listening() - before)
+            found.update(listening(os.getpid()) - before)
         elif progress.stage == "cluster":
             links.append(progress.label)
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import dask
 import pytest
 from distributed import Client
 
@@ -101,7 +102,8 @@ def _die_once(marker: Path) -> str:
 
 @pytest.mark.all
 def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tmp_path: Path) -> None:
-    with local_client(1, "1GB") as client:
+    # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1, "1GB") as client:
         prepare_workers(client)
         task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
         assert task.result(timeout=PATIENCE_SECONDS) == "alive"
