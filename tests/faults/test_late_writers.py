@@ -59,7 +59,7 @@ def write_mesh(folder: Path, shift: float) -> None:
 
 
 @pytest.mark.all
-@pytest.mark.parametrize("what", ["field", "record"])
+@pytest.mark.parametrize("what", ["field", "rename", "record"])
 def test_a_worker_that_goes_on_after_another_run_writes_nothing(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
