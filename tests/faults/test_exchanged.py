@@ -73,19 +73,31 @@ def assert_mended(store: Path, study: Study, right: Path, client: Client, *compu
     assert_same_tables(store, right)
 
 
-@pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_chunks_of_tables_that_trade_places(
-    one: str, other: str, store: Path, study: Study, finished_store: Path, threads: Client
-) -> None:
-    exchange(store, one, other)
-    assert verify(store).tables
-    assert_mended(store, study, finished_store, threads)
+def relabel(store: Path) -> None:
+    """Write labels in another order. The keys in the records say which field is whose."""
+    there = Store.open(store)
+    there.write("fourier/mesh", ..., np.array(there.labels()[::-1], dtype=object))
 
 
-def test_fields_that_trade_places(store: Path, study: Study, finished_store: Path, threads: Client) -> None:
-    exchange(store, FIELD.format(row=1), FIELD.format(row=2))
-    assert list(verify(store).fields) == ["ico/1", "ico/2"]
-    assert_mended(store, study, finished_store, threads, "ico/1", "ico/2")
+@pytest.mark.parametrize(
+    ("change", "labels"),
+    [
+        *((lambda store, earlier, pair=pair: exchange(store, *pair), ()) for pair in PAIRS),
+        (lambda store, earlier: exchange(store, FIELD.format(row=1), FIELD.format(row=2)), ("ico/1", "ico/2")),
+        (lambda store, earlier: relabel(store), ()),
+        (lambda store, earlier: restore(store, earlier, "convergence/distance/c/0/0"), ()),
+        (lambda store, earlier: restore(store, earlier, "fourier/quality/c/0"), ()),
+    ],
+)
+def test_what_is_in_another_place_or_of_an_earlier_state_is_named_and_mended(
+    change: Callable[[Path, Path], None], labels: tuple[str, ...],
+    store: Path, study: Study, earlier: Path, finished_store: Path, threads: Client,
+) -> None:  # fmt: skip
+    change(store, earlier)
+    found = verify(store)
+    assert tuple(found.fields) == labels
+    assert labels or found.tables
+    assert_mended(store, study, finished_store, threads, *labels)
 
 
 def test_fields_that_trade_places_with_their_records(
@@ -96,14 +108,6 @@ def test_fields_that_trade_places_with_their_records(
     assert status(store).lost_records == ("ico/1", "ico/2")
     assert list(verify(store).fields) == ["ico/1", "ico/2"]
     assert_mended(store, study, finished_store, threads, "ico/1", "ico/2")
-
-
-def test_labels_in_another_order(store: Path, study: Study, finished_store: Path, threads: Client) -> None:
-    """The keys in the records say which field is whose."""
-    there = Store.open(store)
-    there.write("fourier/mesh", ..., np.array(there.labels()[::-1], dtype=object))
-    assert verify(store).tables
-    assert_mended(store, study, finished_store, threads)
 
 
 def test_an_earlier_field_with_its_record(
@@ -134,15 +138,6 @@ def test_earlier_tables_and_root_with_newer_fields(
     assert_mended(store, study, finished_store, threads)
 
 
-@pytest.mark.parametrize("name", ["convergence/distance/c/0/0", "fourier/quality/c/0"])
-def test_a_table_of_an_earlier_state(
-    name: str, store: Path, study: Study, earlier: Path, finished_store: Path, threads: Client
-) -> None:
-    restore(store, earlier, name)
-    assert verify(store).tables
-    assert_mended(store, study, finished_store, threads)
-
-
 @pytest.mark.parametrize("name", ["meshes/area", "fourier/fourier", "records"])
 def test_metadata_of_one_node(name: str, store: Path, study: Study, finished_store: Path, threads: Client) -> None:
     path = store / name / "zarr.json"
@@ -165,26 +160,24 @@ def altered(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
     return alter
 
 
-def other_orders(root: dict[str, Any]) -> None:
-    root["attributes"]["study"]["orders"][0] -= 1
-
-
-def other_scale(root: dict[str, Any]) -> None:
-    root["attributes"]["similarity"]["scale"] *= 2
-
-
-def other_lattice(root: dict[str, Any]) -> None:
-    root["attributes"]["study"]["lattice"]["M"] += 2
-
-
-def other_shape(root: dict[str, Any]) -> None:
-    root["consolidated_metadata"]["metadata"]["fourier/fourier"]["shape"][1] += 1
-
-
-@pytest.mark.parametrize("change", [other_orders, other_scale, other_lattice, other_shape])
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("attributes", "study", "orders"), [-11.0, -3.0]),
+        (("attributes", "similarity", "scale"), 2.0),
+        (("attributes", "study", "lattice", "M"), 18),
+        (("consolidated_metadata", "metadata", "fourier/fourier", "shape"), [5, 18, 17, 9]),
+    ],
+)
 def test_metadata_at_the_root_that_were_altered(
-    change: Callable[[dict[str, Any]], None], store: Path, study: Study, finished_store: Path, threads: Client
+    place: tuple[str, ...], value: object, store: Path, study: Study, finished_store: Path, threads: Client
 ) -> None:
+    def change(root: dict[str, Any]) -> None:
+        for name in place[:-1]:
+            root = root[name]
+        assert root[place[-1]] != value
+        root[place[-1]] = value
+
     altered(change)(store)
     assert not verify(store).is_sound
     restore(store, finished_store, "records/record")
