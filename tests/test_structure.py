@@ -17,7 +17,6 @@ LAYERS = (
     "errors",
     "parameters",
     "machine",
-    "html",
     "surfaces",
     "spectral",
     "fitting",

@@ -13,9 +13,16 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 from click.core import ParameterSource
 
-from sobolev_batch.cli.group import EXIT_DIFFERENT, EXIT_UNDECIDED, cli
 from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import best_effort_option, fraction_of_norm, memory_option, orders_option
+from sobolev_batch.cli.options import (
+    EXIT_DIFFERENT,
+    EXIT_UNDECIDED,
+    best_effort_option,
+    cli,
+    fraction_of_norm,
+    memory_option,
+    orders_option,
+)
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.fitting import DEFAULT_ORDER as DEFAULT_FIT_ORDER

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.group import EXIT_OTHER, EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.options import (
+    EXIT_OTHER,
+    EXIT_SOME_FAILED,
+    cli,
     folder_option,
     format_option,
     fraction_of_norm,

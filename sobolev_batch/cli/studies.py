@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from sobolev_batch.cli.group import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.options import (
+    EXIT_SOME_FAILED,
     best_effort_option,
+    cli,
     give_up_option,
     location,
     memory_option,

@@ -21,7 +21,6 @@ from sobolev_batch.batch.study.lattice_search import Survey
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import complete_records
-from sobolev_batch.html import table_html
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.results.tables.text import duration
@@ -29,7 +28,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.transform.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
-from sobolev_batch.visible import visible
+from sobolev_batch.visible import table_html, visible
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6

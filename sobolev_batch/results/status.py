@@ -14,10 +14,9 @@ from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import complete_records, failed_proximities
-from sobolev_batch.html import reasons, table_html
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.text import duration
-from sobolev_batch.visible import visible
+from sobolev_batch.visible import reasons, table_html, visible
 
 # A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
 _PATIENCE_SECONDS = 600.0

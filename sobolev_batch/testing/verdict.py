@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from sobolev_batch.errors import SobolevBatchError, one_line
-from sobolev_batch.html import table_html
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
@@ -17,6 +16,7 @@ from sobolev_batch.spectral.shells import single_order
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
+from sobolev_batch.visible import table_html
 
 Outcome = Literal["same", "different", "undecided"]
 

@@ -92,7 +92,7 @@ class Cluster:
         return cls(client, prepare_workers(client, libraries), notify)
 
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
-        """Report the start of a stage and its total of steps, and return a function that reports each by label and record."""
+        """Report the start of a stage with its number of steps, and return a function that reports each by label."""
         done = count(1)
         self.notify(Progress(stage, 0, total))
         return lambda label, record: self.notify(Progress(stage, next(done), total, label, record))

@@ -17,10 +17,9 @@ from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.batch.study.templates import METHOD, OBJECT
 from sobolev_batch.errors import StudyError
-from sobolev_batch.html import reasons, table_html
 from sobolev_batch.surfaces.formats.readers import mesh_stem
 from sobolev_batch.surfaces.sources.files import FileMember, FileSource, expand
-from sobolev_batch.visible import HAZARDOUS, visible
+from sobolev_batch.visible import HAZARDOUS, reasons, table_html, visible
 
 # More lines of one kind, or objects on a line, would hide what comes next.
 _MOST_LINES, _MOST_OBJECTS = 10, 6
