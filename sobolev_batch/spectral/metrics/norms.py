@@ -100,8 +100,8 @@ def norm(
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         return to_accuracy("norm", (a,), order, lattice, accuracy, seed)[0]
     _refuse_settings_of_rtol(memory, best_effort=best_effort)
-    if isinstance(a, Sphere) and lattice is None:
-        values = np.array([sphere_norm(a, s) for s in orders])
+    if spheres := _spheres(a, lattice=lattice):
+        values = np.array([sphere_norm(spheres[0], s) for s in orders])
         return _dataset("norm", order, _closed_form(values, values**2))
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)
@@ -151,8 +151,8 @@ def inner_product(
         operands = as_operand(a), as_operand(b)
         return _inner_product_to_accuracy(operands, order, lattice, accuracy, seed)
     _refuse_settings_of_rtol(memory)
-    if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
-        products = np.array([sphere_inner_product(a, b, s) for s in orders])
+    if spheres := _spheres(a, b, lattice=lattice):
+        products = np.array([sphere_inner_product(spheres[0], spheres[1], s) for s in orders])
         return labelled(order, {"inner_product": products}, {})
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
@@ -215,13 +215,8 @@ def distance(
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         return to_accuracy("distance", (a, b), order, lattice, accuracy, seed)[0]
     _refuse_settings_of_rtol(memory, best_effort=best_effort)
-    if isinstance(a, Sphere) and isinstance(b, Sphere) and lattice is None:
-        values = np.array([sphere_distance(a, b, s) for s in orders])
-        norms = np.array([sphere_norm(b, s) for s in orders])
-        squares = np.array([sphere_norm(a, s) ** 2 for s in orders]) + norms**2
-        products = np.array([sphere_inner_product(a, b, s) for s in orders]) - norms**2
-        reference = ReferenceEstimate(_closed_form(norms, norms**2), products, _CLOSED_FORM_ACCURACY * squares)
-        return labelled_distances(order, _closed_form(values, squares), reference)
+    if spheres := _spheres(a, b, lattice=lattice):
+        return _distance_of_spheres(spheres[0], spheres[1], order)
     has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
     if lattice is not None and not has_fields and are_equal(a, b):
         settings = {"xi_max": lattice.xi_max, "M": lattice.M}
@@ -330,6 +325,22 @@ def _widths(fields: Sequence[xr.DataArray]) -> Reals:
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     is_complete = len(qualities) == len(fields)
     return Extent.union([one.extent for one in qualities]).widths if is_complete else np.zeros(len(DIRECTIONS))
+
+
+def _spheres(*operands: OperandLike, lattice: Lattice | None) -> tuple[Sphere, ...]:
+    """Return the operands if they are spheres without a lattice: then all metrics are closed forms."""
+    spheres = tuple(operand for operand in operands if isinstance(operand, Sphere))
+    return spheres if lattice is None and len(spheres) == len(operands) else ()
+
+
+def _distance_of_spheres(a: Sphere, b: Sphere, order: Orders) -> xr.Dataset:
+    orders = check_orders(order)
+    values = np.array([sphere_distance(a, b, s) for s in orders])
+    norms = np.array([sphere_norm(b, s) for s in orders])
+    squares = np.array([sphere_norm(a, s) ** 2 for s in orders]) + norms**2
+    products = np.array([sphere_inner_product(a, b, s) for s in orders]) - norms**2
+    reference = ReferenceEstimate(_closed_form(norms, norms**2), products, _CLOSED_FORM_ACCURACY * squares)
+    return labelled_distances(order, _closed_form(values, squares), reference)
 
 
 def _closed_form(values: Reals, squares: Reals) -> NormEstimate:

@@ -19,7 +19,6 @@ from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
-from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -206,7 +205,7 @@ def require_inside(surface: Surface, lattice: Lattice) -> None:
     Raises:
         LatticeError: Some |coordinate| is not below 1/(2h).
     """
-    kind = "mesh" if isinstance(surface, Mesh) else "surface"
+    kind = "mesh" if kind_of(surface).triangles else "surface"
     _require_reach(max(float(np.abs(bound).max()) for bound in surface.bounds), lattice, f"the {kind} reaches", "it")
 
 

@@ -27,7 +27,6 @@ from sobolev_batch import (
 )
 from sobolev_batch.spectral.backends.backends import CPU
 from sobolev_batch.spectral.errors.quality import Quality
-from sobolev_batch.spectral.exact.spheres import sphere_transform
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolution_of
@@ -39,7 +38,6 @@ from tests.support.fake_device import Device
 from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
 from tests.support.smooth_shapes import (
     HALF_TURN,
-    ROTATION,
     TURN,
     angular_ball,
     ball,
@@ -81,13 +79,6 @@ def test_the_sphere_as_a_parametrised_surface_is_the_closed_form(derivatives: bo
         orders = [-2.0, -5.0, -10.0]
         assert norm(field, orders)["norm"].values == pytest.approx(norm(exact, orders)["norm"].values, rel=1e-12)
         assert (distance(field, exact, orders)["distance"] < 1e-12 * norm(exact, orders)["norm"]).all()
-
-
-def test_a_sphere_elsewhere() -> None:
-    center = (0.3, -0.4, 0.2)
-    points = frequencies()
-    exact = sphere_transform(Sphere(0.8, center), points)
-    assert exact_values(Ellipsoid((0.8, 0.8, 0.8), center), points) == pytest.approx(exact, abs=1e-13)
 
 
 def test_a_torus_is_its_bessel_integral() -> None:
@@ -136,12 +127,6 @@ def test_a_rectangle_is_a_product_of_sines() -> None:
     points = frequencies()
     exact = 2 * np.sinc(2 * points[:, 0]) * np.sinc(points[:, 1])
     assert exact_values(surface, points) == pytest.approx(exact, abs=1e-13)
-
-
-def test_a_turned_torus_has_the_turned_transform() -> None:
-    torus, points = Torus(1.0, 0.4), frequencies()
-    turned = exact_values(turned_torus(torus), points)
-    assert turned == pytest.approx(exact_values(torus, points @ ROTATION), abs=1e-12 * torus.area)
 
 
 @pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
@@ -225,12 +210,6 @@ def test_a_surface_beyond_the_period_is_refused() -> None:
         fourier_transform(Ellipsoid((5.0, 1.0, 1.0)), LATTICE)
     with pytest.raises(LatticeError, match="the surface reaches"):
         fourier_transform(Similarity(1.0, (4.0, 0.0, 0.0)).apply(angular_ball(True)), LATTICE)
-
-
-def test_a_surface_needs_a_lattice_or_an_accuracy() -> None:
-    for surface in (Ellipsoid(), Torus()):
-        with pytest.raises(InputError, match="lattice"):
-            norm(surface, -2.0)
 
 
 # What is said of the error.
