@@ -84,14 +84,6 @@ def test_distance_of_two_spheres_is_that_of_fine_meshes_of_them() -> None:
         assert meshed == pytest.approx(exact, rel=3e-4)  # O(h²): h = 0.019
 
 
-def test_scaling_follows_the_area() -> None:
-    # As the radius goes to zero, the sphere becomes 4πR² times a Dirac mass.
-    order, radius = -4.0, 1e-5
-    dirac = 4 * math.pi * float(mpmath.quad(lambda r: r * r * (1 + r * r) ** order, [0, 1, mpmath.inf]))
-    expected = (4 * math.pi * radius**2) * math.sqrt(dirac)
-    assert norm(Sphere(radius), order)["norm"].item() == pytest.approx(expected, rel=1e-8)
-
-
 @pytest.mark.parametrize("order", [-0.5, 0.0, 3.0, float("nan")])
 def test_refuses_orders_without_a_norm(order: float) -> None:
     with pytest.raises(OrderError, match="below -1/2"):
