@@ -15,7 +15,6 @@ from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh
 from sobolev_batch.spectral.backends.arrays import Complexes
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
@@ -28,6 +27,7 @@ from sobolev_batch.spectral.metrics.inputs import (
     field_values,
     quality_of,
 )
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums, single_order
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh

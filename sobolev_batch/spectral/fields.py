@@ -12,10 +12,10 @@ import xarray as xr
 from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
 from sobolev_batch.spectral.backends.backends import backend_named
 from sobolev_batch.spectral.errors.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.settings import (
     ON_CPU,

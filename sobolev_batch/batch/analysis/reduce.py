@@ -28,10 +28,10 @@ from sobolev_batch.batch.store.tables import hide_tables, table_attributes, writ
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.quality import TailQuality
-from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sums import OctaveSums, squared_moduli
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling, TailWeights
+from sobolev_batch.spectral.quality import TailQuality
 
 Reals = NDArray[np.float64]
 
@@ -65,23 +65,22 @@ class TailReducer:
         values: NDArray[np.complexfloating] = self.store.read_octaves([row], [self.checksums[row]])[0]
         return values
 
-    def of_norm(self, row: int, values: NDArray[np.complexfloating], inner: Reals) -> Tail:
-        """Return the tail of a squared norm; ``inner`` are the energies of the two octaves below (2,)."""
+    def of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
+        """Return the tail of a squared norm."""
         quality = self.qualities[row]
-        return self._tail(self.weights.sums(squared_moduli(values)), EnergyLimit(*quality.own_limit), inner)
+        return self._tail(self.weights.sums(squared_moduli(values)), quality.own)
 
-    def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating], inner: Reals) -> Tail:
+    def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
         """Return the tail of a squared distance; see `of_norm`."""
         sums = self.weights.sums(squared_moduli(difference))
-        return self._tail(sums, self._limit(row, other, sums[-1].energy), inner)
+        return self._tail(sums, self._remainder(row, other, sums[-1].energy))
 
-    def of_pairs(self, rows: Sequence[int], others: Sequence[int], inner: Reals, shared: int) -> Tail:
+    def of_pairs(self, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
         """Return the tails of the squared distances of rows to others, (orders, rows, others).
 
         Args:
             rows: Rows of one side.
             others: Rows of the other side.
-            inner: Energies of the two octaves below, (2, rows, others).
             shared: Number of rows that the others begin with.
         """
         tails: dict[tuple[int, int], Tail] = {}
@@ -96,24 +95,23 @@ class TailReducer:
                     if j < shared and (j, i) in tails:
                         tails[i, j] = tails[j, i]
                     elif rows[i] != other:
-                        tails[i, j] = self.of_pair(rows[i], other, own - values, inner[:, i, j])
+                        tails[i, j] = self.of_pair(rows[i], other, own - values)
                     else:
                         tails[i, j] = Tail(*np.zeros((4, len(self.orders))))
         # Below the diagonal, where later rows meet earlier ones.
         flat = [tails[i, j] if (i, j) in tails else tails[j, i] for i in range(len(rows)) for j in range(len(others))]
         return Tail.stacked(flat).reshaped(len(rows), len(others))
 
-    def _tail(self, sums: Sequence[OctaveSums], limit: EnergyLimit, inner: Reals) -> Tail:
-        return Tail.from_sums(self.weights.partition, sums, limit, self.orders, inner.tolist())
+    def _tail(self, sums: Sequence[OctaveSums], beyond: Remainder) -> Tail:
+        return Tail.from_sums(sums, *beyond.at(self.orders))
 
-    def _limit(self, row: int, other: int, last_energy: float) -> EnergyLimit:
-        """Return the limit of a difference's energy: known to the reference, else between bounds."""
-        for one, against in ((row, other), (other, row)):
-            known = self.qualities[one].difference_limit
-            if against == self.reference and known is not None:
-                return EnergyLimit(*known)
-        if not last_energy:
-            # Equal meshes have equal values.
-            return EnergyLimit(0.0)
-        highest = self.qualities[row].own_limit[0] + self.qualities[other].own_limit[0]
-        return EnergyLimit.between(_LEAST_LIMIT * last_energy, highest)
+    def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
+        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""
+        for first, second in ((row, other), (other, row)):
+            known = self.qualities[first].difference
+            if second == self.reference and known is not None:
+                return known
+        parts = [self.qualities[number].own for number in (row, other)]
+        # Equal meshes have equal values.
+        highest = sum(max(part.energies) for part in parts) if last_energy else 0.0
+        return Remainder.between(min(_LEAST_LIMIT * last_energy, highest), highest, parts[0].cutoff)

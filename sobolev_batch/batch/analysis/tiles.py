@@ -136,7 +136,7 @@ class Reducer:
         """
         rows = list(rows)
         lattice = self._lattice_part(rows)
-        tail = None if self.tails is None else self._tail_part(self.tails, rows, lattice)
+        tail = None if self.tails is None else self._tail_part(self.tails, rows)
         own = self._estimate(lattice.own, None if tail is None else tail.own, self.areas[rows], self.errors[:, rows])
         if self.reference is None:
             unknown = np.full_like(own.values, np.nan)
@@ -173,21 +173,21 @@ class Reducer:
         sums = [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
         return Parts(sums[0], sums[1], sums[2].totals, sums[3])
 
-    def _tail_part(self, tails: TailReducer, rows: Sequence[int], lattice: Parts[Sums]) -> Parts[Tail]:
+    def _tail_part(self, tails: TailReducer, rows: Sequence[int]) -> Parts[Tail]:
         """Return the tails beyond the lattice; those of the norms stand for the others without the reference."""
         reference = None if self.reference is None else tails.read(self.reference)
         own, differences, products = [], [], []
-        for i, row in enumerate(rows):
+        for row in rows:
             values = tails.read(row)
-            own.append(tails.of_norm(row, values, lattice.own.outer[:, i]))
+            own.append(tails.of_norm(row, values))
             if reference is not None and self.reference is not None:
                 difference = values - reference
-                differences.append(tails.of_pair(row, self.reference, difference, lattice.difference.outer[:, i]))
+                differences.append(tails.of_pair(row, self.reference, difference))
                 products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
         norms = Tail.stacked(own)
         if reference is None or self.reference is None:
             return Parts(norms, norms, norms.beyond, norms)
-        of_reference = tails.of_norm(self.reference, reference, lattice.reference.outer[:, 0])
+        of_reference = tails.of_norm(self.reference, reference)
         return Parts(norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference]))
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
@@ -214,7 +214,7 @@ class Reducer:
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
-        tail = None if self.tails is None else self.tails.of_pairs(rows, others, sums.outer, shared)
+        tail = None if self.tails is None else self.tails.of_pairs(rows, others, shared)
         return self._estimate(sums, tail, areas, errors, unequal)
 
     def _estimate(

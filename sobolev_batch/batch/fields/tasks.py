@@ -24,13 +24,13 @@ from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.errors.probe import Probe, draws_for, join, probe_block
-from sobolev_batch.spectral.errors.quality import Quality, TailQuality
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.remainder import remainder
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.quadrature.kinds import kind_of
+from sobolev_batch.spectral.quality import Quality, TailQuality
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -41,6 +41,8 @@ _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
 _OCTAVES_SHARE = 5.0
+# Random points that show what lies beyond the octaves in a norm; a distance from the reference takes more.
+_POINTS_OF_NORM = 64
 
 
 @dataclass(frozen=True)
@@ -221,13 +223,12 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         raise ValueError("the study has no octaves")
     settings = job.octave_settings(surface)
     values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
-    own, reference = EnergyLimit.from_surfaces([surface], [1]), job.load_reference()
-    difference = None if reference is None else EnergyLimit.from_surfaces([surface, reference], [1, -1])
+    cutoff, reference = tail.highest_frequency, job.load_reference()
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.checks.radii),
         tuple(float(square) for octave in values for square in octave.checks.squares),
-        (own.value, own.deviation),
-        None if difference is None else (difference.value, difference.deviation),
+        remainder([surface], [1], cutoff, points=_POINTS_OF_NORM),
+        None if reference is None else remainder([surface, reference], [1, -1], cutoff),
     )
     checksum = job.store.write_octaves(job.index, np.concatenate([octave.values for octave in values]))
     return StoredBlocks(Facts(), 0.0, "", replace(Quality.from_surface(surface, Probe()), tail=quality), (checksum,))

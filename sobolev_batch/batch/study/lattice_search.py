@@ -281,7 +281,7 @@ class _Search:
         shortfalls: dict[str, AccuracyError] = {}
         for label in demanding:
             try:
-                solution = solve_in_octaves(self.problems[label], 0, _PILOT_FRACTION)
+                solution = solve_in_octaves(self.problems[label], 0, _PILOT_FRACTION, for_others=True)
             except AccuracyError as error:
                 shortfalls[label] = error
                 continue

@@ -16,8 +16,8 @@ from sobolev_batch.results.open import require_unchanged
 from sobolev_batch.results.store_accessor import StoreAccessor, stored_fields
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import NormEstimate
-from sobolev_batch.spectral.errors.quality import Quality
 from sobolev_batch.spectral.metrics.norms import Proportion
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.similarity import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted

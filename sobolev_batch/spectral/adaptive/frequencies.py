@@ -24,7 +24,7 @@ from sobolev_batch.spectral.errors.budget import (
 )
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.limit import EnergyLimit
+from sobolev_batch.spectral.octaves.remainder import remainder
 from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import SampledOctave, octave_values, settings_for
@@ -33,6 +33,9 @@ from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, Tr
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
+
+# Random points that show what lies beyond all frequencies in a norm that is a scale.
+_POINTS_OF_SCALES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +156,7 @@ class Frequencies:
         for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
             factors = 2 - 2 * np.sinc(2 * weights.quadrature.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
-        if self.octaves:
+        if self.has_tail:
             squares = squares + 2 * self._tail(own, [surface], [1]).beyond
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
@@ -185,6 +188,8 @@ class Frequencies:
 
     def _tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
         """Return the tail from the octaves, and what is known to lie beyond them."""
-        octaves = [octave.sampling.octave for octave in self.octaves]
-        sums, inner = self._octave_sums(measure, measure), self._lattice_sums(measure, measure).outer
-        return Tail.from_sums(octaves, sums, EnergyLimit.from_surfaces(surfaces, signs), self.orders, inner.tolist())
+        cutoff = self.octaves[-1].sampling.octave.highest if self.octaves else self.lattice.xi_max
+        # Norms of single surfaces serve as scales.
+        points = _POINTS_OF_SCALES if len(surfaces) == 1 else None
+        beyond = remainder(surfaces, signs, cutoff, self.orders, points)
+        return Tail.from_sums(self._octave_sums(measure, measure), *beyond.at(self.orders))

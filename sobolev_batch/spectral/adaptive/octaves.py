@@ -1,9 +1,10 @@
-"""Norms and distances whose tail is measured: a small lattice, octaves around it, and the limit beyond them."""
+"""Norms and distances whose tail is measured: a small lattice, octaves around it, and what lies beyond them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -13,13 +14,13 @@ from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, cor
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.errors.budget import aliased, change_of_root, sums_of_shells
-from sobolev_batch.spectral.errors.probe import estimate
+from sobolev_batch.spectral.errors.probe import estimate as estimate_from
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
 from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, SurfaceSize
-from sobolev_batch.spectral.octaves.limit import EnergyLimit, tail_integral
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
+from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
 from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
 from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, window_integral
 from sobolev_batch.spectral.octaves.tail import Tail
@@ -30,10 +31,11 @@ from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 Reals = NDArray[np.float64]
 
-_ROUNDS = 6
-_MOST_OCTAVES, _FEWEST_OCTAVES_OF_FACES = 24, 2
+_ROUNDS, _MOST_OCTAVES = 6, 24
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
-_LIMIT_FRACTION = 0.4
+_REMAINDER_FRACTION = 0.4
+# How far off, relatively, other pairs may be beyond the octaves of a pilot.
+_OF_OTHERS = 1 / 8
 # Fraction of the permitted variance that may come from octaves that are not refined.
 _LEFT_FRACTION = 0.5
 # Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
@@ -52,13 +54,15 @@ _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
 _GROWTH = 4.0
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
+# Random points of a remainder at most, and how many more than needed are taken.
+_MOST_POINTS, _MORE_POINTS = 60_000, 1.3
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
 
 @dataclass(frozen=True, eq=False)
 class Core:
-    """The innermost frequencies: fields on a small lattice, under a smooth step.
+    """The innermost frequencies: fields on a small lattice, under a smooth step that ends at a cutoff.
 
     Attributes:
         lattice: Lattice of the fields.
@@ -66,7 +70,7 @@ class Core:
         squares: Squared norm of their difference under the step for each order (orders,).
         images: Bound on the change of the squares by the lattice's spacing (orders,).
         errors: Norms of the fields' own errors (orders,).
-        energies: Energy ∫_{|ξ|=r} |field|² dS in the last two octaves below ξ_max.
+        energy: Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max.
     """
 
     lattice: Lattice
@@ -74,13 +78,13 @@ class Core:
     squares: Reals
     images: Reals
     errors: Reals
-    energies: tuple[float, ...]
+    energy: float
 
     @classmethod
-    def for_problem(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
-        """Return the core of a problem; the step ends at the cutoff."""
+    def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
+        """Compute the fields of a problem on a lattice."""
         samples = problem.samples(lattice)
-        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate(samples, problem.orders))
+        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate_from(samples, problem.orders))
         problem.require_above_rounding(values)
         # The octaves' values have errors of their own.
         target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
@@ -92,12 +96,11 @@ class Core:
             for surface, sample in zip(problem.surfaces, samples, strict=True)
         )
         weights = SobolevWeights(lattice, problem.orders, cutoff)
-        sums = sums_of_shells(
-            shell_sums(_difference([one.values for one in fields]), None, lattice, lattice.half), weights
-        )
-        errors = np.sum([one.quality.probe.norms(weights) for one in fields], axis=0)
+        difference = _difference([field.values for field in fields])
+        sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
+        errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
         images = aliased(sums, weights, problem.support.widths)
-        return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, tuple(sums.outer.tolist()))
+        return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, float(sums.outer[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +125,128 @@ class MeasuredOctave:
         return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
 
 
-def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0) -> Solution:
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is known of a norm or a distance.
+
+    Attributes:
+        problem: Surfaces, orders and accuracy.
+        seed: Seed of the random frequencies and points.
+        core: The innermost frequencies.
+        octaves: Octaves around them, from the inside out.
+        remainders: What lies beyond the core, and beyond each octave.
+        for_others: True if other pairs are to be compared at the same frequencies.
+        seconds: Processor time that was predicted for the octaves and remainders.
+        steps: Number of steps taken: each draws other frequencies.
+    """
+
+    problem: Problem
+    seed: int
+    core: Core
+    octaves: tuple[MeasuredOctave, ...]
+    remainders: tuple[Remainder, ...]
+    for_others: bool = False
+    seconds: float = 0.0
+    steps: int = 0
+
+    @classmethod
+    def first(cls, problem: Problem, seed: int, for_others: bool) -> Self:
+        """Return what a small lattice shows, and what lies beyond it."""
+        lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
+        core = Core.on_lattice(problem, lattice, lattice.xi_max)
+        beyond = remainder(problem.surfaces, problem.signs, lattice.xi_max, problem.orders, seed=seed)
+        return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
+
+    @property
+    def cutoff(self) -> float:
+        """Radius |ξ| at which the step of the core ends, in cycles per unit length."""
+        return self.remainders[0].cutoff
+
+    @cached_property
+    def tail(self) -> Tail:
+        """All beyond the core. What two ways to it disagree about counts as uncertain."""
+        orders, sums = self.problem.orders, [octave.sums for octave in self.octaves]
+        tail = Tail.from_sums(sums, *self.remainders[-1].at(orders))
+        disagreement = np.zeros(len(orders))
+        for number, beyond in enumerate(self.remainders[:-1]):
+            outer = Tail.from_sums(sums[number:], tail.beyond, tail.uncertainty)
+            value, error = beyond.at(orders)
+            off = np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error
+            disagreement = np.maximum(disagreement, off)
+        return replace(tail, uncertainty=tail.uncertainty + disagreement)
+
+    @cached_property
+    def squares(self) -> Reals:
+        """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
+        certain = np.maximum(self.tail.beyond - self.tail.uncertainty, 0.0)
+        return np.asarray(self.core.squares + self.tail.octaves + certain)
+
+    @cached_property
+    def permitted(self) -> Reals:
+        """Largest permitted error of the squares by the tail (orders,)."""
+        accuracy = self.problem.accuracy
+        parts = np.array([accuracy.truncation_part(order) for order in self.problem.orders])
+        return np.asarray(2 * parts * np.maximum(self.squares, accuracy.floor**2))
+
+    @property
+    def permitted_variances(self) -> Reals:
+        """Largest permitted variance of the squares (orders,)."""
+        return np.asarray(((1 - _REMAINDER_FRACTION) * self.permitted / _QUANTILE) ** 2)
+
+    @property
+    def excess(self) -> float:
+        """Error of the remainder over the permitted one, at the worst order."""
+        values, errors = self.remainders[-1].at(self.problem.orders)
+        if self.for_others:
+            errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
+        return float(np.max(errors / (_REMAINDER_FRACTION * self.permitted)))
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Generator of the next step's frequencies."""
+        return np.random.default_rng([self.seed, self.steps])
+
+    @cached_property
+    def sizes(self) -> list[SurfaceSize]:
+        """Sizes of the surfaces, which times follow from."""
+        return [SurfaceSize.from_surface(surface) for surface in self.problem.surfaces]
+
+    @cached_property
+    def normals(self) -> FaceNormals:
+        """Normals of flat faces."""
+        return FaceNormals.from_surfaces(self.problem.surfaces)
+
+    @property
+    def draw_seconds(self) -> float:
+        """Time of the transforms at one frequency."""
+        return sum(size.draw_seconds for size in self.sizes)
+
+    @property
+    def can_draw(self) -> bool:
+        """True where single frequencies are cheaper than whole lattices; sums over many nodes are not."""
+        return not any(isinstance(surface, Smooth) for surface in self.problem.surfaces)
+
+    def lattice_seconds(self, lattice: OctaveLattice) -> float:
+        """Predict the time of the transforms on a lattice."""
+        return sum(size.lattice_seconds(lattice) for size in self.sizes)
+
+    def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Predict the time of the samples of an octave, without those that are known."""
+        return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
+
+    def advanced(self, seconds: float, **changes: object) -> State:
+        """Return the state after a step of some predicted time."""
+        return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
+
+
+def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: bool = False) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     Args:
         problem: Surfaces, orders and accuracy.
         seed: Seed of the random frequencies. The same seed gives the same result.
         aim: Fraction of the rtol to aim at.
+        for_others: Reach farther, for other pairs whose part beyond the octaves is known less well.
 
     Returns:
         The first solution that meets the aim; else the last one that can be sampled in some minutes.
@@ -137,212 +255,184 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0) -> Solution:
         AccuracyError: The accuracy lies below the rounding of fields.
     """
     aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
-    search = _Search.begin(aimed, seed)
-    for rounds_left in reversed(range(_ROUNDS)):
-        search.measure_outwards()
-        solution = search.solution()
-        if np.all(aimed.accuracy.met(solution.estimate)) or not (rounds_left and search.refine()):
+    state = State.first(aimed, seed, for_others)
+    for _ in range(_ROUNDS):
+        while (farther := farther_out(state)) is not None:
+            state = farther
+        solution = solution_of(state)
+        if np.all(aimed.accuracy.met(solution.estimate)) or (finer := refined(state)) is None:
             break
+        state = finer
+    solution = solution_of(state)
     if np.all(problem.accuracy.met(solution.estimate)):
         return solution
     limits = "with as many frequencies as can be sampled in some minutes"
     return replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits))
 
 
-class _Search:
-    """Octaves that are added and refined until the accuracy is met."""
+def solution_of(state: State) -> Solution:
+    """Return the numbers by what is known so far."""
+    core, orders = state.core, state.problem.orders
+    squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in state.octaves], axis=0)
+    found = state.tail.estimate(core.squares, core.images, np.sqrt(squares))
+    values = tuple(
+        SurfaceValues(field, tuple(octave.values[number] for octave in state.octaves))
+        for number, field in enumerate(core.fields)
+    )
+    return Solution(found, core.lattice, values, has_tail=True)
 
-    def __init__(self, problem: Problem, core: Core, cutoff: float, rng: np.random.Generator) -> None:
-        self.problem = problem
-        self.core = core
-        self.cutoff = cutoff
-        self.rng = rng
-        self.octaves: list[MeasuredOctave] = []
-        self.seconds = 0.0
-        self.sizes = [SurfaceSize.from_surface(surface) for surface in problem.surfaces]
-        self.normals = FaceNormals.from_surfaces(problem.surfaces)
-        self.limit = EnergyLimit.from_surfaces(problem.surfaces, [1, -1][: len(problem.surfaces)])
 
-    @classmethod
-    def begin(cls, problem: Problem, seed: int) -> Self:
-        lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
-        core = Core.for_problem(problem, lattice, lattice.xi_max)
-        return cls(problem, core, lattice.xi_max, np.random.default_rng(seed))
-
-    @property
-    def squares(self) -> Reals:
-        """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
-        tail = self._tail()
-        known = tail.octaves + np.maximum(tail.beyond - tail.uncertainty, 0.0)
-        return np.asarray(self.core.squares + known)
-
-    @property
-    def tail_changes(self) -> Reals:
-        """Largest permitted error of the squares by the tail (orders,)."""
-        parts = np.array([self.problem.accuracy.truncation_part(order) for order in self.problem.orders])
-        return np.asarray(2 * parts * np.maximum(self.squares, self.problem.accuracy.floor**2))
-
-    @property
-    def permitted_variances(self) -> Reals:
-        """Largest permitted variance of the squares (orders,)."""
-        return np.asarray(((1 - _LIMIT_FRACTION) * self.tail_changes / _QUANTILE) ** 2)
-
-    def measure_outwards(self) -> None:
-        """Add octaves until what lies beyond them is known well enough, or no more can be had."""
-        while len(self.octaves) < _MOST_OCTAVES and self.seconds < _MOST_SECONDS and not self._knows_the_rest():
-            octave = Octave(self.cutoff, len(self.octaves) + 1)
-            if octave.highest > self._resolvable_frequency():
-                break
-            self.octaves.append(self._measured(self._first_sampling(octave)))
-
-    def solution(self) -> Solution:
-        """Return the numbers by what has been measured so far."""
-        core, orders = self.core, self.problem.orders
-        squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in self.octaves], axis=0)
-        found = self._tail().estimate(core.squares, core.images, np.sqrt(squares))
-        values = tuple(
-            SurfaceValues(field, tuple(octave.values[number] for octave in self.octaves))
-            for number, field in enumerate(core.fields)
+def farther_out(state: State) -> State | None:
+    """Return a state whose remainder is known better, by more points or one more octave; None if it is known well."""
+    problem, beyond = state.problem, state.remainders[-1]
+    if state.excess <= 1 or state.seconds >= _MOST_SECONDS:
+        return None
+    octave = Octave(state.cutoff, len(state.octaves) + 1)
+    can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
+    points = int(_MORE_POINTS * beyond.points * state.excess**2)
+    sampling = _first_sampling(state, octave) if can_go_on else None
+    seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4
+    if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
+        better = remainder(
+            problem.surfaces, problem.signs, beyond.cutoff, problem.orders, points, state.seed + state.steps + 1
         )
-        return Solution(found, core.lattice, values, has_tail=bool(self.octaves))
+        return state.advanced(beyond.seconds(points), remainders=(*state.remainders[:-1], better))
+    if sampling is None:
+        return None
+    measured = _measured(state, sampling)
+    outer = remainder(problem.surfaces, problem.signs, octave.highest, problem.orders, seed=state.seed)
+    return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
 
-    def refine(self) -> bool:
-        """Take more samples where they are needed most; tell whether any could be taken."""
-        refined = False
-        accuracy = self.problem.accuracy
-        values = accuracy.scale(np.sqrt(self.squares))
-        if np.any(change_of_root(self.squares, self.core.images) > accuracy.aliasing_part * values):
-            lattice = self.core.lattice
-            larger = good_intervals(FINER_LATTICE * lattice.M)
-            if larger <= accuracy.largest_intervals:
-                self.core = Core.for_problem(self.problem, Lattice(lattice.xi_max, larger), self.cutoff)
-                refined = True
-        permitted = self.permitted_variances
-        totals = sum((octave.sums.variances for octave in self.octaves), np.zeros(len(permitted)))
-        order = int(np.argmax(totals / permitted))
-        if totals[order] > permitted[order]:
-            each = permitted[order] / len(self.octaves)
-            variances = np.array([octave.sums.variances[order] for octave in self.octaves])
-            # Those that matter least together stay as they are.
-            ascending = np.argsort(variances)
-            decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
-            finer = {int(n): self._finer_sampling(self.octaves[n], order, each) for n in decisive}
-            samplings = {n: sampling for n, sampling in finer.items() if sampling is not None}
-            seconds = sum(self._seconds(sampling, self.octaves[n].sampling) for n, sampling in samplings.items())
-            if self.seconds + seconds <= _MOST_SECONDS:
-                for number, sampling in samplings.items():
-                    self.octaves[number] = self._measured(sampling, self.octaves[number])
-                    refined = True
-        return refined
 
-    def _knows_the_rest(self) -> bool:
-        # Where faces repeat, the energy may jump from one octave to the next.
-        if len(self.octaves) < (_FEWEST_OCTAVES_OF_FACES if self.normals else 1):
-            return False
-        return bool(np.all(self._tail().uncertainty <= _LIMIT_FRACTION * self.tail_changes))
+def refined(state: State) -> State | None:
+    """Return a state with more samples where they are needed most; None where no more can be taken."""
+    problem, accuracy, core = state.problem, state.problem.accuracy, state.core
+    values = accuracy.scale(np.sqrt(state.squares))
+    if np.any(change_of_root(state.squares, core.images) > accuracy.aliasing_part * values):
+        larger = good_intervals(FINER_LATTICE * core.lattice.M)
+        if larger <= accuracy.largest_intervals:
+            core = Core.on_lattice(problem, Lattice(core.lattice.xi_max, larger), state.cutoff)
+    finer = _finer_samplings(state)
+    seconds = sum(state.sampling_seconds(sampling, state.octaves[n].sampling) for n, sampling in finer.items())
+    if state.seconds + seconds > _MOST_SECONDS:
+        finer, seconds = {}, 0.0
+    if core is state.core and not finer:
+        return None
+    octaves = tuple(
+        _measured(state, finer[number], octave) if number in finer else octave
+        for number, octave in enumerate(state.octaves)
+    )
+    return state.advanced(seconds, core=core, octaves=octaves)
 
-    def _tail(self) -> Tail:
-        octaves = [octave.sampling.octave for octave in self.octaves]
-        sums = [octave.sums for octave in self.octaves]
-        return Tail.from_sums(octaves, sums, self.limit, self.problem.orders, self.core.energies)
 
-    def _measured(self, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
-        problem = self.problem
-        self.seconds += self._seconds(sampling, known.sampling if known else None)
-        values = problem.accuracy.scale(np.sqrt(self.squares))
-        target = error_target(values, problem.orders, problem.accuracy, problem.area)
-        target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
-        settings = settings_for(target)
-        execution = Execution(threads=problem.threads, allowed_bytes=problem.accuracy.allowed_bytes)
-        octave = SampledOctave.from_sampling(sampling)
-        found = tuple(
-            octave_values(
-                surface, octave, problem.orders, settings, execution, known=known.values[number] if known else None
-            )
-            for number, surface in enumerate(problem.surfaces)
+def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
+    """Return an octave at some samples; values that are known are not computed again."""
+    problem = state.problem
+    values = problem.accuracy.scale(np.sqrt(state.squares))
+    target = error_target(values, problem.orders, problem.accuracy, problem.area)
+    settings = settings_for(target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES)))
+    octave = SampledOctave.from_sampling(sampling)
+    of_surfaces = tuple(
+        octave_values(
+            surface,
+            octave,
+            problem.orders,
+            settings,
+            problem.execution,
+            known=known.values[number] if known else None,
         )
-        squares = squared_moduli(_difference([one.values for one in found]))
-        return MeasuredOctave(found, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
+        for number, surface in enumerate(problem.surfaces)
+    )
+    squares = squared_moduli(_difference([values.values for values in of_surfaces]))
+    return MeasuredOctave(of_surfaces, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
 
-    def _first_sampling(self, octave: Octave) -> OctaveSampling:
-        """Return the sampling that is predicted to be the cheapest one."""
-        energy = self._predicted_energy()
-        orders = self.problem.orders
-        inside = np.array([window_integral(octave, order) for order in orders])
-        outside = np.array([tail_integral(octave.highest, order) for order in orders])
-        deviation = _FLAT_DEVIATION if self.normals else _CURVED_DEVIATION
-        # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
-        # Very negative orders have nothing there.
-        with np.errstate(divide="ignore"):
-            own = np.sqrt(self.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
-            further = _LIMIT_FRACTION * self.tail_changes / (_QUANTILE * energy * outside)
-        count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
-        lattice = self._lattice(octave, _FIRST_M)
-        seconds = self._lattice_seconds(lattice)
-        alone = max(count, _FEWEST_FLAT_DRAWS) if self.normals else count
-        alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / self._draw_seconds)))
-        if self._can_draw and alone * self._draw_seconds < seconds:
-            return OctaveSampling(octave, (), self._drawn(octave, alone, _UNIFORM_ALONE))
-        beside = 0
-        if self.normals and self._can_draw:
-            affordable = _DRAWS_FRACTION * seconds / self._draw_seconds
-            beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
-        return OctaveSampling(octave, (lattice,), self._drawn(octave, beside, _UNIFORM_BESIDE_LATTICE))
 
-    def _predicted_energy(self) -> float:
-        """Predict the energy of the next octave."""
-        energy = self.octaves[-1].sums.energy if self.octaves else self.core.energies[-1]
-        return min(_GROWTH * energy, max(self.limit.value, energy))
+def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
+    """Return the sampling of an octave that is predicted to be the cheapest one."""
+    orders, normals, rng = state.problem.orders, state.normals, state.rng
+    energy = state.octaves[-1].sums.energy if state.octaves else state.core.energy
+    energy = max(_GROWTH * energy, *state.remainders[-1].energies)
+    inside = np.array([window_integral(octave, order) for order in orders])
+    outside = np.array([tail_integral(octave.highest, order) for order in orders])
+    deviation = _FLAT_DEVIATION if normals else _CURVED_DEVIATION
+    # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
+    # Very negative orders have nothing there.
+    with np.errstate(divide="ignore"):
+        own = np.sqrt(state.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
+        further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
+    count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
+    lattice = _lattice(state, octave, _FIRST_M, rng)
+    seconds = state.lattice_seconds(lattice)
+    alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
+    alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
+    if state.can_draw and alone * state.draw_seconds < seconds:
+        return OctaveSampling(octave, (), _drawn(state, octave, alone, _UNIFORM_ALONE, rng))
+    beside = 0
+    if normals and state.can_draw:
+        affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
+        beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
+    return OctaveSampling(octave, (lattice,), _drawn(state, octave, beside, _UNIFORM_BESIDE_LATTICE, rng))
 
-    def _finer_sampling(self, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
-        """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
-        sampling, sums = octave.sampling, octave.sums
-        excess = float(sums.variances[order]) / permitted
-        if excess <= 1:
-            return None
-        lattices, drawn = sampling.lattices, sampling.drawn
-        count = int(min(len(drawn) * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
-        from_draws = sums.drawn_variances[order] > sums.lattice_variances[order]
-        first = self._lattice(sampling.octave, _FIRST_M)
-        if not lattices and count * self._draw_seconds > self._lattice_seconds(first):
-            beside = len(drawn) if self.normals else 0
-            lattices = (first,)
-            drawn = self._drawn(sampling.octave, beside, _UNIFORM_BESIDE_LATTICE)
-        elif from_draws:
-            drawn = self._drawn(sampling.octave, count, drawn.uniform_fraction)
-        else:
-            intervals = 2 * round(lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
-            lattices = (*lattices, self._lattice(sampling.octave, intervals))
-        return replace(sampling, lattices=lattices, drawn=drawn)
 
-    def _lattice(self, octave: Octave, intervals: int) -> OctaveLattice:
-        largest = min(_LARGEST_M, self.problem.accuracy.largest_intervals)
-        return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), self.rng)
+def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
+    """Return samplings for the octaves whose variance is too large."""
+    permitted = state.permitted_variances
+    totals = sum((octave.sums.variances for octave in state.octaves), np.zeros(len(permitted)))
+    order = int(np.argmax(totals / permitted))
+    if totals[order] <= permitted[order]:
+        return {}
+    variances = np.array([octave.sums.variances[order] for octave in state.octaves])
+    # Those that matter least together stay as they are.
+    ascending = np.argsort(variances)
+    decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
+    finer = {
+        int(number): _finer_sampling(state, state.octaves[number], order, permitted[order] / len(state.octaves))
+        for number in decisive
+    }
+    return {number: sampling for number, sampling in finer.items() if sampling is not None}
 
-    def _drawn(self, octave: Octave, count: int, uniform_fraction: float) -> DrawnFrequencies:
-        seed = int(self.rng.integers(2**53))
-        return DrawnFrequencies(octave, count, seed, self.normals, uniform_fraction)
 
-    @property
-    def _draw_seconds(self) -> float:
-        return sum(size.draw_seconds for size in self.sizes)
+def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
+    """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
+    sampling, sums, rng = (
+        octave.sampling,
+        octave.sums,
+        np.random.default_rng([state.seed, state.steps, octave.sampling.octave.index]),
+    )
+    excess = float(sums.variances[order]) / permitted
+    if excess <= 1:
+        return None
+    lattices, drawn = sampling.lattices, sampling.drawn
+    count = int(min(len(drawn) * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
+    from_draws = sums.drawn_variances[order] > sums.lattice_variances[order]
+    first = _lattice(state, sampling.octave, _FIRST_M, rng)
+    if not lattices and count * state.draw_seconds > state.lattice_seconds(first):
+        beside = len(drawn) if state.normals else 0
+        lattices = (first,)
+        drawn = _drawn(state, sampling.octave, beside, _UNIFORM_BESIDE_LATTICE, rng)
+    elif from_draws:
+        drawn = _drawn(state, sampling.octave, count, drawn.uniform_fraction, rng)
+    else:
+        intervals = 2 * round(lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
+        lattices = (*lattices, _lattice(state, sampling.octave, intervals, rng))
+    return replace(sampling, lattices=lattices, drawn=drawn)
 
-    def _lattice_seconds(self, lattice: OctaveLattice) -> float:
-        return sum(size.lattice_seconds(lattice) for size in self.sizes)
 
-    def _seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
-        """Predict the processor time of the samples of an octave, without those that are known."""
-        return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
+def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:
+    largest = min(_LARGEST_M, state.problem.accuracy.largest_intervals)
+    return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), rng)
 
-    @property
-    def _can_draw(self) -> bool:
-        """Tell whether single frequencies are cheaper than whole lattices; sums over many nodes are not."""
-        return not any(isinstance(surface, Smooth) for surface in self.problem.surfaces)
 
-    def _resolvable_frequency(self) -> float:
-        """Return the frequency up to which all surfaces can be transformed."""
-        smooth = [surface.area for surface in self.problem.surfaces if isinstance(surface, Smooth)]
-        return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(smooth))) ** 0.5) if smooth else np.inf
+def _drawn(
+    state: State, octave: Octave, count: int, uniform_fraction: float, rng: np.random.Generator
+) -> DrawnFrequencies:
+    return DrawnFrequencies(octave, count, int(rng.integers(2**53)), state.normals, uniform_fraction)
+
+
+def _resolvable_frequency(problem: Problem) -> float:
+    """Return the frequency up to which all surfaces can be transformed."""
+    areas = [surface.area for surface in problem.surfaces if isinstance(surface, Smooth)]
+    return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(areas))) ** 0.5) if areas else np.inf
 
 
 def _difference(values: Sequence[NDArray[np.complexfloating]]) -> NDArray[np.complexfloating]:

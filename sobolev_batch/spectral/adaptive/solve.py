@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,12 @@ from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, S
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, area_bound, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.errors.probe import Sample, estimate
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
+from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
@@ -40,6 +42,8 @@ _LOW_ORDER = -3.5
 _PAIR = 2
 # Where surfaces that agree on a lattice are compared again, in frequencies of the lattice.
 _BEYOND = (4.0, 16.0, 64.0, 256.0)
+# Where the areas permit less than this fraction of the allowed truncation, nothing can hide beyond a lattice.
+_NEGLIGIBLE = 0.3
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -228,6 +232,9 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
         values = solution.estimate.values
         has_no_digit = equal | (values <= problem.rounding)
         is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
+        if is_met and not np.all(has_no_digit):
+            solution = _with_hidden_part(problem, solution)
+            is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
         if is_met or not rounds_left:
             break
         step, before = _next_step(problem, step, sums), step
@@ -235,6 +242,39 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
             break
     shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
     return _not_below_rounding(problem, replace(solution, shortfall=shortfall))
+
+
+def _with_hidden_part(problem: Problem, solution: Solution) -> Solution:
+    """Return a solution on a lattice with the error by what lies beyond it, where close points show more than its law.
+
+    The law extrapolates, and sees no period that begins beyond the lattice. All that lies there follows from close
+    points, of which some are drawn, and is less than the areas permit.
+    """
+    found, lattice = solution.estimate, cast(Lattice, solution.lattice)
+    most = np.array([area_bound(problem.area, order, lattice.xi_max) for order in problem.orders])
+    most_truncation = np.sqrt(found.values**2 + most) - found.values
+    allowed = np.array([problem.accuracy.truncation_part(order) for order in problem.orders]) * found.values
+    if np.all(most_truncation <= np.maximum(found.truncation, _NEGLIGIBLE * allowed)):
+        return solution
+    hidden, error = _beyond_lattice(problem, solution)
+    law = (found.values + found.truncation) ** 2 - found.values**2
+    with_hidden = np.sqrt(found.values**2 + np.minimum(np.maximum(hidden + error, 0.0), most)) - found.values
+    truncation = np.where(hidden - error > law, with_hidden, found.truncation)
+    return replace(solution, estimate=replace(found, truncation=truncation))
+
+
+def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]:
+    """Return the squared norm beyond a solution's lattice (orders,) from close points, and how far off it may be."""
+    lattice, fields = cast(Lattice, solution.lattice), [values.field for values in solution.values]
+    difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
+    known = tuple(max(order, LOWEST_ORDER) for order in problem.orders)
+    # What the lattice shows of the range in which the step falls.
+    shown = SobolevWeights(lattice, known).per_shell - SobolevWeights(lattice, known, lattice.xi_max).per_shell
+    shells = shell_sums(difference, None, lattice, lattice.half)
+    values, errors = remainder(problem.surfaces, problem.signs, lattice.xi_max, known).at(known)
+    # No frequency beyond the lattice weighs more than this at lower orders.
+    factors = (1 + lattice.xi_max**2) ** (np.array(problem.orders) - known)
+    return factors * (values - shown @ shells), factors * errors
 
 
 def _not_below_rounding(problem: Problem, solution: Solution) -> Solution:

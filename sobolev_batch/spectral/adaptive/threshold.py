@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
-from scipy.special import zeta
 
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import difference_on, solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.errors.budget import area_bound, area_bounds
 from sobolev_batch.spectral.errors.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice
@@ -238,24 +238,11 @@ def _exact_norm(problem: Problem) -> Interval:
 
 def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:
     """Return a norm on a lattice with all that may lie beyond the lattice."""
-    factors = _beyond(problem)
-    return float(np.sqrt(value**2 + min(factor * lattice.xi_max**-power for factor, power in factors)))
+    (order,) = problem.orders
+    return float(np.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max)))
 
 
 def _frequency_of(problem: Problem, norm: float) -> float:
     """Return the frequency beyond which no more than a norm can lie."""
-    return float(min((factor / norm**2) ** (1 / power) for factor, power in _beyond(problem)))
-
-
-def _beyond(problem: Problem) -> list[tuple[float, float]]:
-    """Return bounds on the squared norm beyond a frequency, as factors and powers: factor / frequency^power.
-
-    They follow from the areas alone. The energy on |ξ| = r is twice the area on average, and twice that where layers
-    reinforce each other. If surfaces repeat, it comes in pulses at the odd multiples of a frequency, of which the first
-    may lie just beyond. Besides, no value of the transform is larger than the area.
-    """
-    (order,), area = problem.orders, problem.area
-    power, bounds = -2 * order - 3, [(4 * area * (1 - 4**order) * float(zeta(-2 * order)), -2 * order - 1)]
-    if power > 0:
-        bounds.append((4 * np.pi * area**2 / power, power))
-    return bounds
+    (order,) = problem.orders
+    return float(min((factor / norm**2) ** (1 / power) for factor, power in area_bounds(problem.area, order)))

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import exprel, gammaln, kve
+from scipy.special import exprel, gammaln, kve, zeta
 
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
@@ -220,6 +220,31 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
             tails.append(np.where(outer > 0, (growing + flat) / (2 * ratio), 0.0))
     periods = float(support.widths.max()) * lattice.xi_max
     return np.asarray(TRUNCATION_CAUTION * (1 + (_TROUGH_PERIODS / max(periods, 1e-3)) ** 2) * np.stack(tails))
+
+
+def area_bound(area: float, order: float, highest: float) -> float:
+    """Return what no squared norm beyond a frequency exceeds, whatever the surfaces are.
+
+    The energy on |ξ| = r is twice the area on average, and twice that where layers reinforce each other. If surfaces
+    repeat, it comes in pulses at the odd multiples of a frequency, of which the first may lie just beyond. Besides, no
+    value of the transform is larger than the area.
+
+    Args:
+        area: Area of all surfaces together, in squared units of length.
+        order: Order s.
+        highest: The frequency, in cycles per unit length.
+    """
+    factor, power = min(area_bounds(area, order), key=lambda bound: bound[0] * highest ** -bound[1])
+    return float(factor * highest**-power)
+
+
+def area_bounds(area: float, order: float) -> list[tuple[float, float]]:
+    """Return the bounds of `area_bound` as factors and powers: factor / frequency^power."""
+    power = -2 * order - 3
+    bounds = [(4 * area * (1 - 4**order) * float(zeta(-2 * order)), -2 * order - 1)]
+    if power > 0:
+        bounds.append((4 * np.pi * area**2 / power, power))
+    return bounds
 
 
 def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.errors.budget import NormEstimate, change_of_root
-from sobolev_batch.spectral.octaves.limit import EnergyLimit, beyond
-from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import OctaveSums, statistical_errors
 
 Reals = NDArray[np.float64]
@@ -34,22 +32,11 @@ class Tail:
     uncertainty: Reals
 
     @classmethod
-    def from_sums(
-        cls,
-        octaves: Sequence[Octave],
-        sums: Sequence[OctaveSums],
-        limit: EnergyLimit,
-        orders: Sequence[float],
-        inner: Sequence[float],
-    ) -> Self:
-        """Return the tail by the sums over octaves and the limit of the energy; see `beyond`.
-
-        Without octaves nothing is known of it.
-        """
-        none = np.zeros(len(orders))
-        measured = np.sum([one.squares for one in sums], axis=0) if sums else none
-        errors = statistical_errors(sums) if sums else none
-        return cls(measured, errors, *beyond(octaves, sums, limit, orders, inner))
+    def from_sums(cls, sums: Sequence[OctaveSums], beyond: Reals, uncertainty: Reals) -> Self:
+        """Return the tail by the sums over octaves, and what lies beyond them (orders,)."""
+        none = np.zeros(len(beyond))
+        measured = np.sum([octave.squares for octave in sums], axis=0) if sums else none
+        return cls(measured, statistical_errors(sums) if sums else none, beyond, uncertainty)
 
     @classmethod
     def stacked(cls, tails: Sequence[Tail]) -> Self:

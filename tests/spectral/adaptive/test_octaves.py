@@ -51,7 +51,7 @@ def test_spheres_against_their_closed_form(order: float) -> None:
 @pytest.mark.slow
 def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> None:
     pair = icosphere(1), icosphere(2)
-    first, again, other = (distance(*pair, -1.0, rtol=0.05, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (distance(*pair, -1.0, rtol=0.01, seed=seed) for seed in (1, 1, 2))
     # Sums of several threads round differently, here in single precision.
     assert first["distance"].item() == pytest.approx(again["distance"].item(), rel=1e-5)
     assert first["distance"].item() != other["distance"].item()

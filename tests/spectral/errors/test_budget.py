@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.errors.budget import Sums, Support, truncated
-from sobolev_batch.spectral.errors.quality import Quality
+from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.errors.probe import Probe, norms_of_checks
+from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
@@ -21,28 +22,24 @@ class TailQuality:
     Attributes:
         radii: |ξ| at which values were compared with exact ones.
         squares: Contribution of each comparison to the squared norm of the error, without the weight of an order.
-        own_limit: Limit of the surface's own energy for large |ξ|, and its standard error.
-        difference_limit: Limit of the energy of its difference from the study's reference, likewise; None if unknown.
+        own: What lies beyond the octaves in the surface's own norm.
+        difference: The same in its distance from the study's reference; None if unknown.
     """
 
     radii: tuple[float, ...]
     squares: tuple[float, ...]
-    own_limit: tuple[float, float]
-    difference_limit: tuple[float, float] | None = None
+    own: Remainder
+    difference: Remainder | None = None
 
     def to_table(self) -> dict[str, Any]:
         """Return the quality as a table, from which `from_table` makes it again."""
-        return {
-            "radii": self.radii,
-            "squares": self.squares,
-            "own_limit": self.own_limit,
-            "difference_limit": self.difference_limit,
-        }
+        return asdict(self)
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> Self:
         """Return the quality that a table holds."""
-        return cls(*(_tuple(table[name]) for name in ("radii", "squares", "own_limit", "difference_limit")))
+        own, difference = (part and Remainder.from_table(part) for part in (table["own"], table["difference"]))
+        return cls(tuple(table["radii"]), tuple(table["squares"]), own, difference)
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,3 @@ class Quality:
         area, lowest, highest, shells, sums, *tail = json.loads(text)
         extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
         return cls(area, extent, probe, TailQuality.from_table(*tail) if tail else None)
-
-
-def _tuple(value: Any) -> Any:
-    return value if value is None else tuple(value)
