@@ -6,7 +6,6 @@ import base64
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -229,29 +228,20 @@ def _packed(values: Any, dtype: str) -> Mapping[str, str]:
     return {"dtype": dtype[1:], "bdata": base64.b64encode(data.tobytes()).decode("ascii")}
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture for paper, and for browsers without scripts.
-
-    Attributes:
-        source: Picture as a data: URL; None where it could not be made.
-        text: Alternative text, or the reason why there is no picture.
-    """
-
-    source: str | None
-    text: str
-
-
+# A picture for paper, and for browsers without scripts: its source as a data: URL, or None where it could not be made,
+# and its alternative text, or the reason why there is no picture.
+Picture = Mapping[str, str | None]
 Pictures = dict[str, list[Picture]]
 
 
 def study_pictures(selection: Selection, views: Views) -> Pictures:
     """Return the pictures of an open store, by the chart that they stand for."""
-    pictures = {
+    pictures: Pictures = {
         name: [
-            Picture(
-                _data_url(plot.figure(selection, [item])), plot.text + ("" if item is None else f", order {item:g}")
-            )
+            {
+                "source": _data_url(plot.figure(selection, [item])),
+                "text": plot.text + ("" if item is None else f", order {item:g}"),
+            }
             for item in plot.items(selection)[:MOST_PICTURED_ORDERS]
         ]
         for name, plot in PLOTS.items()
@@ -265,14 +255,18 @@ def unpictured(tree: xr.DataTree, pictures: Pictures) -> Iterator[str]:
     orders = finished_group(tree, "convergence", load=False).sizes["order"]
     if orders > MOST_PICTURED_ORDERS:
         yield f"pictures for paper: only those of {MOST_PICTURED_ORDERS} of {orders} orders are included"
-    yield from (f"pictures of meshes for paper: {one.text}" for one in pictures["witness"] if one.source is None)
+    yield from (
+        f"pictures of meshes for paper: {picture['text']}"
+        for picture in pictures["witness"]
+        if picture["source"] is None
+    )
 
 
 def league_pictures(leagues: Sequence[League]) -> Pictures:
     """Return a picture of the league of each order."""
     return {
         "league": [
-            Picture(_data_url(LEAGUE.figure(leagues, [one])), f"{LEAGUE.text}, order {one.order:g}")
+            {"source": _data_url(LEAGUE.figure(leagues, [one])), "text": f"{LEAGUE.text}, order {one.order:g}"}
             for one in leagues[:MOST_PICTURED_ORDERS]
         ]
     }
@@ -282,11 +276,12 @@ def _witness_pictures(views: Views) -> list[Picture]:
     try:
         rendered = render(views.views, MOST_ORDERS)
     except InputError as error:
-        return [Picture(None, str(error))]
+        return [{"source": None, "text": str(error)}]
     return [
-        Picture(
-            _data_url(witness_figure(view, drawn), is_shaded=True), f"{view.label}, coloured by its witness function"
-        )
+        {
+            "source": _data_url(witness_figure(view, drawn), is_shaded=True),
+            "text": f"{view.label}, coloured by its witness function",
+        }
         for view, drawn in zip(views.views, rendered, strict=True)
     ]
 

@@ -24,8 +24,11 @@ DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "s
 
 def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
     axes = sb.plot_transform(tree)
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]  # type: ignore[union-attr]
-    assert labels == ["f_1/0", "f_1/1", "reference"]
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["f_1/0", "f_1/1", "reference"]
+    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
+    assert not legend.get_window_extent().overlaps(axes.bbox)
     data = np.asarray(axes.lines[1].get_xydata())
     assert np.array_equal(data[:, 0], [0.0, 1.0, 2.0])
     # Row 1, xi_y = xi_z = 0: strides of 75, 15, 3 and 1.
