@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import NoneType
 from typing import Any, Literal, Self
 
 from pydantic import ValidationError
@@ -106,14 +105,6 @@ class Study:
     octaves: int = 0
 
     def __post_init__(self) -> None:
-        for name, types in _TYPES.items():
-            value = getattr(self, name)
-            if not isinstance(value, types) or isinstance(value, bool):
-                expected = " or ".join("None" if kind is NoneType else kind.__name__ for kind in types)
-                raise StudyError(
-                    f"Study: {name} must be a value of type {expected}, found {shown_value(value)}; "
-                    "Study.from_table and Study.from_toml make a study from plain values"
-                )
         check_orders(self.orders)
 
     @property
@@ -267,26 +258,6 @@ def _in_section(name: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise StudyError(f"[{name}]: {error}") from error
-
-
-# Types of what a study is made of, for those who make one without a table.
-_TYPES: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "title": (str,),
-    "lattice": (Lattice, NoneType),
-    "accuracy": (Accuracy, NoneType),
-    "transform": (TransformSettings,),
-    "dtype": (str, NoneType),
-    "backend": (str,),
-    "orders": (tuple,),
-    "pairs": (str,),
-    "families": (tuple,),
-    "reference": (Source, FamilyReference),
-    "scaling": (Similarity, NoneType),
-    "proximity": (int, NoneType),
-    "folder": (Path,),
-    "table": (Mapping,),
-}
 
 
 def _require_distinct(families: tuple[Family, ...]) -> None:

@@ -17,22 +17,19 @@ from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.surfaces.sources import registry
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.mesh_files import off
+from tests.support.repository import blocks
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 from tests.support.studies import variable
 
-PAGE = Path(__file__).parents[3] / "docs" / "surfaces.md"
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+PAGE = "docs/surfaces.md"
 
 
 @pytest.fixture
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The packages of the page, installed."""
     site = tmp_path / "site"
-    sources = [text for text in blocks("toml") if text.startswith("[project.")]
-    modules = [text for text in blocks("python") if "(sb.Source)" in text]
+    sources = [text for text in blocks(PAGE, "toml") if text.startswith("[project.")]
+    modules = [text for text in blocks(PAGE, "python") if "(sb.Source)" in text]
     names = []
     for entry_point, module in zip(sources, modules, strict=True):
         match = re.fullmatch(r'\[project\.entry-points\."(.*)"\]\n(.*) = "(\w+)(:\w+)"\n', entry_point)
@@ -54,7 +51,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
-    exec("".join(blocks("python")[:2]), {})
+    exec("".join(blocks(PAGE, "python")[:2]), {})
     first, second = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"\[[\d.e-]+ +[\d.e-]+\] ± \[[\d.e-]+ +[\d.e-]+\]", first)
     assert float(second.split()[0]) > 1.6**2
@@ -63,7 +60,7 @@ def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("packages")
 def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path) -> None:
-    (study_text,) = (text for text in blocks("toml") if text.startswith("[study]"))
+    (study_text,) = (text for text in blocks(PAGE, "toml") if text.startswith("[study]"))
 
     def computed(text: str) -> tuple[str, ...]:
         (tmp_path / "study.toml").write_text(text)
@@ -109,7 +106,7 @@ def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("packages")
 def test_the_examples_conform(tmp_path: Path) -> None:
     check_source(parse_source({"source": "wavy-ball"}))
-    (text,) = (text for text in blocks("python") if "def test_" in text)
+    (text,) = (text for text in blocks(PAGE, "python") if "def test_" in text)
     namespace: dict[str, Any] = {}
     exec(text, namespace)
     namespace["test_the_source_conforms"](tmp_path)
