@@ -27,7 +27,7 @@ from tests.support.shapes import CENTRED_BOX as BOX
 
 Surfaces = tuple[Surface, Surface]
 
-ORDERS = (-0.6, -0.75, -1.0, -1.5, -2.0, -3.0, -5.0, -10.0)
+ORDERS = (-0.6, -0.75, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -10.0)
 # Those at which something is known of any pair, if often little.
 _FROM_ONE = ORDERS[2:]
 # Vertices on multiples of this have exact midpoints.

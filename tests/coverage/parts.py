@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -95,6 +96,79 @@ def distant_parts(rng: np.random.Generator) -> Pair:
     return pair_of(rng, first.joined(second), first.joined(second.moved(*(small_amount(rng) * direction(rng)))))
 
 
+def tapered_plates(rng: np.random.Generator) -> Pair:
+    """Return a stack of squares, smaller towards both ends, and the same moved along it by part of its pitch."""
+    count, half = int(rng.integers(8, 41)), float(rng.uniform(0.1, 0.4))
+    amount = 0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))
+
+    def stack(offset: float) -> Rectangles:
+        heights = (np.arange(count) + 0.5 + offset) / count - 0.5
+        halves = half * np.cos(np.pi * heights) ** 2
+        return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
+
+    return pair_of(rng, stack(0.0), stack(amount))
+
+
+def strips(rng: np.random.Generator) -> Pair:
+    """Return long narrow strips in a plane, and the same moved across by part of their pitch, or strips of others."""
+    count, length, filled = int(rng.integers(5, 31)), float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.2, 0.7))
+
+    def grid(offset: float, count: int) -> Rectangles:
+        lefts = (np.arange(count) + offset) / count - 0.5
+        return Rectangles.from_corners(*(((x, -length / 2, 0), (x + filled / count, length / 2, 0)) for x in lefts))
+
+    if rng.random() < 0.7:
+        return pair_of(rng, grid(0.0, count), grid(0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5)), count))
+    return pair_of(rng, grid(0.0, count), grid(0.0, int(rng.integers(5, 31))))
+
+
+def layers(rng: np.random.Generator) -> Pair:
+    """Return sheets at a small gap against fewer of them, or at another gap."""
+    sides, gaps, counts = (
+        rng.uniform(0.3, 1.0, size=2),
+        10.0 ** rng.uniform(-4, -1.3, size=2),
+        rng.integers(1, 5, size=2),
+    )
+
+    def sheets(count: int, gap: float, height: float) -> Rectangles:
+        low, high = -sides / 2, sides / 2
+        return Rectangles.from_corners(*(((*low, height + i * gap), (*high, height + i * gap)) for i in range(count)))
+
+    return pair_of(rng, sheets(int(counts[0]), gaps[0], 0.0), sheets(int(counts[1]), gaps[1], float(gaps.min()) / 3))
+
+
+def woven(rng: np.random.Generator) -> Pair:
+    """Return strips along x above and below strips along y, and the same moved by part of the pitch."""
+    count, height = int(rng.integers(4, 13)), float(10.0 ** rng.uniform(-3, -1.3))
+
+    def cloth(offset: float) -> Rectangles:
+        lefts = (np.arange(count) + 0.25 + offset) / count - 0.5
+        cuts = np.append(lefts + 0.25 / count, lefts[-1] + 1.25 / count)
+        corners = []
+        for i, x in enumerate(lefts):
+            for j, (start, end) in enumerate(itertools.pairwise(cuts)):
+                z = height * (-1) ** (i + j)
+                corners += [((x, start, z), (x + 0.5 / count, end, z)), ((start, x, -z), (end, x + 0.5 / count, -z))]
+        return Rectangles.from_corners(*corners)
+
+    return pair_of(rng, cloth(0.0), cloth(0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))))
+
+
+def corrugations(rng: np.random.Generator) -> Pair:
+    """Return a sheet with square folds that fade towards its ends, and the same folded the other way."""
+    count, width, amplitude = int(rng.integers(5, 25)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.005, 0.04))
+    edges = np.linspace(-0.5, 0.5, 2 * count + 1)
+    envelope = amplitude * np.cos(np.pi * (edges[:-1] + edges[1:]) / 2) ** 2
+
+    def sheet(sign: float) -> Rectangles:
+        levels = sign * envelope * (-1.0) ** np.arange(2 * count)
+        flat = [((a, 0, z), (b, width, z)) for a, b, z in zip(edges[:-1], edges[1:], levels, strict=True)]
+        pairs = zip(edges[1:-1], np.minimum(levels[:-1], levels[1:]), np.maximum(levels[:-1], levels[1:]), strict=True)
+        return Rectangles.from_corners(*flat, *(((x, 0, low), (x, width, high)) for x, low, high in pairs))
+
+    return pair_of(rng, sheet(1.0), sheet(-1.0))
+
+
 def _box(sides: Reals) -> Rectangles:
     """Return a box around the origin, or a single rectangle if one of its sides is zero."""
     box = Rectangles.box((-sides / 2).tolist(), (sides / 2).tolist())
@@ -127,4 +201,9 @@ PARTS: dict[str, Callable[[np.random.Generator], Pair]] = {
     "voxel balls": voxel_balls,
     "thin walls": thin_walls,
     "distant parts": distant_parts,
+    "tapered plates": tapered_plates,
+    "strips": strips,
+    "layers": layers,
+    "woven": woven,
+    "corrugations": corrugations,
 }
