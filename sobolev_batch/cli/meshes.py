@@ -190,8 +190,8 @@ def _settings_text(attributes: Mapping[str, Any]) -> str:
     text = f"xi_max {attributes['xi_max']:.4g}, M {attributes['M']}, {attributes['dtype']}"
     if attributes["octaves"]:
         octaves = f"{attributes['octaves']} octave{'s' * (attributes['octaves'] != 1)}"
-        text += f", {octaves} up to {attributes['highest_frequency']:.4g}, seed {attributes['seed']}"
-    return text
+        text += f", {octaves} up to {attributes['highest_frequency']:.4g}"
+    return f"{text}, seed {attributes['seed']}"
 
 
 def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:

@@ -39,7 +39,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
     "error": described("bound on the error", NORM, description="truncation + aliasing + discretisation + statistical"),
     "truncation": described(
-        "error of truncation", NORM, description="frequencies beyond the highest one; without octaves they only add"
+        "error of truncation", NORM, description="frequencies beyond the highest one; on a given lattice they only add"
     ),
     "aliasing": described("error of aliasing", NORM, description="spacing of the lattice"),
     "discretisation": described("error of discretisation", NORM, description="quadrature and NUFFT"),
