@@ -71,7 +71,7 @@ class Job:
         index: Index of the row in the store.
         row: Row of the plan.
         settings: Settings of all fields.
-        distance_target: Accuracy that the field is computed for, if the study asks for one.
+        distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
         reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
     """
@@ -133,7 +133,7 @@ class Job:
         return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE), transform.dtype)
 
     def stored_record(self) -> Record | None:
-        """Return the completion record of the field if it is there: Dask repeats tasks whose worker was lost."""
+        """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
         record = self.store.read_record(self.index)
         return record if record is not None and record.completes(self.row.key) else None
 
@@ -163,7 +163,7 @@ class StoredBlocks:
 
 
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
-    """Compute and store the whole field of a mesh, then its completion record, unless that is there.
+    """Compute and store the whole field of a mesh, then its completion record, unless that exists.
 
     A mesh that cannot be loaded or transformed does not raise: the reason goes into its record, so that one bad mesh
     stops nothing else.
@@ -185,7 +185,7 @@ def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks | Record:
 
 
 def compute_octaves(job: Job) -> StoredBlocks | Record:
-    """Compute and store a mesh's values in octaves, unless its completion record is there; then return that.
+    """Compute and store a mesh's values in octaves, unless its completion record exists; then return that.
 
     See `compute_mesh` for failures.
     """
@@ -193,7 +193,7 @@ def compute_octaves(job: Job) -> StoredBlocks | Record:
 
 
 def finish_mesh(job: Job, parts: Sequence[StoredBlocks | Record]) -> Record:
-    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it is there."""
+    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it exists."""
     record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
     return record or _finished(job, [part for part in parts if isinstance(part, StoredBlocks)])
 

@@ -39,7 +39,7 @@ _HIGHEST_FREQUENCY = 1e4
 _CLEARANCE = 1.001
 # Surfaces may be as small as a point, but the kernel is a unit of length wide.
 _LEAST_WIDTH = 0.01
-# An accuracy called reachable must hold when it is asked for, on a pilot that differs a little.
+# An accuracy called reachable must hold when it is requested, on a pilot that differs a little.
 _REACHABLE_MARGIN = 1.5
 _STEP = 1.04
 # Factor of the M of a lattice with octaves whose images are too large.
@@ -51,7 +51,7 @@ _VANISHED = 120.0
 def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
     """Return the lattice for two surfaces close to each other, before anything else is known of them.
 
-    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that asks for
+    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that requires
     a large lattice, the result is a small pilot lattice.
 
     Args:
@@ -91,7 +91,7 @@ def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
 
 
 def lattice_of(highest: float, period: float, most: int) -> Lattice:
-    """Return the lattice of a period 1/h that reaches to a frequency, or as far as M allows.
+    """Return the lattice of a period 1/h that reaches to a frequency, or to the one that M allows.
 
     Args:
         highest: Frequency to reach, in cycles per unit length. A good M may reach beyond it.

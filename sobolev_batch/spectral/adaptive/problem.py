@@ -34,7 +34,7 @@ _ROUNDING = 1e-13
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 _OFF_CENTER = 1e-3
 _PAIR = 2
-# An accuracy called reachable must hold when it is asked for.
+# An accuracy called reachable must hold when it is requested.
 _REACHABLE_MARGIN = 1.3
 
 
@@ -187,7 +187,7 @@ def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
 
 
 def _without_shared_triangles(*meshes: Mesh) -> Sequence[Mesh | None]:
-    """Return two meshes without the triangles that both have; None for one of which nothing remains."""
+    """Return two meshes without the triangles that both have; None for one without any others."""
     shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
     if not shared[0].any():
         return meshes

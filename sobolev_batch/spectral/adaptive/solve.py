@@ -1,4 +1,4 @@
-"""Norms and distances to an accuracy: predict settings, compute, check the result, tighten where it falls short."""
+"""Norms and distances to an accuracy: predict settings, compute, check the result, tighten where it misses it."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _largest_share(solution: Solution) -> float:
 
 
 def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
-    """Return what octaves reach that aim at less than a problem asks for.
+    """Return what octaves reach that aim at less than a problem requires.
 
     With the same number of samples they come nearer than octaves that aim too high: these stop far below the
     frequencies that matter.
@@ -248,7 +248,7 @@ def _with_hidden_part(problem: Problem, solution: Solution) -> Solution:
     """Return a solution on a lattice with the error by what lies beyond it, where close points show more than its law.
 
     The law extrapolates, and sees no period that begins beyond the lattice. All that lies there follows from close
-    points, of which some are drawn, and is less than the areas permit.
+    points, drawn at random, and is less than the areas permit.
     """
     found, lattice = solution.estimate, cast(Lattice, solution.lattice)
     most = np.array([area_bound(problem.area, order, lattice.xi_max) for order in problem.orders])

@@ -148,7 +148,7 @@ class _Search:
         return _frequency_of(self.problem, beyond * self.threshold.lower)
 
     def _on_lattice(self, lattice: Lattice, rtol: float) -> tuple[float, Interval]:
-        """Return the distance as far as a lattice shows it, and bounds on all of it."""
+        """Return the part of the distance on a lattice, and bounds on all of it."""
         problem = self.problem
         accuracy = replace(problem.accuracy, rtol=rtol)
         target = error_target(np.array([self.threshold.lower]), problem.orders, accuracy, problem.area)
@@ -175,7 +175,7 @@ class _Search:
         return bounds.upper <= self.threshold.lower or bounds.lower > self.threshold.upper
 
     def _is_hopeless(self, value: float, bounds: Interval) -> bool:
-        """Tell whether a closer look at the distance is in vain: it may be the threshold, as far as that is known."""
+        """Tell whether a closer look at the distance is in vain: it may equal the threshold, within its errors."""
         narrowest = _NARROWEST * self.threshold.lower
         widths = bounds.upper - bounds.lower, self.threshold.upper - self.threshold.lower
         return self._margin(value) < _NARROWEST and (widths[0] < narrowest or widths[1] > narrowest)

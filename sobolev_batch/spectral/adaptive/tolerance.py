@@ -1,4 +1,4 @@
-"""Accuracy that a user asks for, and its division among the sources of error."""
+"""Accuracy that a user requests, and its division among the sources of error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NEXT_TO_EQUAL = 1e-5
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Relative accuracy of distances, asked for in place of a lattice and settings.
+    """Relative accuracy of distances, requested in place of a lattice and settings.
 
     Args:
         rtol: Largest error of a distance, relative to it.

@@ -25,7 +25,7 @@ Reals = NDArray[np.float64]
 # 0.5 to 8 times, the aliasing 0.25 to 2 times the true loss.
 TRUNCATION_CAUTION = 2.5
 ALIASING_CAUTION = 5.0
-# With so many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
+# With this many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
 _TROUGH_PERIODS = 3.0
 # Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them. Where it is
 # measured beyond xi_max, they are octaves as well.
@@ -226,7 +226,7 @@ def area_bound(area: float, order: float, highest: float) -> float:
     """Return what no squared norm beyond a frequency exceeds, whatever the surfaces are.
 
     The energy on |ξ| = r is twice the area on average, and twice that where layers reinforce each other. If surfaces
-    repeat, it comes in pulses at the odd multiples of a frequency, of which the first may lie just beyond. Besides, no
+    repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just beyond. Besides, no
     value of the transform is larger than the area.
 
     Args:

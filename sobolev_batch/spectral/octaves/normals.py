@@ -20,7 +20,7 @@ _DIRECTION_PARTS = 500
 _KEYS_PER_AXIS = 2 * _DIRECTION_PARTS + 1
 # Triangles whose normals are taken at a time.
 _BATCH = 1 << 14
-# A direction counts if the faces along it hold this fraction of the area; so many directions at most.
+# A direction counts if the faces along it hold this fraction of the area; this many directions at most.
 _LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
 # κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
 _SPOT_FRACTION = 0.5

@@ -32,7 +32,7 @@ class SamplePart:
     Attributes:
         samples: Place of the samples in the quadrature.
         starts: First sample of each of the eight sublattices, counted from the part's first, int64 (8,). Sums over
-            sublattices are nearly independent. None for drawn samples, each of which is independent of the others.
+            sublattices are nearly independent. None for drawn samples, which are all independent.
         places: Indices of the samples in the lattice's block, flattened, int64 (n,); empty for drawn ones.
     """
 

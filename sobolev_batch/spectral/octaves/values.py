@@ -32,8 +32,8 @@ Complexes = NDArray[np.complex128]
 # Settings of the transform of a surface on a lattice.
 Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 
-# Values on a lattice are checked at so many samples: for small meshes, for huge ones, and in between as many as make so
-# many pairs of a triangle (or point) and a frequency.
+# Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
+# number of pairs of a triangle (or point) and a frequency.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
 
 
