@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sobolev_batch import InputError, Mesh, Sphere, distance, icosphere, norm
+from sobolev_batch import AccuracyError, InputError, Mesh, Sphere, distance, icosphere, norm
+from sobolev_batch.spectral.adaptive import octaves
+from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
 from tests.support.rectangles import Rectangles
 
 BOX = Rectangles.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -103,3 +106,22 @@ def test_real_distances_at_a_common_scale() -> None:
     large = [Mesh(50 * icosphere(level).vertices, icosphere(level).triangles) for level in (1, 2)]
     dataset = distance(large[0], large[1], -1.0, rtol=0.1)
     assert dataset["within"].item()
+
+
+@pytest.mark.slow
+def test_a_remainder_that_inner_ones_contradict_is_no_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = PAIRS["moved box"]
+    cutoffs: list[float] = []
+
+    def misjudged(surfaces: Any, signs: Any, cutoff: float, *others: Any, **options: Any) -> Remainder:
+        """Return half of what lies beyond all but the first cutoff, without any error."""
+        cutoffs.append(cutoff)
+        beyond = remainder(surfaces, signs, cutoff, *others, **options)
+        (energy,) = beyond.energies
+        energy, error = (energy, 0.1 * energy) if cutoff == cutoffs[0] else (energy / 2, 0.0)
+        # No more points are drawn.
+        return replace(beyond, energies=(energy,), errors=(error,), points=10**9)
+
+    monkeypatch.setattr(octaves, "remainder", misjudged)
+    with pytest.raises(AccuracyError, match="out of reach"):
+        distance(a.mesh(), b.mesh(), -1.0, rtol=0.01)
