@@ -34,7 +34,7 @@ Reals = NDArray[np.float64]
 _ROUNDS, _MOST_OCTAVES = 6, 24
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
 _REMAINDER_FRACTION = 0.4
-# How far off, relatively, other pairs may be beyond the octaves of a pilot.
+# How far off, relatively, other pairs may be beyond the octaves of a pilot: chosen, not derived.
 _OF_OTHERS = 1 / 8
 # Fraction of the permitted variance that may come from octaves that are not refined.
 _LEFT_FRACTION = 0.5
@@ -127,7 +127,7 @@ class MeasuredOctave:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is known of a norm or a distance.
+    """A norm or a distance in the course of its computation.
 
     Attributes:
         problem: Surfaces, orders and accuracy.
