@@ -23,6 +23,16 @@ def is_whole_number(value: object) -> TypeGuard[int]:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
+def check_seed(seed: object) -> None:
+    """Refuse anything but a whole number from 0 on.
+
+    Raises:
+        InputError: It is none.
+    """
+    if not is_whole_number(seed) or seed < 0:
+        raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
+
+
 def byte_count(memory: float | str) -> int:
     """Return a size of memory in bytes.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import check_seed, is_whole_number
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
@@ -50,7 +50,7 @@ def proximity(a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, seed: i
         seed: Seed of the random points; the same seed gives the same numbers.
 
     Raises:
-        InputError: VTK is not installed (the extra ``vtk``), or ``points`` is out of range; or see `as_mesh`.
+        InputError: VTK is not installed (the extra ``vtk``); ``points`` or ``seed`` is out of range; or see `as_mesh`.
 
     Source: P. Cignoni, C. Rocchini, R. Scopigno, "Metro: measuring error on simplified surfaces" (1998),
     doi:10.1111/1467-8659.00236, for distances of random points; Chamfer distance as H. Barrow et al., "Parametric
@@ -65,6 +65,7 @@ def proximity(a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, seed: i
     """
     if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
+    check_seed(seed)
     try:
         import pyvista
         from vtkmodules.vtkFiltersModeling import vtkHausdorffDistancePointSetFilter

@@ -8,10 +8,10 @@ from typing import Literal
 
 from sobolev_batch.errors import SobolevBatchError, one_line
 from sobolev_batch.machine import available, available_cores
+from sobolev_batch.parameters import check_seed
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.metrics.norms import check_seed
 from sobolev_batch.spectral.shells import single_order
 from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.similarity import Similarity

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -90,3 +92,9 @@ def test_a_mesh_is_at_no_distance_from_itself() -> None:
 def test_points_out_of_range(points: int) -> None:
     with pytest.raises(sb.InputError, match="points must be an integer"):
         proximity(square(1.0), square(2.0), points=points)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "1", True, None])
+def test_seeds_are_whole_numbers(seed: Any) -> None:
+    with pytest.raises(sb.InputError, match="seed must be a whole number from 0 on"):
+        proximity(square(1.0), square(2.0), seed=seed)

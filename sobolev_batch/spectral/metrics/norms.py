@@ -15,7 +15,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available, available_cores
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import check_seed
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
@@ -237,16 +237,6 @@ def accuracy_of(rtol: float, memory: float | str | None, *, best_effort: bool = 
     """Return the accuracy that parameters of the public functions ask for."""
     accuracy = Accuracy(rtol, best_effort=best_effort)
     return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
-
-
-def check_seed(seed: object) -> None:
-    """Refuse anything but a whole number from 0 on.
-
-    Raises:
-        InputError: It is none.
-    """
-    if not is_whole_number(seed) or seed < 0:
-        raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
 
 
 def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool = False) -> None:

@@ -12,12 +12,13 @@ import xarray as xr
 
 from sobolev_batch.errors import LatticeError, MeshError
 from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import check_seed
 from sobolev_batch.spectral.adaptive.frequencies import Frequencies
 from sobolev_batch.spectral.adaptive.problem import support_of
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import labelled
-from sobolev_batch.spectral.metrics.norms import accuracy_of, check_seed, distance, to_accuracy
+from sobolev_batch.spectral.metrics.norms import accuracy_of, distance, to_accuracy
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution
 from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh

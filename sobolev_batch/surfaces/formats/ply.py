@@ -5,9 +5,6 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from tempfile import TemporaryFile
 from typing import IO
 
@@ -40,10 +37,19 @@ def parse_ply(data: bytes) -> Raw:
     Raises:
         MeshError: There are no vertices or faces, or the counts do not fit the contents.
     """
-    header = _checked_header(data)
-    with _opened(data, header) as source:
-        del data
-        ply = _read_checked(source, header)
+    counts, is_text = _checked_counts(data)
+    if is_text:
+        ply = _parsed(data)
+    else:
+        # A real file: the library reads other streams row by row.
+        with TemporaryFile() as stream:
+            stream.write(data)
+            del data
+            ply = _parsed(stream)
+            read = stream.tell()
+            unread = stream.seek(0, os.SEEK_END) - read
+        if unread:
+            raise MeshError(f"the PLY header announces {counts}, but {unread} bytes more follow")
     vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
     return vertices, _triangles(ply["face"])
 
@@ -61,11 +67,45 @@ def write_ply(mesh: Mesh) -> bytes:
     return file.getvalue()
 
 
-def _checked_header(data: bytes) -> _Header:
-    """Return the header of a file whose contents can have the counts that it announces."""
+def announced_sizes(header: bytes) -> tuple[int, int, bool]:
+    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text.
+
+    Raises:
+        MeshError: A count is no integer.
+    """
+    counts, _, is_text = _announced(header.partition(_END)[0])
+    return counts.get("vertex", 0), counts.get("face", 0), is_text
+
+
+def _announced(header: bytes) -> tuple[dict[str, int], int, bool]:
+    """Return the number of entries of each element, their smallest possible length, and whether they are text.
+
+    The library complains of malformed lines.
+    """
+    counts: dict[str, int] = {}
+    row_bytes: dict[str, int] = {}
+    element, is_text = "", False
+    for line in header.splitlines():
+        match line.split():
+            case [b"format", kind, *_]:
+                is_text = kind == b"ascii"
+            case [b"element", name, count, *_]:
+                element = name.decode("ascii", errors="replace")
+                if not count.isdigit() or len(count) > _MOST_DIGITS:
+                    raise MeshError(f"the PLY header announces {count[:40]!r} entries of {element[:40]!r}")
+                counts[element], row_bytes[element] = int(count), 0
+            case [b"property", b"list", kind, _, _] | [b"property", kind, _] if element:
+                row_bytes[element] += _TEXT_BYTES if is_text else _TYPE_BYTES.get(kind, 1)
+    # The last number of a text need not be followed by anything.
+    least_bytes = sum(count * max(row_bytes[name], 1) for name, count in counts.items()) - is_text
+    return counts, least_bytes, is_text
+
+
+def _checked_counts(data: bytes) -> tuple[dict[str, int], bool]:
+    """Return the counts that a header announces, which its contents can have, and whether they are text."""
     start = data.find(_END, 0, HEADER_BYTES)
-    header, length = _Header.parsed(data[: max(start, 0)]), len(data) - start - len(_END)
-    counts = header.counts
+    length = len(data) - start - len(_END)
+    counts, least_bytes, is_text = _announced(data[: max(start, 0)])
     if counts.get("vertex") and not counts.get("face"):
         raise MeshError(
             f"the PLY file has {counts['vertex']} vertices and no faces: it holds points and no surface; make a mesh "
@@ -74,15 +114,15 @@ def _checked_header(data: bytes) -> _Header:
     if start < 0 or not {"vertex", "face"} <= set(counts):
         raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
     # The library would reserve memory for any count.
-    if header.least_bytes > length:
+    if least_bytes > length:
         raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
-    if header.text and data.find(b"_", start + len(_END)) >= 0:
+    if is_text and data.find(b"_", start + len(_END)) >= 0:
         raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
     entries = sum(counts.values())
-    lines = _line_count(data, start) if header.text else entries
+    lines = _line_count(data, start) if is_text else entries
     if lines != entries:
         raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
-    return header
+    return counts, is_text
 
 
 def _line_count(data: bytes, start: int) -> int:
@@ -96,77 +136,12 @@ def _line_count(data: bytes, start: int) -> int:
     return count - 1
 
 
-@contextmanager
-def _opened(data: bytes, header: _Header) -> Iterator[bytes | IO[bytes]]:
-    """Yield a text as it is, and a real file of binary data: the library reads other streams row by row."""
-    if header.text:
-        yield data
-        return
-    with TemporaryFile() as stream:
-        stream.write(data)
-        del data
-        yield stream
-
-
-def _read_checked(source: bytes | IO[bytes], header: _Header) -> PlyData:
-    """Return a PLY file with no more data than its header announces."""
+def _parsed(source: bytes | IO[bytes]) -> PlyData:
     try:
         # Reads all faces at once; the library refuses where one of them is no triangle.
-        ply = _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
+        return _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
     except (PlyElementParseError, KeyError):
-        ply = _read(source, {})
-    # The lines of a text were counted before.
-    read = 0 if isinstance(source, bytes) else source.tell()
-    unread = 0 if isinstance(source, bytes) else source.seek(0, os.SEEK_END) - read
-    if unread:
-        raise MeshError(f"the PLY header announces {header.counts}, but {unread} bytes more follow")
-    return ply
-
-
-def announced_sizes(header: bytes) -> tuple[int, int, bool]:
-    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text.
-
-    Raises:
-        MeshError: A count is no integer.
-    """
-    parsed = _Header.parsed(header.partition(_END)[0])
-    return parsed.counts.get("vertex", 0), parsed.counts.get("face", 0), parsed.text
-
-
-@dataclass(frozen=True)
-class _Header:
-    """The announcements of a header.
-
-    Attributes:
-        counts: Number of entries of each element.
-        least_bytes: Smallest possible length of these entries.
-        text: True where they are text.
-    """
-
-    counts: dict[str, int]
-    least_bytes: int
-    text: bool
-
-    @classmethod
-    def parsed(cls, header: bytes) -> _Header:
-        """Return a header from its bytes; the library complains of malformed lines."""
-        counts: dict[str, int] = {}
-        row_bytes: dict[str, int] = {}
-        element, text = "", False
-        for line in header.splitlines():
-            match line.split():
-                case [b"format", kind, *_]:
-                    text = kind == b"ascii"
-                case [b"element", name, count, *_]:
-                    element = name.decode("ascii", errors="replace")
-                    if not count.isdigit() or len(count) > _MOST_DIGITS:
-                        raise MeshError(f"the PLY header announces {count[:40]!r} entries of {element[:40]!r}")
-                    counts[element], row_bytes[element] = int(count), 0
-                case [b"property", b"list", kind, _, _] | [b"property", kind, _] if element:
-                    row_bytes[element] += _TEXT_BYTES if text else _TYPE_BYTES.get(kind, 1)
-        # The last number of a text need not be followed by anything.
-        least = sum(count * max(row_bytes[name], 1) for name, count in counts.items()) - text
-        return cls(counts, least, text)
+        return _read(source, {})
 
 
 def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:

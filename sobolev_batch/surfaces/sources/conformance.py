@@ -57,181 +57,145 @@ def check_source(source: Source, folder: str | Path = ".", *, broken: Iterable[S
         ...
     AssertionError: Balls breaks 2 promises of a source:
     - members() returns the names 'ball', 'ball', which are the same but for case and accents; make them unique
-    - the members 'ball' and 'ball' have equal fingerprints and different surfaces; add what tells them apart
+    - the member 'ball' has the fingerprint of 'ball' and another surface; add what tells them apart
     """
     folder = Path(folder).absolute()
-    report = _Report()
-    _check_parameters(source, report)
-    _check_members(source, folder, report)
+    problems = [*_parameter_problems(source), *_attempted("members()", _member_problems(source, folder))]
     for broken_source in broken:
-        _check_broken(broken_source, folder, report)
-    if report.problems:
-        count = f"{len(report.problems)} promise{'s' if len(report.problems) > 1 else ''}"
-        lines = "".join(f"\n- {problem}" for problem in report.problems)
+        problems += _attempted(f"the broken source {quoted(broken_source)}", _broken_problems(broken_source, folder))
+    if problems:
+        count = f"{len(problems)} promise{'s' if len(problems) > 1 else ''}"
+        lines = "".join(f"\n- {problem}" for problem in problems)
         raise AssertionError(f"{type(source).__qualname__} breaks {count} of a source:{lines}")
 
 
-class _Report:
-    """The promises that a source breaks."""
-
-    def __init__(self) -> None:
-        self.problems: list[str] = []
-
-    def require(self, kept: bool, problem: str) -> None:
-        """Note a problem unless the promise is kept."""
-        if not kept:
-            self.problems.append(problem)
-
-    @contextlib.contextmanager
-    def attempt(self, action: str) -> Iterator[None]:
-        """Note any error as a problem."""
-        try:
-            yield
-        except Exception as error:
-            self.problems.append(f"{action} raises {type(error).__name__}: {error}")
+def _attempted(action: str, problems: Iterable[str]) -> Iterator[str]:
+    """Yield problems; any error in finding them is one too."""
+    try:
+        yield from problems
+    except Exception as error:
+        yield f"{action} raises {type(error).__name__}: {error}"
 
 
-def _check_parameters(source: Source, report: _Report) -> None:
+def _parameter_problems(source: Source) -> Iterator[str]:
     try:
         type(source).model_validate({_UNKNOWN_KEY: 1})
         errors: list[str] = []
     except ValidationError as error:
         errors = [item["type"] for item in error.errors()]
-    report.require("extra_forbidden" in errors, "it takes unknown keys; keep extra='forbid' in its model_config")
-    report.require(bool(source.model_config.get("frozen")), "it can be changed; keep frozen=True in its model_config")
-    with report.attempt("model_dump_json()"):
+    if "extra_forbidden" not in errors:
+        yield "it takes unknown keys; keep extra='forbid' in its model_config"
+    if not source.model_config.get("frozen"):
+        yield "it can be changed; keep frozen=True in its model_config"
+    try:
         source.model_dump_json()
-    report.require(isinstance(source.libraries, tuple), "libraries is no tuple of names of distributions")
+    except Exception as error:
+        yield f"model_dump_json() raises {type(error).__name__}: {error}"
+    if not isinstance(source.libraries, tuple):
+        yield "libraries is no tuple of names of distributions"
     for library in source.libraries:
         try:
             version(library)
         except (PackageNotFoundError, ValueError):
-            report.problems.append(f"libraries has {library!r}, which is not installed; correct the name or install it")
+            yield f"libraries has {library!r}, which is not installed; correct the name or install it"
 
 
-def _check_members(source: Source, folder: Path, report: _Report) -> None:
-    members, again = _listed(source, folder, report), _listed(source, folder, report)
-    if not members or not again:
-        return
+def _member_problems(source: Source, folder: Path) -> Iterator[str]:
+    members, again = _listed(source, folder), _listed(source, folder)
     names, names_again = ([(member.name, member.level) for member in listing] for listing in (members, again))
-    report.require(names == names_again, f"members() lists {quoted(names)} first and {quoted(names_again)} next")
+    if names != names_again:
+        yield f"members() lists {quoted(names)} first and {quoted(names_again)} next"
     for group in duplicate_names(member.name for member in members):
-        report.problems.append(
+        yield (
             f"members() returns the names {', '.join(map(quoted, group[:5]))}, which are the same but for case and "
             "accents; make them unique"
         )
-    first_of: dict[str, tuple[Member, object]] = {}
+    first_of: dict[str, tuple[str, object]] = {}
     for member, twin in zip(members, again, strict=False):
-        with report.attempt(f"the member {quoted(member.name)}"):
-            _check_values(member, report)
-            identity = _checked_identity(member, report)
-            digest = member.fingerprint_digest()
-            report.require(
-                twin.fingerprint_digest() == digest,
-                f"the member {quoted(member.name)} has another fingerprint when it is listed again",
-            )
-            first, first_identity = first_of.setdefault(digest, (member, identity))
-            report.require(
-                identity == first_identity,
-                f"the members {quoted(first.name)} and {quoted(member.name)} have equal fingerprints and different "
-                "surfaces; add what tells them apart",
-            )
+        label = f"the member {quoted(member.name)}"
+        yield from _attempted(label, (f"{label} {problem}" for problem in _own_problems(member, twin, first_of)))
 
 
-def _listed(source: Source, folder: Path, report: _Report) -> tuple[Member, ...]:
+def _listed(source: Source, folder: Path) -> tuple[Member, ...]:
     """Return the members, listed where no mesh can be made."""
-    members: object = ()
     with (
-        report.attempt("members()"),
         mock.patch.object(Mesh, "__init__", _refuse_mesh),
         mock.patch.object(Mesh, "from_checked", _refuse_mesh),
     ):
-        members = source.members(folder)
-        if isinstance(members, tuple) and members and all(isinstance(member, Member) for member in members):
-            return members
-        raise TypeError(f"it returns {quoted(members)}, expected a tuple of at least one Member")
-    return ()
+        members: object = source.members(folder)
+    if isinstance(members, tuple) and members and all(isinstance(member, Member) for member in members):
+        return members
+    raise TypeError(f"it returns {quoted(members)}, expected a tuple of at least one Member")
 
 
 def _refuse_mesh(*_: object, **__: object) -> NoReturn:
     raise RuntimeError("it makes a mesh; leave that to Member.load")
 
 
-def _check_values(member: Member, report: _Report) -> None:
-    label = f"the member {quoted(member.name)}"
+def _own_problems(member: Member, twin: Member, first_of: dict[str, tuple[str, object]]) -> Iterator[str]:
+    """Yield what is wrong with a member.
+
+    Args:
+        member: Member to look at.
+        twin: The same, as its source lists it a second time.
+        first_of: Name and identity of the first member with each fingerprint, to which this one is added.
+    """
     problem = label_problem(member.name)
-    report.require(problem is None, f"{label} has a name that is no label: {problem}")
-    report.require(
-        type(member.level) is int and member.level >= -1,
-        f"{label} has the level {member.level!r}, expected an integer from -1",
-    )
-    report.require(
-        member.time is None or (isinstance(member.time, int | float) and math.isfinite(member.time)),
-        f"{label} has the time {member.time!r}, expected a number or None",
-    )
-
-
-def _checked_identity(member: Member, report: _Report) -> object:
-    """Return values that tell the surface of a member from others."""
-    label = f"the member {quoted(member.name)}"
-    size = member.expected_size()
-    report.require(isinstance(size, ExpectedSize), f"{label} predicts {quoted(size)}, expected an ExpectedSize")
-    pickled = pickle.dumps(member)
-    report.require(
-        len(pickled) <= _MOST_MEMBER_BYTES,
-        f"{label} takes {len(pickled)} bytes when it is pickled, {_MOST_MEMBER_BYTES} are allowed; make its surface "
-        "in load()",
-    )
-    surface = member.load()
-    if not isinstance(surface, SURFACE_KINDS):
-        report.problems.append(
-            f"{label} makes a {type(surface).__name__}, expected a Mesh, Sphere, Ellipsoid, Torus or "
-            "ParametrisedSurface"
+    if problem is not None:
+        yield f"has a name that is no label: {problem}"
+    if type(member.level) is not int or member.level < -1:
+        yield f"has the level {member.level!r}, expected an integer from -1"
+    if not (member.time is None or (isinstance(member.time, int | float) and math.isfinite(member.time))):
+        yield f"has the time {member.time!r}, expected a number or None"
+    digest, pickled = member.fingerprint_digest(), pickle.dumps(member)
+    if twin.fingerprint_digest() != digest:
+        yield "has another fingerprint when it is listed again"
+    if len(pickled) > _MOST_MEMBER_BYTES:
+        yield (
+            f"takes {len(pickled)} bytes when it is pickled, {_MOST_MEMBER_BYTES} are allowed; make its surface in "
+            "load()"
         )
-        return None
+    size, surface = member.expected_size(), member.load()
+    if not isinstance(size, ExpectedSize):
+        yield f"predicts {quoted(size)}, expected an ExpectedSize"
+    if not isinstance(surface, SURFACE_KINDS):
+        yield (f"makes a {type(surface).__name__}, expected a Mesh, Sphere, Ellipsoid, Torus or ParametrisedSurface")
+        return
     if isinstance(surface, Mesh):
-        _check_size(size, surface, label, report)
+        count, mesh_bytes = len(surface.triangles), surface.vertices.nbytes + surface.triangles.nbytes
+        if count >= _SMALL_TRIANGLES and size.triangles * _FACTOR < count:
+            yield f"predicts {size.triangles} triangles and makes {count}; predict them in expected_size()"
+        if count >= _SMALL_TRIANGLES and size.projected_bytes < mesh_bytes:
+            yield (
+                f"predicts {size.projected_bytes:.0f} bytes for making a mesh of {mesh_bytes}; predict the peak of "
+                "its memory in expected_size()"
+            )
     identity = _identity(surface)
+    first, first_identity = first_of.setdefault(digest, (member.name, identity))
+    if identity != first_identity:
+        yield f"has the fingerprint of {quoted(first)} and another surface; add what tells them apart"
     # A worker may run in any folder.
     with contextlib.chdir(tempfile.gettempdir()):
         copy = pickle.loads(pickled)  # noqa: S301 -- the bytes were made above
-        report.require(
-            copy.fingerprint_digest() == member.fingerprint_digest() and _identity(copy.load()) == identity,
-            f"{label} makes another surface or fingerprint after pickling, in another working directory",
-        )
-    return identity
-
-
-def _check_size(size: ExpectedSize, mesh: Mesh, label: str, report: _Report) -> None:
-    count = len(mesh.triangles)
-    mesh_bytes = mesh.vertices.nbytes + mesh.triangles.nbytes
-    report.require(
-        count < _SMALL_TRIANGLES or size.triangles * _FACTOR >= count,
-        f"{label} predicts {size.triangles} triangles and makes {count}; predict them in expected_size()",
-    )
-    report.require(
-        count < _SMALL_TRIANGLES or size.projected_bytes >= mesh_bytes,
-        f"{label} predicts {size.projected_bytes:.0f} bytes for making a mesh of {mesh_bytes}; predict the peak of "
-        "its memory in expected_size()",
-    )
+        if copy.fingerprint_digest() != digest or _identity(copy.load()) != identity:
+            yield "makes another surface or fingerprint after pickling, in another working directory"
 
 
 def _identity(surface: Surface) -> object:
+    """Return values that tell a surface from others."""
     return surface.digest if isinstance(surface, Mesh) else (type(surface), surface.area, surface.extent)
 
 
-def _check_broken(source: Source, folder: Path, report: _Report) -> None:
-    label = f"the broken source {quoted(source)}"
-    with report.attempt(label):
+def _broken_problems(source: Source, folder: Path) -> Iterator[str]:
+    try:
+        members = source.members(folder)
+    except StudyError:
+        return
+    for member in members:
+        with contextlib.suppress(MeshError):
+            member.fingerprint()
         try:
-            members = source.members(folder)
-        except StudyError:
-            return
-        for member in members:
-            with contextlib.suppress(MeshError):
-                member.fingerprint()
-            try:
-                member.load()
-            except MeshError:
-                continue
-            report.problems.append(f"{label} makes the surface {quoted(member.name)}; expected a MeshError")
+            member.load()
+        except MeshError:
+            continue
+        yield f"the broken source {quoted(source)} makes the surface {quoted(member.name)}; expected a MeshError"

@@ -137,7 +137,7 @@ class IcosphereSource(Source):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
         return tuple(
-            _triangulation(level, icosphere, (level,), {"icosphere": level}, 20 << 2 * level, ("trimesh",))
+            _triangulation(level, icosphere, (level,), {"icosphere": level}, 20 << 2 * level)
             for level in sorted(set(self.levels))
         )
 
@@ -161,7 +161,6 @@ class EllipsoidLevelsSource(EllipsoidSource):
                 (shape, level),
                 {"ellipsoid level": level, "ellipsoid": _parameters(shape)},
                 20 << 2 * level,
-                ("trimesh",),
             )
             for level in sorted(set(self.levels))
         )
@@ -206,7 +205,6 @@ def _triangulation(
     arguments: tuple[Any, ...],
     identity: Fingerprint,
     triangles: int,
-    libraries: tuple[str, ...] = (),
 ) -> Member:
     """Return the member of a level, whose number of triangles is known before it is made."""
     return MadeMember(
@@ -215,7 +213,6 @@ def _triangulation(
         make,
         identity,
         arguments,
-        libraries=libraries,
         triangles=triangles,
         triangle_bytes=_SUBDIVISION_BYTES,
     )

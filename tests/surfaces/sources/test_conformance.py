@@ -159,7 +159,7 @@ class NamesNoDistribution(Balls):
         (Balls(fault="names"), "'one', 'One', which are the same but for case"),
         (Balls(fault="line feed"), r"the invisible character U\+000A"),
         (Balls(fault="level"), "the level -2"),
-        (Balls(fault="one fingerprint"), "'one' and 'two' have equal fingerprints and different surfaces"),
+        (Balls(fault="one fingerprint"), "'two' has the fingerprint of 'one' and another surface"),
         (Balls(fault="beyond JSON"), "not JSON serializable"),
         (Balls(fault="unstable"), "'one' has another fingerprint when it is listed again"),
         (Balls(fault="handle"), "TypeError: it holds a handle"),
