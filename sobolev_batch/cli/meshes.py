@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from sobolev_batch.fitting.fit import FitProgress, FitQuality
     from sobolev_batch.surfaces.shapes.mesh import Mesh
-    from sobolev_batch.surfaces.shapes.similarity import Similarity
+    from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
@@ -121,7 +121,7 @@ def compare_command(
     from sobolev_batch.spectral.metrics.yardsticks import yardsticks
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
-    from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
+    from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
     from sobolev_batch.testing.witness import require_place, write_difference
 
     if below is not None:
@@ -286,7 +286,7 @@ def fit_command(
     from sobolev_batch.surfaces.formats.objects import require_writable, write_mesh
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.shapes.mesh import Mesh
-    from sobolev_batch.surfaces.shapes.similarity import Similarity
+    from sobolev_batch.surfaces.shapes.surface import Similarity
 
     require_writable(output)
     if output.exists() and output.samefile(target):

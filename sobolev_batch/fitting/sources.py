@@ -18,8 +18,7 @@ from sobolev_batch.fitting.problem import FitSettings
 from sobolev_batch.fitting.refine import MOST_TRIANGLES, largest_while_refining, refined_mesh
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,

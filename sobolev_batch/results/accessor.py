@@ -14,7 +14,7 @@ from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm, 
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 
 @xr.register_dataarray_accessor("sobolev")  # type: ignore[no-untyped-call]

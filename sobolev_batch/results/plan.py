@@ -27,7 +27,7 @@ from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.transform.transform import field_seconds, slowness
-from sobolev_batch.surfaces.shapes.similarity import Similarity, placement_doubt
+from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
 from sobolev_batch.visible import table_html, visible
 
 # Time to describe and record a surface, and that of each of its triangles.

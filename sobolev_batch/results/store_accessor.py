@@ -31,7 +31,7 @@ from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import squared_moduli
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 
 # The innermost octave has this many spacings of the lattice within it.

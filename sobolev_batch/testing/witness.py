@@ -15,8 +15,7 @@ from sobolev_batch.spectral.errors.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Extent, Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 
 Reals = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES, Proximity, proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
 

@@ -34,8 +34,7 @@ from sobolev_batch.spectral.quality import Quality, TailQuality
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 
 _log = logging.getLogger(__name__)
 

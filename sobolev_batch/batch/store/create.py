@@ -35,7 +35,7 @@ from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 # Largest factor by which a lattice grows at a time.
 _LARGEST_GROWTH = 2.0

@@ -27,7 +27,7 @@ from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, quoted
 from sobolev_batch.surfaces.sources.registry import Source, parse_source, source_type_of
 

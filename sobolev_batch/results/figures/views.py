@@ -23,8 +23,8 @@ from sobolev_batch.results.tables.groups import Families, chosen_families, finis
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.similarity import Similarity
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
+from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.registry import Member
 
 # Labels that a message lists as examples.

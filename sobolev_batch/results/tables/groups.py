@@ -19,7 +19,7 @@ from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Orders, check_orders
-from sobolev_batch.surfaces.shapes.similarity import placement_doubt
+from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted
 
 Reals = NDArray[np.float64]

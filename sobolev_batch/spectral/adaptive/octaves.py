@@ -27,7 +27,7 @@ from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.surfaces.smooth.smooth import Smooth
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 Reals = NDArray[np.float64]
 

@@ -20,8 +20,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SampledOctave
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Surface
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Similarity, Surface
 
 Reals = NDArray[np.float64]
 Samples = tuple[Sample, ...]

@@ -21,8 +21,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.surfaces.shapes.similarity import Similarity
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 
 Method = Literal["identical", "lattice", "octaves"]
 

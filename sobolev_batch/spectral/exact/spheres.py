@@ -13,7 +13,7 @@ from scipy.special import gamma, kv
 
 from sobolev_batch.errors import OrderError
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
-from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 
 # The integrand is smooth where this rule is used, over intervals shorter than their distance from its singularity.
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)

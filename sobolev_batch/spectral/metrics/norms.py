@@ -42,7 +42,7 @@ from sobolev_batch.spectral.metrics.inputs import (
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.surfaces.formats.objects import as_surface
-from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
 # Fraction of an inner product's accuracy for each of the three numbers that it follows from, and the ratio of two norms

@@ -23,7 +23,7 @@ from sobolev_batch.spectral.metrics.datasets import (
 )
 from sobolev_batch.spectral.metrics.inputs import OperandLike, field_of, pair_of, shells_of
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_volumes
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12

@@ -31,10 +31,10 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.quadrature.rules import symmetric_rule
 from sobolev_batch.spectral.quadrature.smooth import resolution_of
 from sobolev_batch.spectral.shells import smooth_step
+from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.smooth import Interval, Smooth
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Interval, Smooth
 
 Reals = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -31,9 +31,9 @@ from sobolev_batch.spectral.quadrature.meshes import (
     weight_masses,
 )
 from sobolev_batch.spectral.quadrature.smooth import Resolution, exact_values, resolution_of
+from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
-from sobolev_batch.surfaces.smooth.smooth import Smooth
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

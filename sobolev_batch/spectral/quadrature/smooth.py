@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends.arrays import cosine_and_sine
+from sobolev_batch.surfaces.shapes.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
-from sobolev_batch.surfaces.smooth.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.surfaces.formats.readers import WRITERS, read_mesh
+from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 
 class WithVertices(Protocol):

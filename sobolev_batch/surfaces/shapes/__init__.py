@@ -1,4 +1,4 @@
-"""Shapes: meshes and spheres, with their extents and similarity transforms.
+"""Shapes: meshes and surfaces by formula, with their extents and similarity transforms.
 
-In: arrays of vertices and triangles, or a radius. Out: frozen surfaces that everything else reads.
+In: arrays of vertices and triangles, or a formula. Out: frozen surfaces that everything else reads.
 """

@@ -15,10 +15,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.sphere import Sphere
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.smooth.closed_forms import MOST_TRIANGLES, Ellipsoid, Torus
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     Fingerprint,

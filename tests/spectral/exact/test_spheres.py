@@ -10,7 +10,7 @@ import pytest
 
 from sobolev_batch import Lattice, OrderError, Sphere, distance, icosphere, norm
 from sobolev_batch.spectral.exact.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
-from sobolev_batch.surfaces.shapes.similarity import Similarity
+from sobolev_batch.surfaces.shapes.surface import Similarity
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,8 @@ from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transfor
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 from tests.support.fake_device import Device
 from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
 from tests.support.smooth_shapes import (

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import InputError, Mesh, Similarity, Sphere, icosphere
-from sobolev_batch.surfaces.shapes.similarity import placement_doubt
+from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, box, meshes, tetrahedron
 
 seeded = settings(derandomize=True, deadline=None, max_examples=60)

@@ -12,8 +12,8 @@ from scipy.integrate import quad
 from scipy.special import ellipe
 
 from sobolev_batch import Ellipsoid, InputError, Mesh, Similarity, Sphere, Torus, icosphere
+from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
-from sobolev_batch.surfaces.smooth.smooth import Smooth
 
 EGG = Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3))
 TORUS = Torus(1.0, 0.4, (0.1, -0.2, 0.3))
