@@ -17,7 +17,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.collection import StudyCollection
-from sobolev_batch.batch.study.lattice_search import Survey
+from sobolev_batch.batch.study.lattice_choice import look_at_extents
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import complete_records
@@ -428,10 +428,9 @@ def _is_stored(row: Row, records: Mapping[str, Record]) -> bool:
 
 def _doubts_of(study_plan: Plan) -> dict[str, str]:
     members = {row.label: (row.family, row.member) for row in study_plan.rows if row.label != study_plan.reference}
-    survey = Survey(members, study_plan.similarity, study_plan.reference_extent)
-    survey.look_at_others()
-    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in survey.extents.items()}
-    return {**survey.set_aside, **{label: doubt for label, doubt in doubts.items() if doubt is not None}}
+    extents, set_aside = look_at_extents(members, study_plan.similarity, study_plan.reference_extent)
+    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in extents.items()}
+    return set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
 
 
 def default_store(study: Study | StudyCollection) -> Location:

@@ -1,12 +1,17 @@
-"""Lattice and dtype of a study's fields: given, or chosen for an accuracy."""
+"""Lattice and dtype of a study's fields: given, or chosen for the accuracy that it requests.
+
+A few surfaces of the study, the pilots, are compared with the reference. The most demanding of these pairs decides.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -14,13 +19,28 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, good_intervals, lattice_of
+from sobolev_batch.errors import AccuracyError, InputError, MeshError, StudyError
+from sobolev_batch.machine import available_cores
+from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, lattice_of
+from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
+from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
+from sobolev_batch.spectral.adaptive.solve import Pilot, coarser_than, permits_octaves, prefers_octaves, run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.errors.budget import NormEstimate, Support
+from sobolev_batch.spectral.errors.probe import estimate
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.octaves.normals import FaceNormals
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
+from sobolev_batch.surfaces.sources.registry import Member
+
+Reals = NDArray[np.float64]
+# Family and member of each surface, by label.
+Members = Mapping[str, tuple[str, Member]]
+
+_log = logging.getLogger(__name__)
 
 # Largest factor by which a lattice grows at a time.
 _LARGEST_GROWTH = 2.0
@@ -30,6 +50,19 @@ _STATISTICAL_PART, _TRUNCATION_PART = 0.4, 0.4
 _LEAST_REFINEMENT, _LARGEST_REFINEMENT = 1.5, 8.0
 # Most samples of a mesh; their values take 160 MB in double precision.
 _MOST_SAMPLES = 10_000_000
+
+# Pilots are the coarsest and the finest member of this many families.
+_MOST_FAMILIES = 6
+# A surface larger than the reference by this factor is in another unit, or another object.
+_FARTHEST = 8.0
+# Memory that a pilot may take to be made, and that all surfaces together may take whose extents are looked at.
+_MOST_BYTES = 1e9
+# Surfaces that are no pilots may reach a little further than those that are.
+_REACH_MARGIN = 1.03
+# Surfaces that are no pilots may need a little more than those that are: the fraction of the accuracy for pilots.
+_PILOT_FRACTION = 0.7
+# So often a best effort leaves out the pairs that cannot have the accuracy, and looks again.
+_MOST_RETRIES = 2
 
 
 @dataclass(frozen=True)
@@ -76,64 +109,70 @@ class LatticeChoice:
         return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"], tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
-        """Return a larger or finer lattice for distances (orders, meshes) that miss an accuracy.
+        """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy.
 
-        Return None if none of them does, if the lattice does not limit them, or if no larger one fits into the memory.
+        That is a larger or finer lattice; with octaves, more samples, one more octave or a finer lattice. Return None
+        if all distances meet the accuracy, if frequencies do not limit them, or if no more of them fit into the memory.
         """
-        if self.tail is not None:
-            return self._with_finer_octaves(self.tail, distances, accuracy)
-        highest, period = self.lattice.xi_max, 1 / self.lattice.spacing
-        short = _short_by_frequencies(distances, accuracy)
-        for k, order in enumerate(orders):
-            if not short[k].any():
-                continue
-            values = distances.values[k][short[k]]
-            tail = float(np.max(distances.truncation[k][short[k]] / values)) / accuracy.truncation_part(order)
-            images = float(np.max(distances.aliasing[k][short[k]] / values)) / accuracy.aliasing_part
-            if tail > 1 and order < -1.5:
-                # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
-                growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)
-                highest = max(highest, self.lattice.xi_max * growth)
-            if images > 1:
-                period = max(period, 1 / self.lattice.spacing + math.log(images) / (2 * math.pi) * 1.1)
-        if (highest, period) == (self.lattice.xi_max, 1 / self.lattice.spacing):
-            return None
-        if 2 * highest * period > accuracy.largest_intervals:
-            return None
-        lattice = lattice_of(highest, period, accuracy.largest_intervals)
-        reason = f"grown from xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}, whose errors were too large"
-        return replace(self, lattice=lattice, reasons=(*self.reasons, reason))
-
-    def _with_finer_octaves(
-        self, tail: TailSampling, distances: NormEstimate, accuracy: Accuracy
-    ) -> LatticeChoice | None:
-        """Return the choice with more samples or octaves, or a finer lattice, for distances that miss an accuracy."""
-        short = _short_by_frequencies(distances, accuracy)
+        # The distance of a copy up to rounding is lost in the errors of the fields themselves.
+        short = ~accuracy.met(distances) & (distances.values > distances.discretisation)
         if not short.any():
             return None
-        values = distances.values[short]
-        parts = (distances.statistical, distances.truncation, distances.aliasing)
-        statistical, truncation, aliasing = (float(np.max(part[short] / values)) / accuracy.rtol for part in parts)
-        factor = 1.0
-        if statistical > _STATISTICAL_PART:
-            factor = min(max((statistical / _STATISTICAL_PART) ** 2, _LEAST_REFINEMENT), _LARGEST_REFINEMENT)
-        more_octaves = int(truncation > _TRUNCATION_PART)
-        if len(tail.octaves) + more_octaves > MOST_OCTAVES:
+        values = np.where(short, distances.values, np.inf)
+        parts = (distances.truncation, distances.aliasing, distances.statistical)
+        truncation, aliasing, statistical = (np.max(part / values, axis=1) for part in parts)
+        if self.tail is None:
+            more = _larger_lattice(self.lattice, truncation, aliasing, orders, accuracy)
+            before = f"xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}"
+        else:
+            more = _finer_octaves(
+                self.lattice, self.tail, truncation.max(), aliasing.max(), statistical.max(), accuracy
+            )
+            before = f"{len(self.tail.octaves)} octaves with {self.tail.size:,} samples"
+        if more is None:
             return None
-        lattice = self.lattice
-        if aliasing * accuracy.rtol > accuracy.aliasing_part:
-            intervals = good_intervals(FINER_LATTICE * lattice.M)
-            if intervals > accuracy.largest_intervals:
-                return None
-            lattice = Lattice(lattice.xi_max, intervals)
-        if factor == 1.0 and not more_octaves and lattice == self.lattice:
-            return None
-        # Another seed than that of the samples before.
-        refined = tail.refined(factor, more_octaves, accuracy.largest_intervals, seed=tail.size)
-        if refined.size > _MOST_SAMPLES:
-            return None
-        reason = f"grown from {len(tail.octaves)} octaves with {tail.size:,} samples, whose errors were too large"
-        return replace(self, lattice=lattice, tail=refined, reasons=(*self.reasons, reason))
+        reason = f"grown from {before}, whose errors were too large"
+        return replace(self, lattice=more[0], tail=more[1], reasons=(*self.reasons, reason))
+
+
+# More frequencies: a lattice, and octaves if there were any; None where more do not help or do not fit.
+_More = tuple[Lattice, TailSampling | None] | None
+
+
+def _larger_lattice(
+    lattice: Lattice, truncation: Reals, aliasing: Reals, orders: Sequence[float], accuracy: Accuracy
+) -> _More:
+    """Return a larger or finer lattice for errors (orders,) relative to distances."""
+    highest, period = lattice.xi_max, 1 / lattice.spacing
+    for order, cut, folded in zip(orders, truncation.tolist(), aliasing.tolist(), strict=True):
+        tail, images = cut / accuracy.truncation_part(order), folded / accuracy.aliasing_part
+        if tail > 1 and order < -1.5:
+            # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
+            growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)
+            highest = max(highest, lattice.xi_max * growth)
+        if images > 1:
+            period = max(period, 1 / lattice.spacing + math.log(images) / (2 * math.pi) * 1.1)
+    is_same = (highest, period) == (lattice.xi_max, 1 / lattice.spacing)
+    if is_same or 2 * highest * period > accuracy.largest_intervals:
+        return None
+    return lattice_of(highest, period, accuracy.largest_intervals), None
+
+
+def _finer_octaves(
+    lattice: Lattice, tail: TailSampling, truncation: float, aliasing: float, statistical: float, accuracy: Accuracy
+) -> _More:
+    """Return a finer lattice and more octaves or samples for errors relative to distances."""
+    factor, chance = 1.0, float(statistical) / accuracy.rtol
+    if chance > _STATISTICAL_PART:
+        factor = min(max((chance / _STATISTICAL_PART) ** 2, _LEAST_REFINEMENT), _LARGEST_REFINEMENT)
+    more_octaves = int(truncation / accuracy.rtol > _TRUNCATION_PART)
+    intervals = good_intervals(FINER_LATTICE * lattice.M) if aliasing > accuracy.aliasing_part else lattice.M
+    is_too_much = intervals > accuracy.largest_intervals or len(tail.octaves) + more_octaves > MOST_OCTAVES
+    if is_too_much or (factor, more_octaves, intervals) == (1.0, 0, lattice.M):
+        return None
+    # Another seed than that of the samples before.
+    refined = tail.refined(factor, more_octaves, accuracy.largest_intervals, seed=tail.size)
+    return (Lattice(lattice.xi_max, intervals), refined) if refined.size <= _MOST_SAMPLES else None
 
 
 def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
@@ -150,9 +189,282 @@ def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, A
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def _short_by_frequencies(distances: NormEstimate, accuracy: Accuracy) -> NDArray[np.bool_]:
-    """Tell which distances miss an accuracy that other frequencies could give them.
+def look_at_extents(
+    members: Members, similarity: Similarity, reference: Extent
+) -> tuple[dict[str, Extent], dict[str, str]]:
+    """Look at the surfaces that are quickly loaded, one after the other, as long as they take little memory together.
 
-    The distance of a copy up to rounding is lost in the errors of the fields themselves.
+    Returns:
+        Extent of each surface in the study's unit, and the reason for each that cannot be compared with a reference of
+        this extent, by label.
     """
-    return np.asarray(~accuracy.met(distances) & (distances.values > distances.discretisation))
+    extents: dict[str, Extent] = {}
+    set_aside: dict[str, str] = {}
+    left = _MOST_BYTES
+    for label, (_, member) in members.items():
+        if not member.is_quickly_loaded:
+            continue
+        left -= member.expected_size().projected_bytes
+        if left < 0:
+            break
+        try:
+            extents[label] = _comparable(member, similarity, reference).extent
+        except InputError as error:
+            set_aside[label] = str(error)
+    return extents, set_aside
+
+
+def choose_pilots(
+    members: Members, similarity: Similarity, reference: Extent
+) -> tuple[dict[str, Surface], dict[str, str]]:
+    """Return the coarsest and the finest surface of each of a few families, in the study's unit, by label.
+
+    Surfaces that cannot be compared with a reference of this extent are set aside; the reasons come second, by label.
+    """
+    families: dict[str, list[str]] = {}
+    for label, (family, _) in members.items():
+        families.setdefault(family, []).append(label)
+
+    def fineness(label: str) -> tuple[int, int]:
+        _, member = members[label]
+        return member.level, 0 if member.level >= 0 else member.expected_size().triangles
+
+    pilots: dict[str, Surface] = {}
+    set_aside: dict[str, str] = {}
+    for labels in list(families.values())[:_MOST_FAMILIES]:
+        labels.sort(key=fineness)
+        for candidates in (labels, labels[::-1]):
+            for label in candidates:
+                member = members[label][1]
+                if label in set_aside or member.expected_size().projected_bytes > _MOST_BYTES:
+                    continue
+                try:
+                    if label not in pilots:
+                        pilots[label] = _comparable(member, similarity, reference)
+                    break
+                except InputError as error:
+                    set_aside[label] = str(error)
+    return pilots, set_aside
+
+
+def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Surface:
+    """Return a surface in the study's unit, unless it reaches much farther than the reference."""
+    surface = similarity.apply(member.load())
+    times = surface.extent.reach / reference.reach
+    if times > _FARTHEST:
+        raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")
+    return surface
+
+
+def choose_lattice(
+    study: Study, similarity: Similarity, reference: Surface, members: Members, basis: str
+) -> LatticeChoice:
+    """Choose lattice, octaves and dtype for the accuracy that a study requests.
+
+    The coarsest and the finest member of each family are compared with the reference on a small lattice. Where one
+    lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
+    reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
+
+    Args:
+        study: Study with an accuracy.
+        similarity: Similarity transform of the study.
+        reference: Reference in the study's unit.
+        members: Other surfaces of the study.
+        basis: Digest from `choice_basis`.
+
+    Raises:
+        AccuracyError: A pilot shows that the accuracy cannot be met within the memory, and it is no best effort.
+        StudyError: No pilot could be made.
+    """
+    accuracy = study.accuracy
+    if accuracy is None:
+        raise ValueError("only a study that requests an accuracy leaves a choice")
+    pilots, set_aside = choose_pilots(members, similarity, reference.extent)
+    others = {label: member for label, member in members.items() if label not in {*pilots, *set_aside}}
+    extents, unlike = look_at_extents(others, similarity, reference.extent)
+    set_aside |= unlike
+    for label, reason in set_aside.items():
+        _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
+    if not pilots:
+        examples = [f"{label}: {reason}" for label, reason in set_aside.items()]
+        raise StudyError(
+            "none of the study's surfaces can serve to choose a lattice"
+            + (f" ({examples[0]})" if examples else ", since all are too large")
+            + "; see what is wrong with them, or give a [lattice] instead of an [accuracy]"
+        )
+    extent = Extent.union([reference.extent, *(pilot.extent for pilot in pilots.values()), *extents.values()])
+    widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
+    problems = {
+        label: Problem(
+            (surface, reference),
+            study.orders,
+            replace(accuracy, best_effort=False),
+            Support(np.array(surface.area + reference.area), widths, reach),
+            label,
+            available_cores(),
+        )
+        for label, surface in pilots.items()
+    }
+    if not accuracy.best_effort:
+        choice, shortfalls = _best(problems, study.dtype)
+        if choice is None or shortfalls:
+            raise _worst(shortfalls)
+        return replace(choice, basis=basis)
+    choice, short = _best_for_most(problems, study.dtype)
+    notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
+    if choice is None:
+        # Fewer digits of all of them, from the easiest on.
+        for rtol in coarser_than(accuracy.rtol):
+            aimed, _ = _best_for_most(_with_accuracy(problems, rtol=rtol), study.dtype)
+            if aimed is None:
+                break
+            choice, notes = aimed, [f"all miss rtol {accuracy.rtol:g}; this is for {rtol:g}"]
+    if choice is None:
+        # The largest lattice that a pair may need and the memory permits.
+        largest = _with_accuracy(problems, best_effort=True)
+        choice = _one_lattice(largest, {label: run_pilot(problem) for label, problem in largest.items()}, study.dtype)
+    return replace(choice, basis=basis, reasons=(*choice.reasons, *notes))
+
+
+# The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.
+_Problems = Mapping[str, Problem]
+# A choice, if there is one for any pair, and why each pair misses the accuracy that does, by the label of its surface.
+_Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
+
+
+def _worst(shortfalls: Mapping[str, AccuracyError]) -> AccuracyError:
+    """Return why the pair that needs the largest rtol misses its accuracy."""
+    return max(shortfalls.values(), key=lambda shortfall: shortfall.reachable)
+
+
+def _with_accuracy(problems: _Problems, **changes: Any) -> _Problems:
+    return {
+        label: replace(problem, accuracy=replace(problem.accuracy, **changes)) for label, problem in problems.items()
+    }
+
+
+def _best(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
+    """Return the first choice that is enough for all pairs, else the most accurate attainable one."""
+    first = next(iter(problems.values()))
+    lattice = core_lattice(first.support, first.orders, first.accuracy)
+    estimates = {label: estimate(problem.samples(lattice), first.orders) for label, problem in problems.items()}
+    # Near-duplicates have no relative accuracy.
+    distances = {label: values for label, values in estimates.items() if np.all(values > problems[label].rounding)}
+    ways = [partial(_on_one_lattice, problems, dtype)]
+    if distances and permits_octaves(first.accuracy):
+        octaves_first = any(map(prefers_octaves, problems.values()))
+        ways.insert(0 if octaves_first else 1, partial(_in_octaves, problems, dtype, distances))
+    outcomes: list[_Outcome] = []
+    for way in ways:
+        outcomes.append(way())
+        if not outcomes[-1][1]:
+            return outcomes[-1]
+    return min(outcomes, key=lambda outcome: _worst(outcome[1]).reachable)
+
+
+def _best_for_most(problems: _Problems, dtype: ComplexDtype | None) -> tuple[LatticeChoice | None, list[str]]:
+    """Return a choice that is enough for all pairs but some that miss it, and their labels; None if all do."""
+    short: list[str] = []
+    for _ in range(_MOST_RETRIES + 1):
+        choice, shortfalls = _best(problems, dtype)
+        if choice is not None and not shortfalls:
+            return choice, short
+        short += shortfalls
+        problems = {label: problem for label, problem in problems.items() if label not in shortfalls}
+        if not problems:
+            break
+    return None, short
+
+
+def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapping[str, Reals]) -> _Outcome:
+    """Choose a small lattice and the octaves beyond it, from the pairs that are closest to each other.
+
+    Args:
+        problems: All pairs.
+        dtype: Dtype that was requested, if any.
+        distances: Estimated distance of each pair for each order (orders,), near-duplicates left out.
+    """
+    first = next(iter(problems.values()))
+    closest = ESTIMATE_CAUTION * np.min(list(distances.values()), axis=0)
+    demanding = dict.fromkeys(
+        min(distances, key=lambda label: distances[label][order]) for order in range(len(first.orders))
+    )
+    lattices: dict[str, Lattice] = {}
+    samplings: list[list[OctaveSampling]] = []
+    shortfalls: dict[str, AccuracyError] = {}
+    for label in demanding:
+        try:
+            solution = solve_in_octaves(problems[label], 0, _PILOT_FRACTION, for_others=True)
+        except AccuracyError as error:
+            shortfalls[label] = error
+            continue
+        if solution.lattice is not None:
+            lattices[label] = solution.lattice
+        # The values of pilots would fill the memory.
+        samplings.append([octave.sampling for octave in solution.octaves])
+        if solution.shortfall is not None:
+            shortfalls[label] = solution.shortfall
+    if not lattices:
+        return None, shortfalls
+    lattice = max(lattices.values(), key=lambda lattice: lattice.M)
+    surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in problems.values())]
+    tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.from_surfaces(surfaces))
+    target = error_target(closest, first.orders, first.accuracy, first.area)
+    singles = (problem.dtype(lattice, target) == "complex64" for problem in problems.values())
+    reasons = [
+        f"xi_max {lattice.xi_max:.4g}, spacing {lattice.spacing:.4g} for the innermost frequencies: {_reach(first)}"
+    ]
+    if tail.octaves:
+        reasons.append(
+            f"{len(tail.octaves)} octaves up to |xi| {tail.highest_frequency:.4g} for the tail, from the closest of "
+            f"{len(problems)} pilot pairs: {', '.join(lattices)}"
+        )
+    return _choice(lattice, dtype, singles, closest, reasons, first, tail if tail.octaves else None), shortfalls
+
+
+def _on_one_lattice(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
+    """Choose a lattice that reaches far enough for every pair."""
+    pilots: dict[str, Pilot] = {}
+    shortfalls: dict[str, AccuracyError] = {}
+    for label, problem in problems.items():
+        try:
+            pilots[label] = run_pilot(problem)
+        except AccuracyError as error:
+            shortfalls[label] = error
+    return None if shortfalls else _one_lattice(problems, pilots, dtype), shortfalls
+
+
+def _one_lattice(problems: _Problems, pilots: Mapping[str, Pilot], dtype: ComplexDtype | None) -> LatticeChoice:
+    first = next(iter(problems.values()))
+    highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)
+    finest = max(pilots, key=lambda label: 1 / pilots[label].lattice.spacing)
+    xi_max, period = pilots[highest].lattice.xi_max, 1 / pilots[finest].lattice.spacing
+    lattice = lattice_of(xi_max, period, first.accuracy.largest_intervals)
+    closest = np.min([pilot.values for pilot in pilots.values()], axis=0)
+    reasons = (
+        f"xi_max {lattice.xi_max:.4g} for truncation, which {highest} needs most of {len(pilots)} pilot pairs",
+        f"spacing {lattice.spacing:.4g} for aliasing: {_reach(first)}",
+    )
+    return _choice(lattice, dtype, (pilot.single for pilot in pilots.values()), closest, reasons, first, None)
+
+
+def _reach(problem: Problem) -> str:
+    return f"the surfaces reach over {problem.support.widths.max():.4g} units of length"
+
+
+def _choice(
+    lattice: Lattice,
+    dtype: ComplexDtype | None,
+    singles: Iterable[bool],
+    closest: Reals,
+    reasons: Iterable[str],
+    problem: Problem,
+    tail: TailSampling | None,
+) -> LatticeChoice:
+    """Return a choice in the dtype that was requested, or in single precision where that is enough for every pair."""
+    dtype = dtype or ("complex64" if all(singles) else "complex128")
+    distances = ", ".join(
+        f"{value:.2g} at order {order:g}" for value, order in zip(closest.tolist(), problem.orders, strict=True)
+    )
+    reason = f"{dtype} for the smallest distance of a pilot, about {distances}"
+    return LatticeChoice(lattice, dtype, tuple(closest.tolist()), (*reasons, reason), tail=tail)

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.batch.study.lattice_choice import LatticeChoice, choice_basis
-from sobolev_batch.batch.study.lattice_search import Members, choose_lattice
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
 from sobolev_batch.batch.study.schema import FamilyReference
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError

@@ -14,7 +14,7 @@ from distributed import Client
 from sobolev_batch import AccuracyError, Lattice, Sphere, Study, distance, icosphere, open_store, run
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.store.store import stored_choice
-from sobolev_batch.batch.study import lattice_search as search_module
+from sobolev_batch.batch.study import lattice_choice as search_module
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables.convergence import format_table

@@ -10,7 +10,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.lattice_search import Survey
+from sobolev_batch.batch.study.lattice_choice import choose_pilots
 from tests.support.commands import call
 from tests.support.members import members
 
@@ -39,10 +39,10 @@ def study(folder: Path, **accuracy: Any) -> sb.Study:
 
 def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Path) -> None:
     found = {f"f/{member.name}": ("f", member) for member in members({"source": "files", "paths": ["*.off"]}, folder)}
-    survey = Survey(found, sb.Similarity(), sb.Sphere().extent)
-    assert set(survey.pilots()) == {"f/z", "f/y"}
-    assert set(survey.set_aside) == {"f/broken", "f/inches"}
-    assert "its extent is 25.4 times that of the reference" in survey.set_aside["f/inches"]
+    pilots, set_aside = choose_pilots(found, sb.Similarity(), sb.Sphere().extent)
+    assert set(pilots) == {"f/z", "f/y"}
+    assert set(set_aside) == {"f/broken", "f/inches"}
+    assert "its extent is 25.4 times that of the reference" in set_aside["f/inches"]
 
 
 @pytest.mark.slow
