@@ -44,7 +44,7 @@ _SETUP_SECONDS = 0.05
 _OF_DASK = ("dask", "distributed")
 _OF_NUMBERS = (
     *("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "modepy", "zarr", "xarray"),
-    *("fast-simplification", "trimesh", "nibabel", "plyfile"),
+    *("fast-simplification", "trimesh", "plyfile"),
 )
 # Not every study needs these. Processes that have them must have the same.
 _OF_EXTRAS = ("pyacvd", "vtk")

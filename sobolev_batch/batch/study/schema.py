@@ -25,7 +25,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.formats.raw_files import open_regular
+from sobolev_batch.surfaces.formats.parsing import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import name_problem, quoted

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import merge_coincident
-from sobolev_batch.surfaces.formats.raw_files import Raw, read_regular, unpacked_limit
+from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, read_regular, unpacked_limit
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}

@@ -1,27 +1,33 @@
-"""Surfaces of brains: GIFTI files and those of FreeSurfer, parsed by the library nibabel after a check.
+"""Surfaces of brains: GIFTI files and those of FreeSurfer.
 
-The library expands the entities of XML, unpacks data of any size, believes any counts, and only warns of missing
-arrays. Sources: "GIFTI surface data format" 1.0 (2011), https://www.nitrc.org/projects/gifti; FreeSurfer wiki,
-"Surface file format", https://surfer.nmr.mgh.harvard.edu/fswiki/FileFormats.
+They are read here because the library at hand expands the entities of XML, unpacks data of any size, believes any
+counts, and only warns of missing arrays. Sources: "GIFTI surface data format" 1.0 (2011),
+https://www.nitrc.org/projects/gifti; FreeSurfer wiki, "Surface file format",
+https://surfer.nmr.mgh.harvard.edu/fswiki/FileFormats.
 """
 
 from __future__ import annotations
 
 import base64
+import io
 import math
 import re
 import zlib
-from tempfile import NamedTemporaryFile
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.raw_files import Raw, parse_xml, unpacked_limit
+from sobolev_batch.surfaces.formats.parsing import Raw, unpacked_limit, xml_events
 
 _MOST_DIMENSIONS = 6
-# Arrays of a file; the library makes objects of kilobytes for each.
-_MOST_ARRAYS = 10_000
-_CHUNK_BYTES = 1 << 20
+_GIFTI_TYPES = {
+    f"NIFTI_TYPE_{name}": np.dtype(name.lower())
+    for name in ("UINT8", "INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64")
+}
+_POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 # lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; but lh.aparc.annot has values at vertices.
 _NAME = re.compile(r"(?:^|[._-])[lr]h\.[^.].*(?<!\.annot)(?<!\.label)(?<!\.mgh)(?<!\.mgz)$|.\.surf$")
 _TRIANGLES, _QUADS, _OLD_QUADS = b"\xff\xff\xfe", b"\xff\xff\xfd", b"\xff\xff\xff"
@@ -35,102 +41,75 @@ def parse_gifti(data: bytes) -> Raw:
     """Return the vertices and triangles of a GIFTI surface.
 
     Raises:
-        MeshError: The file has not exactly one point set and one triangle array, or its data do not fit
-            their announced sizes.
+        MeshError: The file has not exactly one point set and one triangle array, another number of arrays than
+            announced, entities, or data that do not fit their announced sizes or exceed `unpacked_limit`.
     """
-    from nibabel import GiftiImage
-
-    _XmlCheck(data)
-    image = GiftiImage.from_bytes(data)
-    points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
-    triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
-    if len(points) != 1 or len(triangles) != 1:
+    arrays: dict[str, list[NDArray[Any]]] = {_POINTS: [], _FACES: []}
+    announced, found = None, 0
+    attributes: Mapping[str, str] = {}
+    texts: list[str] | None = None
+    for event, name, values in xml_events(data, "GIFTI"):
+        match event, name:
+            case "start", "GIFTI":
+                announced = values.get("NumberOfDataArrays")
+            case "start", "DataArray":
+                attributes, found = values, found + 1
+            case "start", "Data":
+                # Others hold normals, or values at vertices.
+                texts = [] if attributes.get("Intent") in arrays else None
+            case "text", piece if texts is not None:
+                texts.append(piece)
+            case "end", "Data" if texts is not None:
+                of_kind = arrays[attributes["Intent"]]
+                of_kind.append(_decoded("".join(texts), attributes, found, unpacked_limit(len(data))))
+                texts = None
+                if len(of_kind) > 1:
+                    break
+    else:
+        if announced is not None and int(announced) != found:
+            raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {found}")
+    points, faces = arrays.values()
+    if len(points) != 1 or len(faces) != 1:
         raise MeshError(
-            f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(triangles)}"
+            f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(faces)}"
         )
-    return np.asarray(points[0].data), np.asarray(triangles[0].data)
+    return points[0], faces[0]
 
 
-class _XmlCheck:
-    """One pass over the XML, which refuses what would harm the library and keeps nothing.
-
-    Raises:
-        MeshError: The file has entities, data in another file, odd dimensions, another number of arrays than
-            announced, or packed data that are larger than announced or than `unpacked_limit`.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        self._limit, self._unpacked = unpacked_limit(len(data)), 0
-        self._announced: int | None = None
-        self._arrays = 0
-        self._encoding, self._bytes = "", 0
-        self._texts: list[str] | None = None
-        parse_xml(data, "GIFTI", self._start, self._end, self._text)
-        if self._announced is not None and self._announced != self._arrays:
-            raise MeshError(f"the GIFTI header announces {self._announced} arrays, found {self._arrays}")
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        # The library also takes the text before an inner element as all of the data.
-        self._flush()
-        if name == "GIFTI" and "NumberOfDataArrays" in attributes:
-            self._announced = int(attributes["NumberOfDataArrays"])
-        elif name == "DataArray":
-            self._arrays += 1
-            if self._arrays > _MOST_ARRAYS:
-                raise MeshError(f"the file has more than {_MOST_ARRAYS} arrays; save it with the surface alone")
-            self._encoding = attributes.get("Encoding", "")
-            if attributes.get("ExternalFileName") or "External" in self._encoding:
-                raise MeshError("its data lie in another file; write it with them inside")
-            self._bytes = _array_bytes(attributes)
-        elif name == "Data":
-            self._texts = []
-
-    def _end(self, name: str) -> None:
-        self._flush()
-        if name == "Data":
-            self._texts = None
-
-    def _text(self, text: str) -> None:
-        if self._texts is not None:
-            self._texts.append(text)
-
-    def _flush(self) -> None:
-        if not self._texts:
-            return
-        text = "".join(self._texts)
-        self._texts = []
-        if "GZip" in self._encoding or "GZ" in self._encoding:
-            self._unpack(text)
-        elif self._encoding.upper().endswith("ASCII") and not text.strip():
-            raise MeshError(f"array {self._arrays} of the file is empty")
-
-    def _unpack(self, text: str) -> None:
-        """Count the bytes that data unpack to, a megabyte at a time, without keeping them."""
-        packer, packed, total = zlib.decompressobj(), base64.b64decode(text), 0
-        while packed and not packer.eof:
-            total += len(packer.decompress(packed, _CHUNK_BYTES))
-            packed = packer.unconsumed_tail
-            if total > self._bytes:
-                raise MeshError(
-                    f"array {self._arrays} of the file unpacks to more than the {self._bytes} bytes announced"
-                )
-            if self._unpacked + total > self._limit:
-                raise MeshError(f"its arrays unpack to more than {self._limit} bytes: no mesh file shrinks that far")
-        self._unpacked += total
-
-
-def _array_bytes(attributes: dict[str, str]) -> int:
-    """Return the size that a DataArray announces."""
-    from nibabel.nifti1 import data_type_codes
-
+def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: int) -> NDArray[Any]:
+    """Return the data of a DataArray, which is the file's array of that number, from 1."""
+    encoding = attributes.get("Encoding", "")
+    if attributes.get("ExternalFileName") or "External" in encoding:
+        raise MeshError("its data lie in another file; write it with them inside")
+    dtype = _GIFTI_TYPES.get(kind := attributes.get("DataType", ""))
+    if dtype is None:
+        raise MeshError(f"array {number} of the file is of the type {kind[:40]!r}, expected {', '.join(_GIFTI_TYPES)}")
     count = int(attributes.get("Dimensionality", 0))
     if not 1 <= count <= _MOST_DIMENSIONS:
-        raise MeshError(f"an array of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
-    sizes = [int(attributes[f"Dim{axis}"]) for axis in range(count)]
-    if min(sizes) < 0:
-        raise MeshError(f"an array of the file has a negative dimension: {sizes}")
-    dtype = data_type_codes.dtype[attributes.get("DataType", "NIFTI_TYPE_FLOAT32")]
-    return math.prod(sizes) * int(np.dtype(dtype).itemsize)
+        raise MeshError(f"array {number} of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
+    shape = [int(attributes[f"Dim{axis}"]) for axis in range(count)]
+    if min(shape) < 0:
+        raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
+    size = math.prod(shape) * dtype.itemsize
+    order: Literal["C", "F"] = "F" if attributes.get("ArrayIndexingOrder") == "ColumnMajorOrder" else "C"
+    if encoding == "ASCII":
+        if not text.strip():
+            raise MeshError(f"array {number} of the file is empty")
+        values: NDArray[Any] = np.loadtxt(io.StringIO(text), dtype, comments=None, ndmin=1)
+    else:
+        decoded = base64.b64decode(text)
+        if encoding == "GZipBase64Binary":
+            if size > most_bytes:
+                raise MeshError(f"its arrays unpack to more than {most_bytes} bytes: no mesh file shrinks that far")
+            # One byte more shows whether there are more.
+            decoded = zlib.decompressobj().decompress(decoded, size + 1)
+        elif encoding != "Base64Binary":
+            raise MeshError(f"array {number} of the file has the encoding {encoding[:40]!r}, which GIFTI does not have")
+        if len(decoded) != size:
+            wrong = "more" if len(decoded) > size else "fewer"
+            raise MeshError(f"array {number} of the file unpacks to {wrong} than the {size} bytes announced")
+        values = np.frombuffer(decoded, dtype.newbyteorder(">" if attributes.get("Endian") == "BigEndian" else "<"))
+    return np.asarray(values.reshape(shape, order=order))
 
 
 def is_freesurfer_name(name: str) -> bool:
@@ -150,49 +129,50 @@ def parse_freesurfer(data: bytes) -> Raw:
     """
     match data[:3]:
         case magic if magic == _TRIANGLES:
-            _check_triangles(data)
+            return _triangle_surface(data)
         case magic if magic in (_QUADS, _OLD_QUADS):
-            _check_quads(data, 12 if magic == _QUADS else 6)
+            return _quad_surface(data, is_old=magic == _OLD_QUADS)
         case magic:
             raise MeshError(
                 f"it begins with the bytes {magic.hex(' ')} and is no surface of FreeSurfer's, which begin with "
                 f"{_TRIANGLES.hex(' ')}; give a surface such as lh.pial, or a name with the suffix of its own format"
             )
-    from nibabel.freesurfer import read_geometry
-
-    # The library reads files by their names alone.
-    with NamedTemporaryFile() as file:
-        file.write(data)
-        file.flush()
-        vertices, triangles = read_geometry(file.name)
-    return vertices, triangles
 
 
-def _check_triangles(data: bytes) -> None:
+def _triangle_surface(data: bytes) -> Raw:
     lines = _HEADER_LINES.match(data, len(_TRIANGLES))
     if lines is None or len(data) < lines.end() + 8:
         raise MeshError("the file breaks off before the counts of its vertices and triangles")
-    vertices, triangles = (_integer_at(data, lines.end() + place, 4) for place in (0, 4))
-    end = lines.end() + 8 + 12 * (vertices + triangles)
+    vertices, triangles = np.frombuffer(data, ">i4", 2, lines.end()).tolist()
+    start = lines.end() + 8
+    end = start + 12 * (vertices + triangles)
     if min(vertices, triangles) < 0 or end > len(data):
         raise MeshError(
             f"the header announces {vertices} vertices and {triangles} triangles, but the file has {len(data)} bytes"
         )
     if end < len(data) and not data[end : end + 12].startswith(_VOLUME):
         raise MeshError(f"the file has {len(data) - end} bytes behind its {triangles} triangles")
+    coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)
+    corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
+    return coordinates.reshape(-1, 3), corners.reshape(-1, 3)
 
 
-def _check_quads(data: bytes, vertex_bytes: int) -> None:
-    if len(data) >= 15 and len(data) == 15 + 4 * _integer_at(data, 3, 4) * _integer_at(data, 11, 4):
+def _quad_surface(data: bytes, *, is_old: bool) -> Raw:
+    if len(data) >= 15 and len(data) == 15 + 4 * math.prod(np.frombuffer(data, ">i4", 3, 3)[[0, 2]].tolist()):
         raise MeshError(
             "it holds values at vertices, such as thickness or curvature; give the surface, such as lh.pial"
         )
-    vertices, quads = (_integer_at(data, place, 3, signed=False) for place in (3, 6))
-    if len(data) != 9 + vertex_bytes * vertices + 12 * quads:
+    vertices, quads = (int.from_bytes(data[place : place + 3], "big") for place in (3, 6))
+    start = 9 + (6 if is_old else 12) * vertices
+    if len(data) != start + 12 * quads:
         raise MeshError(
             f"the header announces {vertices} vertices and {quads} quadrilaterals, but the file has {len(data)} bytes"
         )
-
-
-def _integer_at(data: bytes, place: int, size: int, *, signed: bool = True) -> int:
-    return int.from_bytes(data[place : place + size], "big", signed=signed)
+    # The oldest ones count in hundredths.
+    coordinates = np.frombuffer(data, ">i2" if is_old else ">f4", 3 * vertices, 9) / (100.0 if is_old else 1.0)
+    digits = np.frombuffer(data, np.uint8, 12 * quads, start).reshape(-1, 4, 3).astype(np.int64)
+    corners = digits @ [1 << 16, 1 << 8, 1]
+    cut = np.where(
+        (corners[:, 0] % 2 == 0)[:, None, None], corners[:, [[0, 1, 3], [2, 3, 1]]], corners[:, [[0, 1, 2], [0, 2, 3]]]
+    )
+    return coordinates.reshape(-1, 3), cut.reshape(-1, 3)

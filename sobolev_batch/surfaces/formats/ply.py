@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import triangle_fans_of_lists
-from sobolev_batch.surfaces.formats.raw_files import Raw
+from sobolev_batch.surfaces.formats.parsing import Raw, triangle_fans_of_lists
 from sobolev_batch.surfaces.formats.text_formats import LONGEST_LINE
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 

@@ -13,8 +13,7 @@ import numpy as np
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
 from sobolev_batch.surfaces.formats.neuroimaging import is_freesurfer_name, parse_freesurfer, parse_gifti
-from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply, write_ply
-from sobolev_batch.surfaces.formats.raw_files import (
+from sobolev_batch.surfaces.formats.parsing import (
     Raw,
     checked_length,
     is_gzipped,
@@ -23,6 +22,7 @@ from sobolev_batch.surfaces.formats.raw_files import (
     require_memory_to_read,
     unpacked_limit,
 )
+from sobolev_batch.surfaces.formats.ply import HEADER_BYTES, announced_sizes, parse_ply, write_ply
 from sobolev_batch.surfaces.formats.text_formats import (
     parse_obj,
     parse_off,

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import merge_coincident, triangle_fans
-from sobolev_batch.surfaces.formats.raw_files import Raw
+from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.

@@ -6,6 +6,7 @@ VTK reports what it cannot read and returns the rest. Here every report is an er
 from __future__ import annotations
 
 import re
+from collections import deque
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from threading import Lock
@@ -15,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.polygons import triangle_fans, triangle_strips
-from sobolev_batch.surfaces.formats.raw_files import Raw, parse_xml
+from sobolev_batch.surfaces.formats.parsing import Raw, triangle_fans, triangle_strips, xml_events
 
 Indices = NDArray[np.int64]
 
@@ -86,7 +86,7 @@ def _check_xml(data: bytes) -> None:
     raw = _RAW_DATA.search(data)
     # Raw bytes are no XML.
     document = data if raw is None else data[: raw.end()] + b"</AppendedData>" + _END
-    parse_xml(document, "VTK", lambda name, attributes: None, lambda name: None, lambda text: None)
+    deque(xml_events(document, "VTK"), maxlen=0)
 
 
 def _read(data: bytes, suffix: str) -> Any:

@@ -24,7 +24,7 @@ import pandas as pd
 from pydantic import BeforeValidator, Field, model_validator
 
 from sobolev_batch.errors import MeshError, StudyError
-from sobolev_batch.surfaces.formats.raw_files import checked_length, open_regular
+from sobolev_batch.surfaces.formats.parsing import checked_length, open_regular
 from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import (

@@ -48,7 +48,6 @@ REASONS = {
     "gifti, data of another file": "its data lie in another file",
     "gifti, deep elements unpacked": "at the depth 101",
     "gifti, many elements unpacked": "element 100001",
-    "gifti, many arrays": "more than 10000 arrays",
     "obj, continued lines unpacked": "goes on for more than",
     "ply ascii, long line unpacked": "a line of the PLY file has more than",
     "glb, one part in many nodes": "repeats parts",

@@ -1,4 +1,4 @@
-"""Bytes and XML of files: regular ones only, unpacked where they are gzipped, and never more than is sensible."""
+"""What parsers share: the bytes of regular files, unpacked but bounded; XML in small parts; polygons as triangles."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any, cast
 from xml.parsers import expat
 
-from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.machine import MachineMemory
@@ -131,26 +132,21 @@ def unpacked_limit(packed_bytes: int) -> int:
     return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
 
 
-def parse_xml(
-    data: bytes,
-    kind: str,
-    start: Callable[[str, dict[str, str]], None],
-    end: Callable[[str], None],
-    text: Callable[[str], None],
-) -> None:
+def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str]]]:
     """Parse XML a little at a time, and refuse what would take memory out of proportion.
 
     Args:
         data: Contents of the file.
         kind: Name of the format, as messages name it.
-        start: Called with the name and the attributes of each element.
-        end: Called with its name where it ends.
-        text: Called with pieces of text.
+
+    Yields:
+        ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
 
     Raises:
         MeshError: There are entities, or more and longer elements than any surface has.
     """
-    heard = depth = elements = 0
+    events: list[tuple[str, str, dict[str, str]]] = []
+    heard = 0
 
     def refuse_entity(name: str, *_: object) -> None:
         raise MeshError(f"the XML declares the entity {name[:40]!r}; a {kind} file has none, write it without")
@@ -159,42 +155,35 @@ def parse_xml(
         nonlocal heard
         heard += 1
 
-    def begin(name: str, attributes: dict[str, str]) -> None:
-        nonlocal heard, depth, elements
-        heard, depth, elements = heard + 1, depth + 1, elements + 1
-        if depth > _DEEPEST or elements > _MOST_ELEMENTS:
-            raise MeshError(
-                f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {_MOST_ELEMENTS} "
-                f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
-            )
-        start(name, attributes)
-
-    def finish(name: str) -> None:
-        nonlocal heard, depth
-        heard, depth = heard + 1, depth - 1
-        end(name)
-
-    def take(piece: str) -> None:
-        hear(piece)
-        text(piece)
-
     parser = expat.ParserCreate()
     parser.buffer_text = True
-    parser.EntityDeclHandler = refuse_entity
-    parser.StartElementHandler, parser.EndElementHandler = begin, finish
-    parser.CharacterDataHandler, parser.DefaultHandlerExpand = take, hear
-    silent, before = 0, 0
+    parser.EntityDeclHandler, parser.DefaultHandlerExpand = refuse_entity, hear
+    parser.StartElementHandler = lambda name, attributes: events.append(("start", name, attributes))
+    parser.EndElementHandler = lambda name: events.append(("end", name, {}))
+    parser.CharacterDataHandler = lambda piece: events.append(("text", piece, {}))
+    silent = depth = elements = 0
     for place in range(0, len(data), _XML_BYTES):
+        heard = 0
         parser.Parse(memoryview(data)[place : place + _XML_BYTES], False)
         # The parser tells of text at once, and keeps everything else until it is complete.
-        silent = silent + _XML_BYTES if heard == before else 0
-        before = heard
+        silent = 0 if heard or events else silent + _XML_BYTES
         if silent > _LONGEST_MARKUP:
             raise MeshError(
                 f"the XML has an attribute, name or comment of more than {_LONGEST_MARKUP} bytes, which goes on "
                 f"at byte {place + _XML_BYTES}; a {kind} file has none, write it without"
             )
+        for event in events:
+            elements += event[0] == "start"
+            depth += (event[0] == "start") - (event[0] == "end")
+            if depth > _DEEPEST or elements > _MOST_ELEMENTS:
+                raise MeshError(
+                    f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {_MOST_ELEMENTS} "
+                    f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
+                )
+            yield event
+        events.clear()
     parser.Parse(b"", True)
+    yield from events
 
 
 def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes:
@@ -212,3 +201,77 @@ def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())
     return data.getvalue()
+
+
+def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones.
+
+    Args:
+        corners: Vertex indices of all polygons, one after the other.
+        sizes: Number of corners of each polygon.
+
+    Returns:
+        Vertex indices of triangles (m, 3), int64; those of a polygon lie next to each other.
+
+    Raises:
+        MeshError: There are no polygons, or one has fewer than three corners.
+    """
+    if not len(sizes):
+        raise MeshError("the file has no faces")
+    _check_sizes(sizes)
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    first, rank = _places(sizes)
+    return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
+
+
+def triangle_strips(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cut each strip of triangles into these, all turned the same way.
+
+    Args:
+        corners: Vertex indices of all strips, one after the other.
+        sizes: Number of corners of each strip.
+
+    Returns:
+        Vertex indices of triangles (m, 3), int64.
+
+    Raises:
+        MeshError: A strip has fewer than three corners.
+    """
+    _check_sizes(sizes)
+    first, rank = _places(sizes)
+    start, odd = first + rank, rank % 2
+    return np.stack([corners[start + odd], corners[start + 1 - odd], corners[start + 2]], axis=1)
+
+
+def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
+    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
+    if not len(polygons):
+        raise MeshError("the file has no faces")
+    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
+    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
+
+
+def merge_coincident(
+    vertices: NDArray[np.floating], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Merge vertices with exactly the same coordinates, for formats that repeat them."""
+    if not np.isfinite(vertices).all():
+        # The mesh refuses them and names the entries.
+        return vertices, triangles
+    merged, indices = np.unique(vertices, axis=0, return_inverse=True)
+    return merged, indices.reshape(-1)[triangles]
+
+
+def _check_sizes(sizes: NDArray[np.int64]) -> None:
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+
+
+def _places(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return, for each triangle of polygons or strips, the place of the first corner and its rank among them."""
+    starts = np.cumsum(sizes) - sizes
+    polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
+    rank = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    return starts[polygon], rank
