@@ -1,44 +1,45 @@
-"""A collection: several objects, each with its own reference, and the same methods for all of them."""
+"""A collection: several objects, each with its own reference, and the same methods for all of them.
+
+Its study file has templates: texts with {object} and {method}, which are filled in, or matched with files.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from glob import has_magic
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
-from pydantic import AfterValidator, ValidationError
-
-from sobolev_batch.batch.study.refusals import joined, refusals
-from sobolev_batch.batch.study.schema import Name, Section, plain_tables, read_toml, require_modest
+from sobolev_batch.batch.study.schema import (
+    MOST_OBJECTS,
+    ObjectSection,
+    StudyDocument,
+    object_name,
+    plain_tables,
+    read_toml,
+)
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED, as_written, filled, holds, names_of
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.surfaces.sources.files import checked_list, matching_files, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.files import (
+    ListedMesh,
+    expand,
+    matching_files,
+    number_as_text,
+    read_mesh_list,
+)
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 
-_MOST_OBJECTS = 1000
+OBJECT, METHOD = "{object}", "{method}"
 
+_PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
+_PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 
-def _plain_name(name: str) -> str:
-    if any(character in RESERVED for character in name) or name.startswith((".", "__")) or name.endswith(".json"):
-        raise ValueError(
-            f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
-            "begin with . or __, and does not end with .json"
-        )
-    return name
-
-
-class _ObjectSection(Section):
-    name: Annotated[Name, AfterValidator(_plain_name)]
-    reference: dict[str, Any] | None = None
-    scaling: dict[str, Any] | None = None
-
-
-class _ObjectsSection(Section):
-    meshes: Any
+# Meshes of a list as entries of a family, by object and method.
+_Listed = Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -115,32 +116,28 @@ class StudyCollection:
 
     @classmethod
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
-        require_modest(table)
-        table = plain_tables(table)
-        _require_sections(table)
-        common = {key: value for key, value in table.items() if key not in ("object", "objects")}
-        listed = _listed_meshes(table.get("objects"), folder)
-        named = list(dict.fromkeys(name for name, _ in listed))
-        objects = _named_objects(table["object"]) if "object" in table else []
-        unnamed = [name for name in named if objects and name not in {section.name for section in objects}]
+        values = plain_tables(table)
+        # Objects and lists may bring references and families.
+        document = StudyDocument.from_tables({"reference": None, "family": [], **values})
+        listed = _listed_meshes(document.objects.get("meshes", ()), folder)
+        listed_names = list(dict.fromkeys(name for name, _ in listed))
+        objects = document.object or _unwritten_objects(listed_names or _names_in_reference(values, folder))
+        names = [section.name for section in objects]
+        unnamed = [name for name in listed_names if name not in names]
         if unnamed:
             raise StudyError(
                 f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or "
                 "give all of them sections"
             )
-        if not objects:
-            plain = {f"object {quoted(name)}": {"name": name} for name in named or _names_in_reference(common, folder)}
-            objects = _object_sections(plain)
-        same = duplicate_names(section.name for section in objects)
+        same = duplicate_names(names)
         if same:
             raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
+        families = [_families(family, names, folder) for family in values.get("family", ())]
         studies: dict[str, Study] = {}
         for section in objects:
-            own = {method: meshes for (name, method), meshes in listed.items() if name == section.name}
-            # Files of objects with longer names also match the templates of this object.
-            longer = [other.name for other in objects if section.name in other.name and other.name != section.name]
+            made = [entry for entries in families for entry in entries[section.name]]
             try:
-                table_of_object = _Part(section, common, own, longer, folder).table()
+                table_of_object = _table_of_object(values, section, listed, made)
                 studies[section.name] = Study.from_table(table_of_object, folder=folder)
             except StudyError as error:
                 raise StudyError(f"object {quoted(section.name)}: {error}") from error
@@ -150,20 +147,14 @@ class StudyCollection:
             missing = methods.keys() - {family.name for family in study.families}
             if missing:
                 lacking[name] = tuple(method for method in methods if method in missing)
-        header = common["study"]
-        return cls(
-            header["name"],
-            header.get("title") or header["name"],
-            studies,
-            lacking,
-            json.loads(json.dumps(table, default=str)),
-        )
+        title = document.study.title or document.study.name
+        return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(values, default=str)))
 
 
 def is_collection(table: Mapping[str, Any]) -> bool:
     """Return True where the table of a study file has several objects."""
     templates = table.get("reference"), table.get("family")
-    return "object" in table or "objects" in table or any(holds(templates, name) for name in (OBJECT, METHOD))
+    return "object" in table or "objects" in table or any(_holds(templates, name) for name in (OBJECT, METHOD))
 
 
 def read_study(path: str | Path) -> Study | StudyCollection:
@@ -172,30 +163,19 @@ def read_study(path: str | Path) -> Study | StudyCollection:
     Raises:
         StudyError: See `Study.from_toml`.
     """
-    path = Path(path)
-    try:
-        kind = StudyCollection if is_collection(read_toml(path)) else Study
-    except InputError as error:
-        raise StudyError(f"{path}: {error}") from error
-    return kind.from_toml(path)
+    with suppress(InputError):
+        if is_collection(read_toml(Path(path))):
+            return StudyCollection.from_toml(path)
+    return Study.from_toml(path)
 
 
-def _listed_meshes(section: Any, folder: Path) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Return the meshes of the section [objects], as entries of a family, by object and method."""
-    if section is None:
-        return {}
-    try:
-        given = checked_list(_ObjectsSection.model_validate(section).meshes)
-    except ValidationError as error:
-        values = section if isinstance(section, dict) else {}
-        raise StudyError(joined(refusals(error, values, _ObjectsSection, "[objects]"))) from error
-    except ValueError as error:
-        raise StudyError(f"[objects]: meshes {error}") from error
+def _listed_meshes(given: str | Sequence[ListedMesh], folder: Path) -> _Listed:
+    """Return the meshes of the section [objects]."""
     base = Path()
     if isinstance(given, str):
         base, given = Path(given).parent, read_mesh_list(folder / given)
     meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for mesh in given or ():
+    for mesh in given:
         known: dict[str, Any] = dict(mesh.metadata)
         names: list[str] = []
         for column in ("object", "method"):
@@ -209,93 +189,120 @@ def _listed_meshes(section: Any, folder: Path) -> dict[tuple[str, str], list[dic
     return meshes
 
 
-@dataclass(frozen=True)
-class _Part:
-    """The study of one object of a collection.
-
-    Attributes:
-        section: Section of the object.
-        common: Sections that all objects share.
-        listed: Its meshes in a list, by method.
-        longer: Names of other objects that hold its name. A file is of the object with the longest name that fits.
-        folder: Folder where relative paths start.
-    """
-
-    section: _ObjectSection
-    common: Mapping[str, Any]
-    listed: Mapping[str, Sequence[Mapping[str, Any]]]
-    longer: Sequence[str]
-    folder: Path
-
-    def table(self) -> dict[str, Any]:
-        """Return the study as nested tables."""
-        name = self.section.name
-        common = filled({key: value for key, value in self.common.items() if key != "family"}, OBJECT, name)
-        reference = self.section.reference or self._listed_reference() or common.get("reference")
-        families = [table for family in self.common.get("family", []) for table in self._families(family)]
-        families += (
-            {"name": method, "source": "files", "meshes": meshes}
-            for method, meshes in self.listed.items()
-            if caseless_key(method) != REFERENCE_LABEL
+def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
+    """Return the objects that the files of the reference name, in their natural order."""
+    paths = (values.get("reference") or {}).get("paths")
+    templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
+    if not templates:
+        raise StudyError(
+            "a collection needs its objects: [[object]] sections, a list in [objects], or a [reference] with paths "
+            'such as ["objects/{object}.obj"]'
         )
-        header = common["study"]
-        return {
-            **common,
-            "study": {**header, "name": f"{header['name']} {name}"},
-            **({} if reference is None else {"reference": filled(reference, OBJECT, name)}),
-            **({} if self.section.scaling is None else {"scaling": self.section.scaling}),
-            "family": families,
+    names: set[str] = set()
+    for template in templates:
+        match = re.compile(_pattern(template)).fullmatch
+        found = {
+            matched["object"] for path in expand(folder, _glob(template)) if (matched := match(_text(path, folder)))
         }
-
-    def _listed_reference(self) -> dict[str, Any] | None:
-        listed = self.listed.items()
-        meshes = [mesh for method, meshes in listed if caseless_key(method) == REFERENCE_LABEL for mesh in meshes]
-        return {"source": "files", "paths": [mesh["path"] for mesh in meshes]} if meshes else None
-
-    def _families(self, family: Any) -> list[Any]:
-        """Return a family for each method among its files, or none where no file matches."""
-        others = filled({key: value for key, value in family.items() if key != "paths"}, OBJECT, self.section.name)
-        paths = family.get("paths")
-        if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-            return [filled(family, OBJECT, self.section.name)]
-        if not holds(family.get("name"), METHOD):
-            own = [file for path in paths for file in self._paths(path, self._files_of_others(path))]
-            return [{**others, "paths": own}]
-        methods: dict[str, list[str]] = {}
-        for path in paths:
-            foreign = self._files_of_others(path)
-            for method in self._methods(path, foreign) if METHOD in path else []:
-                methods.setdefault(method, []).extend(self._paths(path, foreign, method))
-        return [
-            {**filled(others, METHOD, method), "paths": methods[method]} for method in sorted(methods, key=natural_key)
-        ]
-
-    def _methods(self, template: str, foreign: set[Path]) -> list[str]:
-        """Return the methods that have files of the object; none where no file matches."""
-        own = template.replace(OBJECT, self.section.name)
-        try:
-            return names_of(own, METHOD, self.folder, foreign)
-        except StudyError:
-            return []
-
-    def _paths(self, template: str, foreign: set[Path], method: str = "") -> list[str]:
-        """Return the path or glob of a method, or the files that match it where others are of another object."""
-        text = template.replace(OBJECT, self.section.name).replace(METHOD, method)
-        files = _files(self.folder, text) if foreign and has_magic(text) else []
-        if foreign.isdisjoint(files):
-            return [text]
-        own = [as_written(path, self.folder) for path in files if path not in foreign]
-        if not own:
+        if not found:
             raise StudyError(
-                f"{quoted(text)} matches files of other objects alone, such as {quoted(str(files[0]))}; "
-                f"put files of {quoted(self.section.name)} there, or correct it"
+                f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
             )
-        return own
+        names |= found
+    return sorted(names, key=natural_key)
 
-    def _files_of_others(self, template: str) -> set[Path]:
-        """Return the files of the objects with longer names."""
-        globs = [template.replace(OBJECT, name).replace(METHOD, "*") for name in self.longer if OBJECT in template]
-        return {path for glob in globs for path in _files(self.folder, glob)}
+
+def _unwritten_objects(names: Sequence[str]) -> list[ObjectSection]:
+    """Return the objects that a list or the files of the reference name."""
+    if len(names) > MOST_OBJECTS:
+        raise StudyError(f"object: at most {MOST_OBJECTS} objects are allowed, found {len(names)}")
+    for name in names:
+        try:
+            object_name(name)
+        except ValueError as error:
+            raise StudyError(f"object {quoted(name)}: {error}") from error
+    return [ObjectSection(name=name) for name in names]
+
+
+def _table_of_object(
+    values: Mapping[str, Any], section: ObjectSection, listed: _Listed, families: Iterable[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the study of an object as nested tables."""
+    name = section.name
+    common = {key: value for key, value in values.items() if key not in ("family", "object", "objects")}
+    common = _filled(common, OBJECT, name)
+    own = {method: meshes for (owner, method), meshes in listed.items() if owner == name}
+    is_reference = {method: caseless_key(method) == REFERENCE_LABEL for method in own}
+    references = [mesh["path"] for method, meshes in own.items() if is_reference[method] for mesh in meshes]
+    if section.reference is not None:
+        common["reference"] = _filled(section.reference, OBJECT, name)
+    elif references:
+        common["reference"] = {"source": "files", "paths": references}
+    if section.scaling is not None:
+        common["scaling"] = section.scaling
+    methods = (method for method in own if not is_reference[method])
+    return {
+        **common,
+        "study": {**common["study"], "name": f"{common['study']['name']} {name}"},
+        "family": [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)],
+    }
+
+
+def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the families of each object that a section gives: one, or one for each method among its files."""
+    made = {name: [_filled(family, OBJECT, name)] for name in names}
+    paths = family.get("paths")
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        return made
+    files = {template: _files_of_objects(template, names, folder) for template in paths}
+    for name, (plain,) in made.items():
+        if METHOD not in family["name"]:
+            plain["paths"] = [file for path in paths for file in _paths(path, name, files[path][name], folder)]
+            continue
+        methods: dict[str, list[str]] = {}
+        for template in paths:
+            for method, own in files[template][name].items() if METHOD in template else ():
+                methods.setdefault(method, []).extend(own)
+        made[name] = [
+            {**_filled(plain, METHOD, method), "paths": methods[method]} for method in sorted(methods, key=natural_key)
+        ]
+    return made
+
+
+def _files_of_objects(template: str, names: Sequence[str], folder: Path) -> dict[str, dict[str, list[str]]]:
+    """Return the files that match a template, by object and method.
+
+    A file is of the object with the longest name that fits, and the method is as long as it can be.
+    """
+    found: dict[str, dict[str, list[str]]] = {name: {} for name in names}
+    has_object = OBJECT in template
+    patterns = {name: re.compile(_pattern(template.replace(OBJECT, name))) for name in names}
+    longest_first = sorted(names, key=len, reverse=True)
+    for path in _files(folder, _glob(template)):
+        text = _text(path, folder)
+        for name in longest_first:
+            if has_object and name not in text:
+                continue
+            matched = patterns[name].fullmatch(text)
+            if matched is not None:
+                found[name].setdefault(matched.groupdict().get("method", ""), []).append(text)
+                if has_object:
+                    break
+    return found
+
+
+def _paths(template: str, name: str, own: Mapping[str, list[str]], folder: Path) -> list[str]:
+    """Return the files of an object; its path or glob where there are none yet, or where it holds for all objects."""
+    text = template.replace(OBJECT, name)
+    if OBJECT not in template or not has_magic(text):
+        return [text]
+    others = [] if own else _files(folder, text)
+    if others:
+        raise StudyError(
+            f"object {quoted(name)}: {quoted(text)} matches files of other objects alone, such as "
+            f"{quoted(str(others[0]))}; put files of {quoted(name)} there, or correct it"
+        )
+    return [file for files in own.values() for file in files] or [text]
 
 
 def _files(folder: Path, text: str) -> list[Path]:
@@ -306,57 +313,47 @@ def _files(folder: Path, text: str) -> list[Path]:
         return []
 
 
-def _require_sections(table: Mapping[str, Any]) -> None:
-    """Check the kinds of the sections that objects share, since their studies are made from them."""
-    kinds: dict[str, tuple[type, str]] = {
-        "study": (Mapping, "a section, [study], with the name of the study"),
-        "reference": (Mapping, "a section, [reference]"),
-        "objects": (Mapping, '[objects] with the key meshes, such as meshes = "meshes.csv"'),
-        "family": (list, "written as sections, [[family]] before each"),
-    }
-    for key, (kind, words) in kinds.items():
-        value = table.get(key)
-        entries = value if isinstance(value, list) else []
-        is_one = isinstance(value, kind) and all(isinstance(entry, Mapping) for entry in entries)
-        if not is_one and (key in table or key == "study"):
-            found = f", found {quoted(value)}" if key in table else ", and is missing"
-            raise StudyError(f"{key} must be {words}{found}")
-    if not isinstance(table["study"].get("name"), str):
-        raise StudyError(f"[study]: name must be a text, found {quoted(table['study'].get('name'))}")
+def _holds(value: Any, placeholder: str) -> bool:
+    """Return True where any text of nested tables has a placeholder."""
+    if isinstance(value, str):
+        return placeholder in value
+    if isinstance(value, Mapping):
+        return any(_holds(entry, placeholder) for entry in value.values())
+    return isinstance(value, list | tuple) and any(_holds(entry, placeholder) for entry in value)
 
 
-def _named_objects(entries: Any) -> list[_ObjectSection]:
-    """Return the sections [[object]]."""
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise StudyError(f"object must be written as sections, [[object]] before each, found {quoted(entries)}")
-    return _object_sections({f"[[object]] {number}": entry for number, entry in enumerate(entries, 1)})
+def _filled(value: Any, placeholder: str, name: str) -> Any:
+    """Return nested tables with a name in place of a placeholder."""
+    if isinstance(value, str):
+        return value.replace(placeholder, name)
+    if isinstance(value, Mapping):
+        return {key: _filled(entry, placeholder, name) for key, entry in value.items()}
+    return [_filled(entry, placeholder, name) for entry in value] if isinstance(value, list) else value
 
 
-def _object_sections(entries: Mapping[str, dict[str, Any]]) -> list[_ObjectSection]:
-    """Return the sections of objects, by where they are given."""
-    if len(entries) > _MOST_OBJECTS:
-        raise StudyError(f"object: at most {_MOST_OBJECTS} objects are allowed, found {len(entries)}")
-    sections: list[_ObjectSection] = []
-    refused: list[str] = []
-    for place, entry in entries.items():
-        try:
-            sections.append(_ObjectSection.model_validate(entry))
-        except ValidationError as error:
-            refused += refusals(error, entry, _ObjectSection, place)
-    if refused:
-        raise StudyError(joined(refused))
-    return sections
+def _glob(template: str) -> str:
+    return template.replace(OBJECT, "*").replace(METHOD, "*")
 
 
-def _names_in_reference(common: Mapping[str, Any], folder: Path) -> list[str]:
-    """Return the objects that the files of the reference name."""
-    reference = common.get("reference")
-    paths = reference.get("paths") if isinstance(reference, Mapping) else None
-    templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
-    if not templates:
-        raise StudyError(
-            "a collection needs its objects: [[object]] sections, a list in [objects], or a [reference] with paths "
-            'such as ["objects/{object}.obj"]'
-        )
-    names = dict.fromkeys(name for template in templates for name in names_of(template, OBJECT, folder))
-    return sorted(names, key=natural_key)
+def _text(path: Path, folder: Path) -> str:
+    """Return a path as a template of the study would have it."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
+
+
+def _pattern(template: str) -> str:
+    """Return the regular expression of a template, with the groups object and method.
+
+    A placeholder stands for as many characters as it can, of one part of the path; where it is repeated, for the same.
+    """
+    seen: set[str] = set()
+    pattern = ""
+    for part in _PART.split(Path(template).as_posix()):
+        if part in (OBJECT, METHOD):
+            group = part.strip("{}")
+            pattern += f"(?P={group})" if part in seen else f"(?P<{group}>[^/]+)"
+            seen.add(part)
+        elif part.startswith("[") and part.endswith("]"):
+            pattern += "[^" + re.escape(part[2:-1]) + "]" if part[1:2] == "!" else part
+        else:
+            pattern += _PATTERNS.get(part) or re.escape(part)
+    return pattern

@@ -11,11 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from sobolev_batch.batch.study.collection import StudyCollection, is_collection
+from sobolev_batch.batch.study.collection import METHOD, OBJECT, StudyCollection, is_collection
 from sobolev_batch.batch.study.mesh_folder import Layout, MeshFile, free_name, guess_layout, with_any_size
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.batch.study.templates import METHOD, OBJECT
 from sobolev_batch.errors import StudyError
 from sobolev_batch.surfaces.formats.readers import mesh_stem
 from sobolev_batch.surfaces.sources.files import FileMember, FileSource, expand

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
+from sobolev_batch.batch.study.collection import METHOD, OBJECT
+from sobolev_batch.batch.study.schema import RESERVED
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
-from sobolev_batch.batch.study.templates import METHOD, OBJECT, RESERVED
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
 from sobolev_batch.surfaces.sources.files import MOST_MESHES

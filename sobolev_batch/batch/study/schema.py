@@ -1,22 +1,35 @@
-"""Schema of study files: their syntax, sections, keys and limits."""
+"""Schema of study files: their syntax, sections, keys and limits, and the refusal of what is malformed.
+
+A refusal has a message for each key that is wrong, with what was found and what is allowed.
+"""
 
 from __future__ import annotations
 
 import codecs
+import difflib
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 import pandas as pd
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, PydanticKnownError
 
-from sobolev_batch.batch.study.refusals import dotted_key
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -28,17 +41,17 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.sources.files import ListedMesh, checked_list
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
-from sobolev_batch.surfaces.sources.registry import at_most
+from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_source, source_type_of
 
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
 
 # Deeper tables and longer texts are mistakes, or made to keep the validation busy.
 _DEEPEST = 20
-_MOST_VALUES = 1_000_000
 _LONGEST_TEXT = 10_000
-_MOST_ORDERS = 100
+_MOST_ORDERS, MOST_OBJECTS = 100, 1000
 MOST_OCTAVES = 24
 _LONGEST_NAME, _LONGEST_TITLE = 100, 1000
 # Larger study files are mistakes, or made to keep the parser busy.
@@ -47,6 +60,23 @@ _LARGEST_FILE_BYTES = 4 << 20
 _LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.[ \t]*+){100}""")
 # The range of TOML's integers.
 _LARGEST_INTEGER = (1 << 63) - 1
+# Most refusals of one study; longer keys are not compared with others.
+_MOST_OFFENDERS, _LONGEST_KEY = 10, 40
+# Sections that are lists.
+_REPEATED = ("family", "object")
+# What a value must be in the words of TOML, by the type of pydantic's error or the first word of it.
+_WORDS = {
+    "list": "be a list",
+    "tuple": "be a list",
+    "dict": "be a table",
+    "model": "be a table",
+    "int": "be a whole number",
+    "float": "be a number",
+    "bool": "be true or false",
+    "string_type": "be text in quotes",
+}
+# Characters of globs and templates, which the names of objects and methods cannot have.
+RESERVED = "*?[]{}/\\"
 
 
 def _name(text: str) -> str:
@@ -64,6 +94,20 @@ def _title(text: str) -> str:
     if problem is not None:
         raise ValueError(f"a title is one line of up to {_LONGEST_TITLE} visible characters and blanks; {problem}")
     return text
+
+
+def object_name(name: str) -> str:
+    """Check the name of an object, which is that of a folder in the store."""
+    if (
+        any(character in RESERVED for character in _name(name))
+        or name.startswith((".", "__"))
+        or name.endswith(".json")
+    ):
+        raise ValueError(
+            f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
+            "begin with . or __, and does not end with .json"
+        )
+    return name
 
 
 def _memory(value: Any) -> float:
@@ -93,6 +137,19 @@ class Section(BaseModel):
     """A section of a study file: frozen, of strict types, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    def settings(self) -> Any:
+        """Return what the section says, in the terms of the package."""
+        return None
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        """Refuse values that are wrong together."""
+        try:
+            self.settings()
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return self
 
 
 class _Header(Section):
@@ -140,20 +197,28 @@ class _ScalingSection(Section):
     origin: Annotated[tuple[Number, Number, Number] | None, Field(strict=False)] = None
 
     def settings(self) -> Similarity | None:
+        given = self.scale is not None or self.origin is not None
+        if given != (self.mode == "fixed"):
+            raise ValueError("scale and origin belong to mode = 'fixed', which needs at least one of them")
         if self.mode == "reference":
             return None
         return Similarity(1.0 if self.scale is None else self.scale, self.origin or (0.0, 0.0, 0.0))
 
-    @model_validator(mode="after")
-    def _values_where_needed(self) -> Self:
-        given = self.scale is not None or self.origin is not None
-        if given != (self.mode == "fixed"):
-            raise ValueError("scale and origin belong to mode = 'fixed', which needs at least one of them")
-        return self
-
 
 class _ProximitySection(Section):
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
+
+
+def _source(table: object) -> Source:
+    if not isinstance(table, dict):
+        raise PydanticKnownError("dict_type")
+    try:
+        return parse_source(table)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+
+
+SourceTable = Annotated[SerializeAsAny[Source], BeforeValidator(_source)]
 
 
 class FamilyReference(Section):
@@ -163,25 +228,72 @@ class FamilyReference(Section):
     member: str | None = None
 
 
-class FamilySection(Section):
-    """Keys of a family that are not those of its source."""
+class Family(Section):
+    """A named source of surfaces.
+
+    Attributes:
+        name: Name of the family.
+        source: Source of its surfaces. In a study file its keys are beside the others.
+        order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
+            names, in which they are no sequence from coarse to fine and have no rates.
+    """
 
     name: Name
+    source: SourceTable
     order_by: Literal["triangles", "names"] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_keys_of_source(cls, table: object) -> object:
+        if not isinstance(table, dict):
+            return table
+        own = {key: table[key] for key in _KEYS_OF_FAMILY if key in table}
+        return {**own, "source": {key: value for key, value in table.items() if key not in own}}
+
+
+_KEYS_OF_FAMILY = ("name", "order_by")
+
+
+def _reference(table: object) -> object:
+    if isinstance(table, dict) and table.get("source") == "family":
+        return FamilyReference.model_validate({key: value for key, value in table.items() if key != "source"})
+    return None if table is None else _source(table)
+
+
+class ObjectSection(Section):
+    """One of the objects of a study that has several."""
+
+    name: Annotated[Name, AfterValidator(object_name)]
+    reference: dict[str, Any] | None = None
+    scaling: dict[str, Any] | None = None
 
 
 class StudyDocument(Section):
-    """All sections of a study file. Families and sources are validated by their own schemas."""
+    """All sections of a study file, of one object or of several."""
 
     study: _Header
     lattice: _LatticeSection | None = None
     accuracy: _AccuracySection | None = None
     norm: _NormSection
     transform: _TransformSection = _TransformSection()
-    reference: dict[str, Any]
-    family: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    reference: Annotated[FamilyReference | SerializeAsAny[Source] | None, BeforeValidator(_reference)]
+    family: list[Family]
     scaling: _ScalingSection = _ScalingSection()
     proximity: _ProximitySection | None = None
+    object: Annotated[list[ObjectSection], Field(min_length=1, max_length=MOST_OBJECTS)] | None = None
+    objects: dict[Literal["meshes"], Annotated[str | tuple[ListedMesh, ...], BeforeValidator(checked_list)]] = {}
+
+    @classmethod
+    def from_tables(cls, values: Mapping[str, Any]) -> Self:
+        """Validate the tables of a study, as `plain_tables` gives them.
+
+        Raises:
+            StudyError: A message for each key that is wrong.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise StudyError(_joined(_refusals(error, values))) from error
 
     @model_validator(mode="after")
     def _lattice_or_accuracy(self) -> Self:
@@ -231,16 +343,35 @@ def _line_at(message: str, text: str) -> str:
     return f": {quoted(text.splitlines()[int(position[1]) - 1].strip())}" if position else ""
 
 
-def plain_tables(value: Any) -> Any:
-    """Return tables as dictionaries, DataFrames as lists of rows, values of NumPy as Python's, and paths as texts."""
+def plain_tables(table: object) -> dict[str, Any]:
+    """Return a study with DataFrames as lists of rows, values of NumPy as Python's, and paths as texts.
+
+    Raises:
+        StudyError: It is no table, or its validation or messages would take too long.
+    """
+    if not isinstance(table, Mapping):
+        raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
+    plain = _plain(table, ())
+    return plain if isinstance(plain, dict) else {}
+
+
+def _plain(value: Any, key: tuple[object, ...]) -> Any:
+    if len(key) > _DEEPEST:
+        raise StudyError(f"{_dotted(key)}: nested more than {_DEEPEST} deep")
     if isinstance(value, Mapping):
-        return {key: plain_tables(entry) for key, entry in value.items()}
+        if not all(isinstance(name, str) for name in value):
+            raise StudyError(f"{_dotted(key)}: keys must be strings")
+        return {name: _plain(entry, (*key, name)) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [plain_tables(entry) for entry in value]
+        return [_plain(entry, (*key, number)) for number, entry in enumerate(value)]
     if isinstance(value, pd.DataFrame):
         return _rows_of(value)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if isinstance(value, str) and len(value) > _LONGEST_TEXT:
+        raise StudyError(f"{_dotted(key)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
+    if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+        raise StudyError(f"{_dotted(key)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
@@ -251,7 +382,7 @@ def _rows_of(frame: pd.DataFrame) -> list[dict[str, Any]]:
         raise StudyError(f"a DataFrame has the column {quoted(repeated[0])} twice; rename one")
     return [
         {
-            str(key): value.isoformat() if isinstance(value, date) else plain_tables(value)
+            str(key): value.isoformat() if isinstance(value, date) else _plain(value, (key,))
             for key, value in row.items()
             if not (pd.api.types.is_scalar(value) and pd.isna(value))
         }
@@ -259,24 +390,130 @@ def _rows_of(frame: pd.DataFrame) -> list[dict[str, Any]]:
     ]
 
 
-def require_modest(table: object) -> None:
-    """Refuse tables whose validation or messages would take too long: too deep, too long, or too many values."""
-    waiting: list[tuple[object, tuple[object, ...]]] = [(table, ())]
-    count = 0
-    while waiting:
-        value, path = waiting.pop()
-        count += 1
-        if len(path) > _DEEPEST:
-            raise StudyError(f"{dotted_key(path)}: nested more than {_DEEPEST} deep")
-        if count > _MOST_VALUES:
-            raise StudyError(f"{dotted_key(path)}: the study has more than {_MOST_VALUES} values")
-        if isinstance(value, Mapping):
-            if not all(isinstance(key, str) for key in value):
-                raise StudyError(f"{dotted_key(path)}: keys must be strings")
-            waiting += ((entry, (*path, key)) for key, entry in value.items())
-        elif isinstance(value, list | tuple):
-            waiting += ((entry, (*path, index)) for index, entry in enumerate(value))
-        elif isinstance(value, str) and len(value) > _LONGEST_TEXT:
-            raise StudyError(f"{dotted_key(path)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
-        elif isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-            raise StudyError(f"{dotted_key(path)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
+Key = tuple[int | str, ...]
+
+
+def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong in the tables of a study, a message for each key."""
+    messages: list[str] = []
+    allowed: dict[Key, list[str]] = {}
+    for item in error.errors(include_url=False):
+        kind, key = item["type"], _key_in(values, item)
+        name = _named(key, values)
+        if kind == "extra_forbidden":
+            messages.append(f"{name} is unknown; {known_names(str(key[-1]), _known_keys(values, key[:-1]))}")
+        elif kind == "missing":
+            messages.append(f"{name} is missing")
+        elif kind == "value_error":
+            said, value = str(item["ctx"]["error"]), _value_at(values, key)
+            found = "" if isinstance(value, Mapping) or "found " in said else f", found {shown_value(value)}"
+            messages.append(": ".join(filter(None, (name, said + found))))
+        # Wrong entries are not counted; the list may be long enough with them.
+        elif kind != "too_short" or len(_value_at(values, key)) < item["ctx"]["min_length"]:
+            allowed.setdefault(key, []).append(_demand(item))
+    for key, demands in allowed.items():
+        text = " or ".join(dict.fromkeys(demands)).replace(" or be ", " or ")
+        messages.append(f"{_named(key, values)} must {text}, found {shown_value(_value_at(values, key))}")
+    return messages
+
+
+def _joined(messages: Sequence[str]) -> str:
+    """Return messages on one line; a long list is cut."""
+    more = len(messages) - _MOST_OFFENDERS
+    return "; ".join(messages[:_MOST_OFFENDERS]) + (f"; and {more} more" if more > 0 else "")
+
+
+def known_names(name: str, known: Sequence[str]) -> str:
+    """Return the name that an unknown one is probably meant to be, or else all that are known."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1) if len(name) <= _LONGEST_KEY else []
+    return f"did you mean {by_lower[near[0]]}?" if near else f"known are {', '.join(map(_readable, known))}"
+
+
+def shown_value(value: object) -> str:
+    """Return a value as a study file spells it, on one short line."""
+    return str(value).lower() if isinstance(value, bool) else quoted(value)
+
+
+def _dotted(key: Sequence[object]) -> str:
+    return ".".join(_readable(str(part)) for part in key[:8]) or "study"
+
+
+def _readable(key: str) -> str:
+    """Return a key, in quotes where it is unusual."""
+    return key if name_problem(key, _LONGEST_KEY) is None else quoted(key)
+
+
+def _demand(item: ErrorDetails) -> str:
+    """Return what a value must do: be a list, be greater than 0, have at most 3 items."""
+    kind, said = item["type"], item["msg"]
+    if item["loc"][-1:] == ("[key]",):
+        return f"be called {item['ctx']['expected']}"
+    words = _WORDS.get(kind) or _WORDS.get(kind.partition("_")[0])
+    return words or re.sub(r"^\w+ should | after validation.*$", "", said)
+
+
+def _key_in(values: object, item: ErrorDetails) -> Key:
+    """Return the location of an error without the parts that name the alternatives of a type."""
+    location = item["loc"]
+    if location[:1] == ("family",) and location[2:3] == ("source",):
+        # Its keys are those of the family.
+        location = (*location[:2], *location[3:])
+    key: list[int | str] = []
+    for number, part in enumerate(location, 1):
+        is_list = isinstance(values, list | tuple) and isinstance(part, int) and part < len(values)
+        if is_list or (isinstance(values, Mapping) and part in values):
+            values = values[part]  # type: ignore[index]
+        elif item["type"] != "missing" or number < len(location):
+            continue
+        key.append(part)
+    return tuple(key)
+
+
+def _value_at(values: Any, key: Key) -> Any:
+    for part in key:
+        values = values[part]
+    return values
+
+
+def _known_keys(values: Any, key: Key) -> tuple[str, ...]:
+    """Return the keys that the table at a key may have."""
+    model: type[BaseModel] = StudyDocument
+    for depth, part in enumerate(key):
+        values = values[part]
+        if isinstance(values, Mapping) and "source" in values:
+            is_family = depth == 0 and values["source"] == "family"
+            model = FamilyReference if is_family else source_type_of(values["source"])
+        elif isinstance(part, str):
+            model = next(models_in(model.model_fields[part].annotation))
+    source = ("source",) if issubclass(model, Source | FamilyReference) else ()
+    return (*model.model_fields, *source, *(_KEYS_OF_FAMILY if key[:1] == ("family",) and len(key) <= 2 else ()))
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models that a type is made of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from models_in(part)
+
+
+def _named(key: Key, values: Mapping[str, Any]) -> str:
+    """Return a key with its place: ``[norm]: entry 2 of orders``. Entries count from one."""
+    if not key:
+        return ""
+    section, rest = str(key[0]), key[1:]
+    value = values.get(section)
+    if not rest and section in values and not isinstance(value, dict | list):
+        return _readable(section)
+    place = f"[[{section}]]" if section in _REPEATED else f"[{_readable(section)}]"
+    if section in _REPEATED and rest:
+        entry, rest = _value_at(value, rest[:1]), rest[1:]
+        place += f" {int(key[1]) + 1}"
+        if isinstance(entry, Mapping) and isinstance(entry.get("name"), str):
+            place += f" (named {quoted(entry['name'])})"
+    name = ".".join(_readable(part) for part in rest if isinstance(part, str))
+    numbers = ", ".join(str(part + 1) for part in rest if isinstance(part, int))
+    if numbers:
+        name = f"entry {numbers} of {name}" if name else f"entry {numbers}"
+    return ": ".join(filter(None, (place, name)))

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import ValidationError
-
-from sobolev_batch.batch.study.refusals import joined, known_names, refusals, shown_value
 from sobolev_batch.batch.study.schema import (
     Backends,
+    Family,
     FamilyReference,
-    FamilySection,
     StudyDocument,
+    known_names,
     plain_tables,
     read_toml,
-    require_modest,
 )
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -29,25 +25,9 @@ from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, quoted
-from sobolev_batch.surfaces.sources.registry import Source, parse_source, source_type_of
+from sobolev_batch.surfaces.sources.registry import Source
 
 REFERENCE_LABEL = "reference"
-
-
-@dataclass(frozen=True)
-class Family:
-    """A named source of surfaces.
-
-    Attributes:
-        name: Name of the family.
-        source: Source of its surfaces.
-        order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
-            names, in which they are no sequence from coarse to fine and have no rates.
-    """
-
-    name: str
-    source: Source
-    order_by: Literal["triangles", "names"] | None = None
 
 
 @dataclass(frozen=True)
@@ -202,119 +182,48 @@ class Study:
 
     @classmethod
     def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
-        if not isinstance(table, Mapping):
-            raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
-        require_modest(table)
         values = plain_tables(table)
-        # Families and the reference are looked at even where sections are wrong: all offenders are named.
-        refused: list[str] = []
-        document: StudyDocument | None = None
-        try:
-            document = StudyDocument.model_validate(values)
-        except ValidationError as error:
-            refused += refusals(error, values, StudyDocument)
-        entries = values.get("family")
-        tables = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
-        families = tuple(_families(tables, refused))
-        reference = _reference(values.get("reference"), tables, refused)
-        if document is None or reference is None or refused:
-            raise StudyError(joined(refused))
-        _require_distinct(families)
+        document = StudyDocument.from_tables(values)
+        if document.object is not None or document.objects:
+            raise StudyError("[[object]] and [objects] make several studies; read them as a StudyCollection")
+        families, reference = document.family, document.reference
+        if not families:
+            raise StudyError("[[family]] must have at least 1 item, found []")
+        if reference is None:
+            raise StudyError("[reference] must be a table, found None")
+        _require_distinct([family.name for family in families])
         if isinstance(reference, Source):
-            families = tuple(replace(family, source=family.source.with_reference(reference)) for family in families)
-        with _in_section("lattice"):
-            lattice = None if document.lattice is None else document.lattice.settings()
-        with _in_section("accuracy"):
-            accuracy = None if document.accuracy is None else document.accuracy.settings()
-        with _in_section("transform"):
-            transform = document.transform.settings()
-        with _in_section("scaling"):
-            scaling = document.scaling.settings()
-        orders = document.norm.orders
+            own = reference
+            families = [family.model_copy(update={"source": family.source.with_reference(own)}) for family in families]
+        elif reference.family not in (names := [family.name for family in families]):
+            name = reference.family
+            raise StudyError(f"[reference]: no family is named {quoted(name)}; {known_names(name, names)}")
         return cls(
             name=document.study.name,
             title=document.study.title or document.study.name,
-            lattice=lattice,
-            accuracy=accuracy,
-            transform=transform,
+            lattice=None if document.lattice is None else document.lattice.settings(),
+            accuracy=None if document.accuracy is None else document.accuracy.settings(),
+            transform=document.transform.settings(),
             dtype=document.transform.dtype,
             backend=document.transform.backend,
-            orders=orders,
+            orders=document.norm.orders,
             pairs=document.norm.pairs,
-            families=families,
+            families=tuple(families),
             reference=reference,
-            scaling=scaling,
+            scaling=document.scaling.settings(),
             proximity=None if document.proximity is None else document.proximity.points,
             folder=folder,
-            octaves=0 if document.lattice is None else document.lattice.octaves,
+            octaves=document.lattice.octaves if document.lattice else 0,
             table=json.loads(json.dumps(values, default=str)),
         )
 
 
-@contextmanager
-def _in_section(name: str) -> Iterator[None]:
-    """Name the section whose values together are refused."""
-    try:
-        yield
-    except InputError as error:
-        raise StudyError(f"[{name}]: {error}") from error
-
-
-def _require_distinct(families: tuple[Family, ...]) -> None:
-    same = duplicate_names(family.name for family in families)
+def _require_distinct(families: Sequence[str]) -> None:
+    same = duplicate_names(families)
     if same:
         names = ", ".join(quoted(name) for group in same[:3] for name in group[:3])
         raise StudyError(
             f"family: names must differ by more than case and the spelling of accents, found {names} twice; rename one"
         )
-    if any(caseless_key(family.name) == REFERENCE_LABEL for family in families):
+    if any(caseless_key(name) == REFERENCE_LABEL for name in families):
         raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
-
-
-def _families(entries: list[dict[str, Any]], refused: list[str]) -> Iterator[Family]:
-    """Yield the families that can be read, and add what is wrong with the others to the refusals."""
-    for number, entry in enumerate(entries, 1):
-        place = f"[[family]] {number}"
-        if isinstance(entry.get("name"), str):
-            place += f" (named {quoted(entry['name'])})"
-        own = {key: entry[key] for key in FamilySection.model_fields if key in entry}
-        section = None
-        try:
-            section = FamilySection.model_validate(own)
-        except ValidationError as error:
-            refused += refusals(error, entry, FamilySection, place)
-        parameters = {key: value for key, value in entry.items() if key not in own}
-        source = _source(parameters, place, refused, FamilySection.model_fields)
-        if section is not None and source is not None:
-            yield Family(section.name, source, section.order_by)
-
-
-def _source(parameters: dict[str, Any], place: str, refused: list[str], others: Iterable[str] = ()) -> Source | None:
-    """Return the source of a table, or add what is wrong with it to the refusals."""
-    try:
-        return parse_source(parameters)
-    except ValidationError as error:
-        refused += refusals(error, parameters, source_type_of(parameters["source"]), place, tuple(others))
-    except InputError as error:
-        refused.append(f"{place}: {error}")
-    return None
-
-
-def _reference(entry: object, families: list[dict[str, Any]], refused: list[str]) -> Source | FamilyReference | None:
-    """Return the reference, or add what is wrong with it to the refusals."""
-    if not isinstance(entry, dict):
-        return None
-    place = "[reference]"
-    if entry.get("source") != "family":
-        return _source(entry, place, refused)
-    parameters = {key: value for key, value in entry.items() if key != "source"}
-    try:
-        reference = FamilyReference.model_validate(parameters)
-    except ValidationError as error:
-        refused += refusals(error, parameters, FamilyReference, place, ("source",))
-        return None
-    names, name = [str(family.get("name")) for family in families], reference.family
-    if name not in names:
-        refused.append(f"{place}: no family is named {quoted(name)}; {known_names(name, names)}")
-        return None
-    return reference

@@ -86,7 +86,7 @@ PLACES: list[tuple[str, Any, str]] = [
     ("reference", {"source": "sphere", "center": [0, 0]}, r"\[reference\]: entry 3 of center is missing"),
     ("reference", {"source": "torus", "R": 1.0, "r": 2.0}, r"\[reference\]: .*0 < r < R"),
     ("family", {"name": "a"}, r"\[\[family\]\] must be a list"),
-    ("family", ["files"], r"\[\[family\]\]: entry 1 must be a table"),
+    ("family", ["files"], r"\[\[family\]\] 1 must be a table"),
     ("family.0.level", [1], rf"{re.escape(FAMILY)}: level is unknown; did you mean levels\?"),
     ("family.0.colour", 1, "colour is unknown; known are levels, source, name, order_by"),
     ("family", [{**DECIMATED, "mesh": "a.ply"}], "mesh: must be a table that names a source"),
@@ -179,12 +179,6 @@ def test_large_and_deep_tables_are_refused_before_they_take_memory() -> None:
     finally:
         tracemalloc.stop()
     assert peak_bytes < 48 << 20
-
-
-@pytest.mark.slow
-def test_all_values_together_are_bounded() -> None:
-    families = [{"name": f"f{i}", "source": "files", "paths": ["a"] * 10_000} for i in range(101)]
-    assert "more than 1000000 values" in refusal(small_table(family=families))
 
 
 @pytest.mark.parametrize("key", ["a\nb", "x" * 10_000, "\u202ename", "", "a.b", " "])
