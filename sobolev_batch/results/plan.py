@@ -12,7 +12,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
-from sobolev_batch.batch.fields.memory import TaskSizes, size_rows
+from sobolev_batch.batch.fields.compute import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice

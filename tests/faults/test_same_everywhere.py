@@ -39,7 +39,7 @@ from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.fields.tasks import FieldSettings, Job, compute_mesh
+from sobolev_batch.batch.fields.tasks import Job, compute_mesh
 from tests.support.studies import small_table
 
 plan = make_plan(Study.from_table(small_table()))
@@ -49,7 +49,7 @@ sys.stdin.readline()
 for i, row in Workspace.for_plan(store, plan).rows.items():
     if row.label == "reference":
         continue
-    job = Job(store, i, row, FieldSettings.for_plan(plan))
+    job = Job.for_row(plan, row, store, i)
     for _ in range(5):
         store.write_record(i, None)
         assert compute_mesh(job, plan.blocks).status == "complete"

@@ -19,7 +19,7 @@ import xarray as xr
 
 from sobolev_batch.batch.analysis.datasets import TableOrder
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
-from sobolev_batch.batch.fields.memory import MESH_BYTES
+from sobolev_batch.batch.fields.compute import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import table_attributes, write_table

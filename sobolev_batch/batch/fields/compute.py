@@ -1,32 +1,45 @@
-"""The fields that a store lacks: copied from other stores, or computed as tasks of the cluster."""
+"""The fields that a store lacks: copied from other stores, or computed as tasks that fit into the workers' memory."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
-from sobolev_batch.batch.fields.memory import TaskSizes, reference_in_tasks, size_rows
-from sobolev_batch.batch.fields.tasks import (
-    FieldSettings,
-    Job,
-    compute_blocks,
-    compute_mesh,
-    compute_octaves,
-    finish_mesh,
-)
+from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, compute_octaves, finish_mesh
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.workspace import Workspace, complete_records
-from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.errors import ClusterError, DamageError, StoreError
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import projected_bytes
+from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 _log = logging.getLogger(__name__)
 
 # Most of the time of a copy is spent waiting for disks or object storage.
 _THREADS = 4
+# Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
+MESH_BYTES = 100.0
+# With less, the batches of points of a transform become so small that it is slow.
+LEAST_TRANSFORM_BYTES = 256e6
+# For the choice of quadrature rules, for each triangle.
+_CHOICE_BYTES = 100.0
+# Of a sample of octaves: its frequency, weight, place and value, and what makes them.
+_SAMPLE_BYTES = 150.0
+# Every task of a study with octaves loads the reference too, but for a larger one.
+_LARGEST_REFERENCE = 3 << 20
 
 
 def copy_fields(workspace: Workspace, others: Sequence[Location]) -> list[int]:
@@ -99,14 +112,13 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
     for i in pending:
         if rows[i].label in refused:
             give_up(i, refused[rows[i].label])
-    settings, reference = FieldSettings.for_plan(plan), reference_in_tasks(plan)
+    reference = _reference_in_tasks(plan)
 
     def tasks() -> Iterator[Task]:
         for i in pending:
             row = rows[i]
             if row.label in sizes:
-                allowed_bytes = sizes[row.label].allowed_bytes
-                job = Job(store, i, row, settings, plan.distance_target(row), allowed_bytes, reference)
+                job = Job.for_row(plan, row, store, i, sizes[row.label].allowed_bytes, reference)
                 yield _field_task(job, sizes[row.label])
 
     projected_bytes = max((size.projected_bytes for size in sizes.values()), default=0.0)
@@ -119,11 +131,117 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
 
 def _field_task(job: Job, sizes: TaskSizes) -> Task:
     """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
-    needs_gpu = job.settings.backend == "gpu"
+    needs_gpu = job.backend == "gpu"
     if len(sizes.block_groups) == 1:
         (blocks,) = sizes.block_groups
         return Task(compute_mesh, (job, blocks), sizes.projected_bytes, needs_gpu, job.index, job.row.label)
     groups = [Task(compute_blocks, (job, blocks), sizes.projected_bytes, needs_gpu) for blocks in sizes.block_groups]
-    if job.settings.tail is not None:
+    if job.tail is not None:
         groups.append(Task(compute_octaves, (job,), sizes.projected_bytes, needs_gpu))
     return Task(finish_mesh, (job, groups), row=job.index, label=job.row.label)
+
+
+@dataclass(frozen=True)
+class TaskSizes:
+    """The tasks of one row.
+
+    Attributes:
+        block_groups: Groups of blocks of the lattice. The blocks of a group are computed in one task.
+        allowed_bytes: Memory that one transform may take besides its mesh and its block.
+        projected_bytes: Projected memory of a task.
+        octave_tasks: Number of tasks of their own for octaves, where the field has more than one task.
+    """
+
+    block_groups: tuple[tuple[Block, ...], ...]
+    allowed_bytes: float
+    projected_bytes: float
+    octave_tasks: int = 0
+
+    @property
+    def task_count(self) -> int:
+        """Number of tasks."""
+        # Several groups have a task for the record too.
+        return 1 if len(self.block_groups) == 1 else len(self.block_groups) + 1 + self.octave_tasks
+
+
+def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
+    """Return the tasks of rows by their labels, and the reason for each row that fits into no worker.
+
+    Raises:
+        ClusterError: The lattice itself fits into no worker, whatever the mesh.
+    """
+    octaves = _octave_memory(plan)
+
+    def sizes_for(size: ExpectedSize) -> TaskSizes:
+        return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), octaves)
+
+    sizes_for(ExpectedSize())
+    sizes, refused = {}, {}
+    for row in rows:
+        try:
+            sizes[row.label] = sizes_for(row.member.expected_size())
+        except ClusterError as error:
+            refused[row.label] = f"the mesh is too large: {error}"
+    return sizes, refused
+
+
+def _reference_in_tasks(plan: Plan) -> Row | None:
+    """Return the reference as tasks of octaves load it beside their mesh; None without octaves, or if it is huge."""
+    row = next(row for row in plan.rows if row.label == plan.reference)
+    is_small = row.member.expected_size().triangles <= _LARGEST_REFERENCE
+    return row if plan.tail is not None and is_small else None
+
+
+def _octave_memory(plan: Plan) -> tuple[Block, float] | None:
+    """Return the largest block that octaves transform, and the bytes of their samples and of the reference."""
+    if plan.tail is None:
+        return None
+    blocks = [lattice.half for sampling in plan.tail.octaves for lattice in sampling.lattices]
+    reference = _reference_in_tasks(plan)
+    triangles = 0 if reference is None else reference.member.expected_size().triangles
+    largest = max([plan.blocks[0], *blocks], key=lambda block: block.size)
+    return largest, _SAMPLE_BYTES * plan.tail.size + MESH_BYTES * triangles
+
+
+def size_tasks(
+    blocks: Sequence[Block],
+    transform: TransformSettings,
+    size: ExpectedSize,
+    workers: Workers,
+    rows: int,
+    octaves: tuple[Block, float] | None = None,
+) -> TaskSizes:
+    """Fit a row's tasks into the memory of workers.
+
+    Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
+    within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
+    takes more runs beside fewer others.
+
+    Args:
+        blocks: Blocks of the lattice, all but the last of equal size.
+        transform: Settings of the fields.
+        size: Size of the row's surface.
+        workers: Workers of the cluster.
+        rows: Number of rows that are to be computed.
+        octaves: Largest block that octaves transform, and the bytes that they hold; None without octaves.
+
+    Raises:
+        ClusterError: No worker has the memory.
+    """
+    block, octave_bytes = (blocks[0], 0.0) if octaves is None else octaves
+    block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
+    mesh_bytes = MESH_BYTES * size.triangles
+    # The mesh, the block, and a block that it is added to or compared with.
+    held_bytes = mesh_bytes + 2 * block_bytes + octave_bytes
+    least_bytes = LEAST_TRANSFORM_BYTES + _CHOICE_BYTES * size.triangles
+    loading_bytes = max(size.projected_bytes, mesh_bytes)
+    workers.require_memory(max(loading_bytes, held_bytes + least_bytes))
+    allowed_bytes = max(least_bytes, workers.allowed_bytes_per_task - held_bytes)
+    # The transform seldom takes all that it may, but a mesh may turn out larger than its file suggested.
+    wanted_bytes = projected_bytes(block, transform, triangles=size.triangles) - block_bytes
+    computing_bytes = held_bytes + min(allowed_bytes, max(wanted_bytes, least_bytes))
+    # A task computes as many blocks as leaves two tasks for every thread: each task loads the mesh anew.
+    count = min(len(blocks), max(1, math.ceil(2 * workers.threads / max(rows, 1))))
+    ends = [len(blocks) * k // count for k in range(count + 1)]
+    groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
+    return TaskSizes(groups, allowed_bytes, max(loading_bytes, computing_bytes), int(octaves is not None))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -45,23 +45,6 @@ _POINTS_OF_NORM = 64
 
 
 @dataclass(frozen=True)
-class FieldSettings:
-    """The settings that all fields of a plan share; see `Plan`."""
-
-    lattice: Lattice
-    transform: TransformSettings
-    orders: tuple[float, ...]
-    similarity: Similarity
-    backend: Backends = "auto"
-    tail: TailSampling | None = None
-
-    @classmethod
-    def for_plan(cls, plan: Plan) -> Self:
-        """Return the settings of a plan."""
-        return cls(plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail)
-
-
-@dataclass(frozen=True)
 class Job:
     """The field of one row, and where it is stored.
 
@@ -69,7 +52,7 @@ class Job:
         store: Store of the field.
         index: Index of the row in the store.
         row: Row of the plan.
-        settings: Settings of all fields.
+        lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
         reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
@@ -78,15 +61,46 @@ class Job:
     store: Store
     index: int
     row: Row
-    settings: FieldSettings
+    lattice: Lattice
+    transform: TransformSettings
+    orders: tuple[float, ...]
+    similarity: Similarity
+    backend: Backends = "auto"
+    tail: TailSampling | None = None
     distance_target: DistanceTarget | None = None
     allowed_bytes: float | None = None
     reference: Row | None = None
 
+    @classmethod
+    def for_row(
+        cls,
+        plan: Plan,
+        row: Row,
+        store: Store,
+        index: int,
+        allowed_bytes: float | None = None,
+        reference: Row | None = None,
+    ) -> Self:
+        """Return the job of a row of a plan."""
+        return cls(
+            store,
+            index,
+            row,
+            plan.lattice,
+            plan.transform,
+            plan.study.orders,
+            plan.similarity,
+            plan.study.backend,
+            plan.tail,
+            plan.distance_target(row),
+            allowed_bytes,
+            reference,
+        )
+
     @property
     def execution(self) -> Execution:
         """Execution of the transforms on this worker."""
-        return Execution(worker_backend(self.settings.backend), allowed_bytes=self.allowed_bytes)
+        return Execution(worker_backend(self.backend), allowed_bytes=self.allowed_bytes)
 
     def load(self) -> Surface:
         """Load the surface, in the study's unit.
@@ -98,11 +112,7 @@ class Job:
         return self._loaded(self.row)
 
     def load_reference(self) -> Surface | None:
-        """Load the reference, in the study's unit; None where it is too large.
-
-        Raises:
-            MeshError: See `load`.
-        """
+        """Load the reference, in the study's unit; None where it is too large. See `load` for errors."""
         if self.reference is None:
             return None
         try:
@@ -111,7 +121,7 @@ class Job:
             raise MeshError(f"the reference: {error}") from error
 
     def _loaded(self, row: Row) -> Surface:
-        surface = self.settings.similarity.apply(row.member.load())
+        surface = self.similarity.apply(row.member.load())
         if row.fingerprint and row.member.fingerprint_digest() != row.fingerprint:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
@@ -119,14 +129,12 @@ class Job:
     def transform_settings(self, surface: Surface) -> TransformSettings:
         """Return the settings of a field that is computed block by block, from its a priori error."""
         if self.distance_target is None:
-            return self.settings.transform
-        return choose_settings(
-            surface, self.settings.lattice, self.distance_target.error_target(surface), self.settings.transform
-        )
+            return self.transform
+        return choose_settings(surface, self.lattice, self.distance_target.error_target(surface), self.transform)
 
     def octave_settings(self, surface: Surface) -> Settings:
         """Return a function that gives the settings of a surface's transforms in octaves."""
-        transform = self.settings.transform
+        transform = self.transform
         if self.distance_target is None:
             return lambda surface, lattice: transform
         return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE), transform.dtype)
@@ -153,8 +161,8 @@ class Job:
 class StoredBlocks:
     """The outcome of a task that stored blocks of a field; ``error`` is empty unless it failed."""
 
-    facts: Facts
-    seconds: float
+    facts: Facts = field(default_factory=Facts)
+    seconds: float = 0.0
     error: str = ""
     quality: Quality | None = None
     checksums: tuple[int, ...] = ()
@@ -173,7 +181,7 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
 
     def compute(surface: Surface) -> list[StoredBlocks]:
         field = _store_some(job, surface, blocks)
-        return [field] if job.settings.tail is None else [field, _store_octaves(job, surface)]
+        return [field] if job.tail is None else [field, _store_octaves(job, surface)]
 
     return job.stored_record() or _finished(job, _of_loaded(job, compute))
 
@@ -205,23 +213,22 @@ def _of_loaded(job: Job, compute: Callable[[Surface], list[StoredBlocks]]) -> li
     except StoreError:
         raise
     except Exception as error:
-        return [StoredBlocks(Facts(), time.perf_counter() - started, job.failure_reason(error))]
+        return [StoredBlocks(seconds=time.perf_counter() - started, error=job.failure_reason(error))]
     return [replace(first, seconds=time.perf_counter() - started), *others]
 
 
 def _store_some(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
-    is_whole = tuple(blocks) == (job.settings.lattice.half,)
-    stored = _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
-    return replace(stored, facts=_facts_of(surface, stored.facts.points))
+    is_whole = tuple(blocks) == (job.lattice.half,)
+    return _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
 
 
 def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     """Compute and store a surface's values at all samples of octaves."""
-    tail = job.settings.tail
+    tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
     settings = job.octave_settings(surface)
-    values = [octave_values(surface, octave, job.settings.orders, settings, job.execution) for octave in tail.sampled]
+    values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.sampled]
     cutoff, reference = tail.highest_frequency, job.load_reference()
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.checks.radii),
@@ -230,24 +237,25 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         None if reference is None else remainder([surface, reference], [1, -1], cutoff),
     )
     checksum = job.store.write_octaves(job.index, np.concatenate([octave.values for octave in values]))
-    return StoredBlocks(Facts(), 0.0, "", replace(Quality.from_surface(surface, Probe()), tail=quality), (checksum,))
+    return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
-    """Compute and store a field of one block; its facts have the number of points alone."""
-    lattice, transform, execution = job.settings.lattice, job.settings.transform, job.execution
+    """Compute and store a field of one block."""
+    lattice, transform, execution = job.lattice, job.transform, job.execution
     if job.distance_target is not None and not kind_of(surface).is_closed_form:
         error_target = job.distance_target.error_target(surface)
         field = field_for(surface, lattice, error_target, transform, execution)
     else:
-        field = compute_field(surface, lattice, transform, job.settings.orders, execution)
+        field = compute_field(surface, lattice, transform, job.orders, execution)
     checksum = job.store.write_field(job.index, lattice.place(lattice.half), field.values)
-    return StoredBlocks(Facts(points=field.points), 0.0, "", field.quality, (checksum,), (field.backend,))
+    facts = _facts_of(surface, field.points)
+    return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
 
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
-    """Compute and store some of several blocks; the facts have the number of points alone."""
-    lattice, orders, execution = job.settings.lattice, job.settings.orders, job.execution
+    """Compute and store some of several blocks."""
+    lattice, orders, execution = job.lattice, job.orders, job.execution
     transform = job.transform_settings(surface)
     plan = transform.plan(surface, lattice)
     draws = draws_for([surface], lattice, orders, plan.lowest_degree)
@@ -259,7 +267,9 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
         backends.append(result.backend)
         points = result.points
     quality = Quality.from_surface(surface, join(probes))
-    return StoredBlocks(Facts(points=points), 0.0, "", quality, tuple(checksums), tuple(backends))
+    return StoredBlocks(
+        _facts_of(surface, points), quality=quality, checksums=tuple(checksums), backends=tuple(backends)
+    )
 
 
 def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:

@@ -12,7 +12,6 @@ import pytest
 
 from sobolev_batch import Study
 from sobolev_batch.batch.fields.tasks import (
-    FieldSettings,
     Job,
     compute_blocks,
     compute_mesh,
@@ -30,7 +29,7 @@ FINE = small_table(family=[{"name": "ico", "source": "icosphere", "levels": [0, 
 
 def job_of(plan: Plan, store_path: Path, label: str = "ico/5", allowed_bytes: float | None = None) -> Job:
     row = next(row for row in plan.rows if row.label == label)
-    return Job(prepare_store(store_path, plan), 0, row, FieldSettings.for_plan(plan), allowed_bytes=allowed_bytes)
+    return Job.for_row(plan, row, prepare_store(store_path, plan), 0, allowed_bytes)
 
 
 def test_a_mesh_is_one_task_that_adds_up_batches_as_large_as_the_memory_allows(
