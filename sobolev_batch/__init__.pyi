@@ -67,9 +67,9 @@ from .spectral.metrics.norms import proportion as proportion
 from .spectral.metrics.spectrum import spectrum as spectrum
 from .spectral.metrics.witness import witness as witness
 from .spectral.metrics.yardsticks import yardsticks as yardsticks
-from .surfaces.formats.objects import as_mesh as as_mesh
-from .surfaces.formats.objects import write_mesh as write_mesh
+from .surfaces.formats.readers import as_mesh as as_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh
+from .surfaces.formats.readers import write_mesh as write_mesh
 from .surfaces.proximity import Proximity as Proximity
 from .surfaces.proximity import proximity as proximity
 from .surfaces.shapes.closed_forms import Ellipsoid as Ellipsoid

@@ -283,8 +283,7 @@ def fit_command(
     from sobolev_batch.fitting.fit import fit
     from sobolev_batch.fitting.problem import require_comparable
     from sobolev_batch.fitting.refine import refine
-    from sobolev_batch.surfaces.formats.objects import require_writable, write_mesh
-    from sobolev_batch.surfaces.formats.readers import read_mesh
+    from sobolev_batch.surfaces.formats.readers import read_mesh, require_writable, write_mesh
     from sobolev_batch.surfaces.shapes.mesh import Mesh
     from sobolev_batch.surfaces.shapes.surface import Similarity
 

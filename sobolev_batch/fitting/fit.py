@@ -17,7 +17,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.metrics.norms import distance
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
-from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
+from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 

@@ -17,7 +17,7 @@ from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
-from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
+from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
 

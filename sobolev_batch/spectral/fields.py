@@ -26,7 +26,7 @@ from sobolev_batch.spectral.transform.settings import (
     thread_count,
 )
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
+from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 # The orders that a field is probed for if none are named.

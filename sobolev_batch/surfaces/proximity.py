@@ -9,7 +9,7 @@ import numpy as np
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import check_seed, is_whole_number
-from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
+from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 DEFAULT_POINTS = 10_000

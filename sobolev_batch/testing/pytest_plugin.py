@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from sobolev_batch.surfaces.formats.objects import SurfaceLike
+    from sobolev_batch.surfaces.formats.readers import SurfaceLike
     from sobolev_batch.testing.verdict import Verdict
 
 _OPTION, _INI = "--sobolev-witness-folder", "sobolev_witness_folder"

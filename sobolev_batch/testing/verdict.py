@@ -13,7 +13,7 @@ from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.shells import single_order
-from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
+from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
 from sobolev_batch.visible import table_html

@@ -13,7 +13,7 @@ from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Complexes, Reals, shell_sums
-from sobolev_batch.surfaces.formats.objects import SurfaceLike, as_surface
+from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Operand = Surface | xr.DataArray

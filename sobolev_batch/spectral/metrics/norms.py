@@ -41,7 +41,7 @@ from sobolev_batch.spectral.metrics.inputs import (
     shells_of,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
-from sobolev_batch.surfaces.formats.objects import as_surface
+from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 

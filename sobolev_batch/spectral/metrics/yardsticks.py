@@ -21,7 +21,7 @@ from sobolev_batch.spectral.metrics.datasets import labelled
 from sobolev_batch.spectral.metrics.norms import accuracy_of, distance, to_accuracy
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution
-from sobolev_batch.surfaces.formats.objects import MeshLike, as_mesh
+from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.sources.displaced import with_noise
 from sobolev_batch.surfaces.sources.reduced import decimated

@@ -15,7 +15,7 @@ from unittest import mock
 from pydantic import ValidationError
 
 from sobolev_batch.errors import MeshError, StudyError
-from sobolev_batch.surfaces.formats.objects import SURFACE_KINDS
+from sobolev_batch.surfaces.formats.readers import SURFACE_KINDS
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.names import duplicate_names, label_problem, quoted

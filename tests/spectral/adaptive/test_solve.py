@@ -162,7 +162,7 @@ def test_refuses_what_has_no_meaning() -> None:
     with pytest.raises(InputError, match=r"memory must be a positive number of bytes, or a size .* found 'much'"):
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory="much")
     with pytest.raises(InputError, match=r"expected a Mesh, the path of a mesh file, .*; found int"):
-        distance(7, Sphere(), -2.0, rtol=1e-3)  # type: ignore[arg-type]
+        distance(7, Sphere(), -2.0, rtol=1e-3)
     with pytest.raises(InputError, match=r"1e-06 GB of memory are too little"):
         distance(BOX, Sphere(), -2.0, rtol=1e-3, memory=1e3)
 

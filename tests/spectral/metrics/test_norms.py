@@ -97,7 +97,7 @@ def test_refuses_what_cannot_be_compared() -> None:
     with pytest.raises(InputError, match="needs a lattice"):
         norm(BOX, -2)
     with pytest.raises(InputError, match="found dict"):
-        norm({}, -2)  # type: ignore[arg-type]
+        norm({}, -2)
     with pytest.raises(LatticeError, match="select one mesh"):
         norm(field.expand_dims(mesh=["a"]), -2)
 

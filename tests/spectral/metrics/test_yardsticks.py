@@ -77,6 +77,6 @@ def test_what_is_like_nothing() -> None:
     far = yardsticks(Mesh(2 * np.asarray(BALL.vertices), BALL.triangles), BALL, -4.0, lattice=Lattice(3.0, 48))
     assert np.isnan(far["moved"].item())
     with pytest.raises(InputError, match="found Sphere"):
-        yardsticks(Sphere(), BALL, -2.0, lattice=LATTICE)  # type: ignore[arg-type]
+        yardsticks(Sphere(), BALL, -2.0, lattice=LATTICE)
     with pytest.raises(InputError, match="seed must be a whole number from 0 on, found -1"):
         yardsticks(moved(0.1), BALL, -2.0, lattice=LATTICE, seed=-1)

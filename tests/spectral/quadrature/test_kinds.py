@@ -72,7 +72,7 @@ def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> No
     with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised surface .*, found str"):
         kind_of("torus.ply")
     with pytest.raises(InputError, match=r"expected a Mesh, .*; found dict"):
-        fourier_transform({}, Lattice(1.0, 4))  # type: ignore[arg-type]
+        fourier_transform({}, Lattice(1.0, 4))
 
 
 def test_the_rules_of_a_field_are_chosen_once(monkeypatch: pytest.MonkeyPatch) -> None:

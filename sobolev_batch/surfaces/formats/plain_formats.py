@@ -1,21 +1,26 @@
-"""OBJ, OFF and STL files, read with every line and every announced count checked, and written.
+"""PLY, OBJ, OFF and STL files, read with every line and every announced count checked, and written.
 
-The libraries at hand silently lose or change faces where a line is not what they expect.
+PLY files are parsed by the library plyfile. Those at hand for the others silently lose or change faces where a line is
+not what they expect.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import re
 from array import array
 from collections.abc import Iterator
 from itertools import islice
+from tempfile import TemporaryFile
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyElementParseError
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans
+from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans, triangle_fans_of_lists
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
@@ -26,11 +31,53 @@ _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 # Digits of an index or count: all that fit into 64 bits.
 _MOST_DIGITS = 18
 # Characters of a line: a polygon of a hundred thousand corners.
-LONGEST_LINE = 1 << 20
+_LONGEST_LINE = 1 << 20
 # Seventeen digits give every double back.
 _DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# A header of PLY ends within this many bytes: room for a thousand lines, and quick to look through.
+HEADER_BYTES = 1 << 16
+_END = b"end_header"
+_LINE = re.compile(rb"\S[^\r\n]*")
+_CORNERS = ("vertex_indices", "vertex_index")
+_SHORT, _LONG = (b"short", b"ushort", b"int16", b"uint16"), (b"int", b"uint", b"float", b"int32", b"uint32", b"float32")
+_TYPE_BYTES = dict.fromkeys(_SHORT, 2) | dict.fromkeys(_LONG, 4) | dict.fromkeys((b"double", b"float64"), 8)
+# A digit and the character that ends it.
+_TEXT_BYTES = 2
+
+
+def parse_ply(data: bytes) -> Raw:
+    """Return the vertices and triangles of a PLY file, in its own precision.
+
+    Raises:
+        MeshError: There are no vertices or faces, or the counts do not fit the contents.
+    """
+    counts, is_text = _checked_counts(data)
+    if is_text:
+        ply = _parsed(data)
+    else:
+        # A real file: the library reads other streams row by row.
+        with TemporaryFile() as stream:
+            stream.write(data)
+            del data
+            ply = _parsed(stream)
+            read = stream.tell()
+            unread = stream.seek(0, os.SEEK_END) - read
+        if unread:
+            raise MeshError(f"the PLY header announces {counts}, but {unread} bytes more follow")
+    vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
+    return vertices, _triangles(ply["face"])
+
+
+def announced_sizes(header: bytes) -> tuple[int, int, bool]:
+    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text.
+
+    Raises:
+        MeshError: A count is no integer.
+    """
+    counts, _, is_text = _announced(header.partition(_END)[0])
+    return counts.get("vertex", 0), counts.get("face", 0), is_text
 
 
 def parse_obj(data: bytes) -> Raw:
@@ -49,7 +96,7 @@ def parse_obj(data: bytes) -> Raw:
             number = len(vertices) // 3 + 1
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
                 raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
-            vertices.extend(parsed_numbers(words[1:4], f"vertex {number}"))
+            vertices.extend(_parsed_numbers(words[1:4], f"vertex {number}"))
         elif words[0] == "f":
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
@@ -66,12 +113,12 @@ def parse_off(data: bytes) -> Raw:
         MeshError: The counts do not fit the lines, or a line is malformed.
     """
     filled, last = 0, ""
-    for last in text_lines(data):
+    for last in _text_lines(data):
         filled += bool(last.partition("#")[0].strip())
     # Without a line end, the last number may have lost digits.
     if last[-1:] != "\n" and (words := last.partition("#")[0].split()) and not _complete_face(words):
         raise MeshError("the OFF file breaks off in its last line")
-    lines = (words for line in text_lines(data) if (words := line.partition("#")[0].split()))
+    lines = (words for line in _text_lines(data) if (words := line.partition("#")[0].split()))
     first = next(lines, [""])
     kind = re.fullmatch(r"(C?N?)OFF", first[0])
     if kind is None:
@@ -117,6 +164,19 @@ def parse_stl(data: bytes) -> Raw:
     return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
+def write_ply(mesh: Mesh) -> bytes:
+    """Return a binary PLY file, all digits kept."""
+    vertices = np.empty(len(mesh.vertices), dtype=[(axis, "<f8") for axis in "xyz"])
+    for axis, column in zip("xyz", mesh.vertices.T, strict=True):
+        vertices[axis] = column
+    faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    file = io.BytesIO()
+    PlyData(elements, text=False, byte_order="<").write(file)
+    return file.getvalue()
+
+
 def write_obj(mesh: Mesh) -> bytes:
     """Return an OBJ file, all digits kept."""
     file = io.BytesIO()
@@ -141,22 +201,20 @@ def write_stl(mesh: Mesh) -> bytes:
     return bytes(trimesh.exchange.stl.export_stl(mesh.to_trimesh()))
 
 
-def text_lines(data: bytes, errors: str = "replace") -> Iterator[str]:
+def _text_lines(data: bytes) -> Iterator[str]:
     """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack.
-
-    Args:
-        data: Contents of the file, in UTF-8.
-        errors: What happens to other bytes, as Python names it.
 
     Raises:
         MeshError: A line is longer than any mesh needs.
     """
-    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors=errors)
+    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors="replace")
     number = 0
-    while line := reader.readline(LONGEST_LINE + 1):
+    while line := reader.readline(_LONGEST_LINE + 1):
         number += 1
-        if len(line) > LONGEST_LINE:
-            raise MeshError(f"line {number} has more than {LONGEST_LINE} characters; cut its polygon into smaller ones")
+        if len(line) > _LONGEST_LINE:
+            raise MeshError(
+                f"line {number} has more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
+            )
         yield line
 
 
@@ -164,13 +222,13 @@ def _joined_lines(data: bytes) -> Iterator[str]:
     """Yield the lines of an OBJ file, where one that ends in a backslash goes on in the next."""
     parts: list[str] = []
     length = 0
-    for line in text_lines(data):
+    for line in _text_lines(data):
         is_continued = line.endswith("\\\n")
         parts.append(f"{line[:-2]} " if is_continued else line)
         length += len(line)
-        if length > LONGEST_LINE:
+        if length > _LONGEST_LINE:
             raise MeshError(
-                f"a line goes on for more than {LONGEST_LINE} characters; cut its polygon into smaller ones"
+                f"a line goes on for more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
             )
         if not is_continued:
             yield "".join(parts)
@@ -184,7 +242,7 @@ def _is_count(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) <= _MOST_DIGITS
 
 
-def parsed_numbers(words: list[str], owner: str) -> list[float]:
+def _parsed_numbers(words: list[str], owner: str) -> list[float]:
     """Return words as numbers.
 
     Raises:
@@ -196,15 +254,6 @@ def parsed_numbers(words: list[str], owner: str) -> list[float]:
         return [float(word) for word in words]
     except ValueError as error:
         raise MeshError(f"{owner} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
-
-
-def parsed_integers(words: list[str], owner: str) -> list[int]:
-    """Return words as integers.
-
-    Raises:
-        MeshError: A word is no integer; the message starts with the owner, such as "the section POLYGONS".
-    """
-    return [_integer(word, owner) for word in words]
 
 
 def _integer(word: str, owner: str) -> int:
@@ -231,7 +280,7 @@ def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
 def _off_vertex(words: list[str], number: int, expected: int) -> list[float]:
     if len(words) != expected:
         raise MeshError(f"vertex {number} has {len(words)} numbers, expected {expected}")
-    return parsed_numbers(words, f"vertex {number}")[:3]
+    return _parsed_numbers(words, f"vertex {number}")[:3]
 
 
 def _off_polygon(words: list[str], number: int) -> list[int]:
@@ -248,7 +297,7 @@ def _complete_face(words: list[str]) -> bool:
 def _stl_text_corners(data: bytes) -> NDArray[np.float64]:
     corners = array("d")
     facet, facet_corners, in_solid = 0, 0, False
-    for line in text_lines(data):
+    for line in _text_lines(data):
         words = line.split()
         match words[0].lower() if words else "":
             case "":
@@ -260,7 +309,7 @@ def _stl_text_corners(data: bytes) -> NDArray[np.float64]:
             case "vertex":
                 if len(words) != 4:
                     raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
-                corners.extend(parsed_numbers(words[1:], f"facet {facet}"))
+                corners.extend(_parsed_numbers(words[1:], f"facet {facet}"))
                 facet_corners += 1
             case "endfacet":
                 if facet_corners != 3:
@@ -273,3 +322,90 @@ def _stl_text_corners(data: bytes) -> NDArray[np.float64]:
     if in_solid or facet_corners:
         raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
     return np.array(corners).reshape(-1, 3)
+
+
+def _announced(header: bytes) -> tuple[dict[str, int], int, bool]:
+    """Return the number of entries of each element, their smallest possible length, and whether they are text.
+
+    The library complains of malformed lines.
+    """
+    counts: dict[str, int] = {}
+    row_bytes: dict[str, int] = {}
+    element, is_text = "", False
+    for line in header.splitlines():
+        match line.split():
+            case [b"format", kind, *_]:
+                is_text = kind == b"ascii"
+            case [b"element", name, count, *_]:
+                element = name.decode("ascii", errors="replace")
+                if not count.isdigit() or len(count) > _MOST_DIGITS:
+                    raise MeshError(f"the PLY header announces {count[:40]!r} entries of {element[:40]!r}")
+                counts[element], row_bytes[element] = int(count), 0
+            case [b"property", b"list", kind, _, _] | [b"property", kind, _] if element:
+                row_bytes[element] += _TEXT_BYTES if is_text else _TYPE_BYTES.get(kind, 1)
+    # The last number of a text need not be followed by anything.
+    least_bytes = sum(count * max(row_bytes[name], 1) for name, count in counts.items()) - is_text
+    return counts, least_bytes, is_text
+
+
+def _checked_counts(data: bytes) -> tuple[dict[str, int], bool]:
+    """Return the counts that a header announces, which its contents can have, and whether they are text."""
+    start = data.find(_END, 0, HEADER_BYTES)
+    length = len(data) - start - len(_END)
+    counts, least_bytes, is_text = _announced(data[: max(start, 0)])
+    if counts.get("vertex") and not counts.get("face"):
+        raise MeshError(
+            f"the PLY file has {counts['vertex']} vertices and no faces: it holds points and no surface; make a mesh "
+            "of them first"
+        )
+    if start < 0 or not {"vertex", "face"} <= set(counts):
+        raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
+    # The library would reserve memory for any count.
+    if least_bytes > length:
+        raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
+    if is_text and data.find(b"_", start + len(_END)) >= 0:
+        raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
+    entries = sum(counts.values())
+    lines = _line_count(data, start) if is_text else entries
+    if lines != entries:
+        raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
+    return counts, is_text
+
+
+def _line_count(data: bytes, start: int) -> int:
+    """Return the number of lines of a text that are not empty, after the one that begins at a place."""
+    count = 0
+    # From the first visible character of each line on: no list of all lines, and no line looked through twice.
+    for line in _LINE.finditer(data, start):
+        if line.end() - line.start() > _LONGEST_LINE:
+            raise MeshError(f"a line of the PLY file has more than {_LONGEST_LINE} characters; cut its polygon")
+        count += 1
+    return count - 1
+
+
+def _parsed(source: bytes | IO[bytes]) -> PlyData:
+    try:
+        # Reads all faces at once; the library refuses where one of them is no triangle.
+        return _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
+    except (PlyElementParseError, KeyError):
+        return _read(source, {})
+
+
+def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:
+    # The library closes the stream of a text.
+    stream = io.BytesIO(source) if isinstance(source, bytes) else source
+    stream.seek(0)
+    return PlyData.read(stream, known_list_len=lengths)
+
+
+def _triangles(faces: PlyElement) -> NDArray[np.int64]:
+    names = [name for name in _CORNERS if name in faces.data.dtype.names]
+    if not names:
+        raise MeshError("the PLY faces have no list vertex_indices")
+    kind = faces.ply_property(names[0]).val_dtype
+    if not kind.startswith(("i", "u")):
+        raise MeshError(f"the PLY faces have indices that are not integers, but of the type {kind}")
+    corners = faces[names[0]]
+    if corners.ndim == 2:
+        return np.asarray(corners, dtype=np.int64)
+    return triangle_fans_of_lists(corners)
