@@ -1,4 +1,4 @@
-"""A first study file for a folder of meshes."""
+"""A first study file for a folder of meshes. What its files are for is guessed from their names and sizes."""
 
 from __future__ import annotations
 
@@ -7,19 +7,30 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from sobolev_batch.batch.study.collection import METHOD, OBJECT, StudyCollection, is_collection
-from sobolev_batch.batch.study.mesh_folder import Layout, MeshFile, free_name, guess_layout, with_any_size
 from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.batch.study.schema import RESERVED
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.errors import StudyError
-from sobolev_batch.surfaces.formats.readers import mesh_stem
-from sobolev_batch.surfaces.sources.files import FileMember, FileSource, expand
+from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
+from sobolev_batch.surfaces.sources.files import MOST_MESHES, FileMember, FileSource, expand
+from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.visible import HAZARDOUS, reasons, table_html, visible
 
+# Bytes of files that are read as a whole; the header or the length of others gives their size.
+_MOST_BYTES = 32 << 20
+# Words in the names of references, and of folders that hold references.
+_REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_]*truth|gt)(?![^\W\d_])", re.IGNORECASE)
+# Only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
+_REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
+# The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
+_SIZE = re.compile(r"(?P<separator>[\W_]*)\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
+_LONGEST_NAME = 100
 # More lines of one kind, or objects on a line, would hide what comes next.
 _MOST_LINES, _MOST_OBJECTS = 10, 6
 # Lists of paths are broken into lines where they are longer.
@@ -48,18 +59,18 @@ _TAIL = """
 # [proximity]              # Hausdorff and Chamfer distances beside ours; needs the extra "vtk"
 # points = 10000
 """
-_REFERENCE = """\
+_REFERENCE_SECTION = """\
 [reference]                # {remark}
 source = "files"
 {paths}
 """
-_FAMILY = """
+_FAMILY_SECTION = """
 [[family]]
 name = {name}
 source = "files"
 {paths}
 """
-_DECIMATED = """
+_DECIMATED_SECTION = """
 [[family]]
 name = "quadric decimation"
 source = "decimate"
@@ -142,15 +153,25 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if os.path.lexists(output):
         # Before files are looked at, which may take a while.
         raise StudyError(f"{output} exists already; name another file, or move it away")
-    layout = guess_layout(folder)
+    if not folder.is_dir():
+        raise StudyError(f"{folder}: there is no such folder; name one with mesh files")
     # Links are followed, as the system follows them from the study file on.
     base = output.parent.resolve()
     relative = Path(os.path.relpath(folder.resolve(), base)).as_posix()
     if OBJECT in relative or METHOD in relative:
         raise StudyError(f"{folder}: its name holds {OBJECT} or {METHOD}, which study files replace; rename it")
     prefix = "" if relative == "." else f"{relative}/"
-    sections, summary = (_one_object if "" in layout.references else _several_objects)(layout, base, prefix)
-    text = f"{_HEAD.format(name=_toml(free_name(folder.resolve().name, fallback='study')))}{sections}{_TAIL}"
+    sizes, left_out = _look_at(folder)
+    several = _several_objects(list(sizes))
+    if several is None:
+        reference = _reference(folder, sizes, left_out)
+        sections, summary = _sections_of_one(reference, sizes, base, prefix)
+    else:
+        references, methods = several
+        sections, summary = _sections_of_several(references, methods, base, prefix)
+        used = {*references.values(), *(path for paths in methods.values() for path in paths)}
+        left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
+    text = f"{_HEAD.format(name=_toml(_free_name(folder.resolve().name, fallback='study')))}{sections}{_TAIL}"
     table = tomllib.loads(text)
     if is_collection(table):
         StudyCollection.from_table(table, folder=base)
@@ -162,44 +183,215 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
             file.write(data)
     except (OSError, UnicodeEncodeError) as error:
         raise StudyError(f"{output}: no study can be written there: {getattr(error, 'strerror', error)}") from error
-    return StudyDraft(output, summary, layout.left_out)
+    return StudyDraft(output, summary, left_out)
 
 
-def _one_object(layout: Layout, base: Path, prefix: str) -> tuple[str, tuple[str, ...]]:
+def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
+    """Look at the mesh files in a folder and those below, except hidden ones, stores, and links to folders.
+
+    Small files are read as a whole, up to some bytes together.
+
+    Returns:
+        The number of triangles of each file that a study can name, in the natural order of their paths below the
+        folder, and the reason for each other file.
+    """
+    sizes: dict[PurePosixPath, int] = {}
+    left_out: dict[str, str] = {}
+    left = _MOST_BYTES
+    names: dict[str, str] = {}
+    for below in sorted(_mesh_names(folder), key=natural_key):
+        other = names.setdefault(caseless_key(below), below)
+        try:
+            if other != below:
+                raise MeshError(f"its name differs from that of {quoted(other)} only in case or accents; rename one")
+            problem = label_problem(below)
+            if problem is not None:
+                raise MeshError(f"its name cannot be a label: {problem}; rename it")
+            if OBJECT in below or METHOD in below:
+                raise MeshError(f"its name holds {OBJECT} or {METHOD}, which study files replace; rename it")
+            (triangles, _), size = expected_size(folder / below), (folder / below).stat().st_size
+            # A file without an expected size is of another format, damaged or empty.
+            if size <= left or not triangles:
+                left -= size
+                triangles = len(read_mesh(folder / below).triangles)
+            sizes[PurePosixPath(below)] = triangles
+        except (MeshError, OSError) as error:
+            left_out[below] = str(error).removeprefix(f"{folder / below}: ")
+    return sizes, left_out
+
+
+def _mesh_names(folder: Path) -> Iterator[str]:
+    count = 0
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".") and not name.endswith(".zarr")]
+        for name in names:
+            if name.startswith(".") or not is_mesh_name(Path(name)):
+                continue
+            count += 1
+            if count > MOST_MESHES:
+                raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
+            yield Path(parent, name).relative_to(folder).as_posix()
+
+
+def _stem(path: PurePosixPath) -> str:
+    """Return the name of a file without format and compression."""
+    return mesh_stem(Path(path))
+
+
+def _is_called_reference(path: PurePosixPath) -> bool:
+    """Tell whether the name of a file, or that of a folder on the way to it, is that of a reference."""
+    folders = path.parent.parts
+    return any(map(_REFERENCE.search, (_stem(path), *folders))) or any(map(_REFERENCES.fullmatch, folders[-1:]))
+
+
+def _reference(folder: Path, sizes: Mapping[PurePosixPath, int], left_out: Mapping[str, str]) -> PurePosixPath:
+    """Return the finest file that is called a reference, or else the finest of all."""
+    # Of equals the one with the shortest path: original.ply before original_2.ply.
+    for path in sorted(sizes, key=lambda path: (not _is_called_reference(path), -sizes[path], len(str(path)))):
+        try:
+            read_mesh(folder / path)
+        except MeshError:
+            continue
+        return path
+    examples = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+    raise StudyError(
+        f"{folder} holds no mesh file that can be read{': ' * bool(examples)}{examples}; name a folder with meshes"
+    )
+
+
+def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes") -> str:
+    """Return a name for a family that no other has."""
+    visible = "".join(c if c.isprintable() and c not in "/\\" else " " for c in wanted)
+    name = " ".join(visible.split())[: _LONGEST_NAME - 10].strip() or fallback
+    known = {caseless_key(other) for other in (*taken, REFERENCE_LABEL)}
+    numbered = [name, *(f"{name} {number}" for number in range(2, len(known) + 3))]
+    return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
+
+
+def _with_any_size(stem: str) -> str:
+    """Return the stem of a file with a wildcard for the number at its end."""
+    return _SIZE.sub(lambda size: f"{size['separator']}*", stem)
+
+
+def _without_size(stem: str) -> str:
+    return _SIZE.sub("", stem).rstrip(" _-.")
+
+
+def _families(paths: Sequence[PurePosixPath]) -> dict[str, list[PurePosixPath]]:
+    """Return the files of one object by family: one for each folder, or by what names in one folder have in common."""
+    has_folders = len({path.parent for path in paths}) > 1
+    groups: dict[str, list[PurePosixPath]] = {}
+    for path in paths:
+        # With slashes, or those of a/b and "a b" would be one.
+        groups.setdefault("/".join(path.parent.parts) if has_folders else _without_size(_stem(path)), []).append(path)
+    if not has_folders:
+        alone = [path for members in groups.values() for path in members if len(members) == 1]
+        groups = {name: members for name, members in groups.items() if len(members) > 1}
+        groups.setdefault("", []).extend(alone)
+    families: dict[str, list[PurePosixPath]] = {}
+    for wanted, members in groups.items():
+        if members:
+            families[_free_name(wanted, families)] = members
+    return families
+
+
+# The files of each object and method.
+_Methods = Mapping[tuple[str, str], Sequence[PurePosixPath]]
+
+
+def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosixPath], _Methods] | None:
+    """Return the references by their objects, and the files of these; None where all files are of one object.
+
+    There are several objects if several files are called references, and each has files of its name.
+    """
+    called = [path for path in paths if _is_called_reference(path)]
+    references = {_object_of(path): path for path in called}
+    are_names = all(
+        name_problem(name, _LONGEST_NAME, RESERVED) is None and not name.startswith((".", "__")) for name in references
+    )
+    owned = [(path, owner) for path in paths if path not in called and (owner := _owner(path, references)) is not None]
+    are_all_owners = references.keys() == {owner for _, owner in owned}
+    if not are_names or not are_all_owners or not 2 <= len({*map(caseless_key, references)}) == len(called):
+        return None
+    # Folders that are neither the object's nor those of its reference.
+    folders = [
+        [part for part in path.parent.parts if part not in (name, *references[name].parent.parts)]
+        for path, name in owned
+    ]
+    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
+    families: dict[str, str] = {}
+    methods: dict[tuple[str, str], list[PurePosixPath]] = {}
+    for (path, name), parts in zip(owned, folders, strict=True):
+        # What the name of the file says beside object and size; cowboy in the folder of cow is a method.
+        rest = _stem(path).removeprefix(name)
+        rest = _without_size(_stem(path) if rest[:1].isalnum() else rest).strip(" _-.")
+        # With slashes, or the methods of a/b and "a b" would be one.
+        method = "/".join(parts[shared:]) or rest or "".join(parts[-1:])
+        family = families.setdefault(method, _free_name(method, families.values()))
+        methods.setdefault((name, family), []).append(path)
+    return references, methods
+
+
+def _object_of(reference: PurePosixPath) -> str:
+    """Return the name of the object of a reference: cow of objects/cow.ply, cow/original.ply, cow_original.ply."""
+    rest = _REFERENCE.sub("", _stem(reference)).strip(" _-.")
+    own = [part for part in reference.parent.parts if not _REFERENCE.search(part) and not _REFERENCES.fullmatch(part)]
+    return rest or "".join(own[-1:])
+
+
+def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str | None:
+    """Return the object that a file belongs to: the longest that its name begins with, or that of its folder."""
+    stem = _stem(path)
+    # cow_big_500 is of cow_big, not of cow.
+    beginnings = (stem[:end] for end in range(len(stem), 0, -1) if not stem[end : end + 1].isalnum())
+    return next((name for name in (*beginnings, *path.parent.parts) if name in references), None)
+
+
+def _sections_of_one(
+    reference: PurePosixPath, sizes: Mapping[PurePosixPath, int], base: Path, prefix: str
+) -> tuple[str, tuple[str, ...]]:
     """Return the sections of a study of one object, and what they hold."""
-    reference = layout.references[""]
-    path = f"{prefix}{reference.path}"
-    sizes = [count for part in _FRACTIONS if (count := reference.triangles // part) >= _FEWEST_TRIANGLES]
-    if not layout.files and not sizes:
+    path, triangles = f"{prefix}{reference}", sizes[reference]
+    families = _families([other for other in sizes if other != reference])
+    counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
+    if not families and not counts:
         raise StudyError(
-            f"{reference.path} is the only mesh that can be read, and too small to decimate "
-            f"({reference.triangles} triangles); add meshes to compare with it"
+            f"{reference} is the only mesh that can be read, and too small to decimate ({triangles} triangles); add "
+            "meshes to compare with it"
         )
-    remark = "its name says so" if reference.is_called_reference else "the mesh with the most triangles"
-    sections = _REFERENCE.format(remark=remark, paths=_paths([path]))
-    summary = [f"reference {path}, {reference.triangles:,} triangles"]
-    for (_, family), files in layout.files.items():
-        entries = _entries([f"{prefix}{file.path}" for file in files], base)
-        sections += _FAMILY.format(name=_toml(family), paths=_paths(entries, _size(files)))
-        summary.append(f"family {family}: {_size(files)}")
-    if sizes:
-        decimated = _DECIMATED.format(path=_toml(path), sizes=sizes)
-        if layout.files:
+    remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
+    sections = _REFERENCE_SECTION.format(remark=remark, paths=_paths([path]))
+    summary = [f"reference {path}, {triangles:,} triangles"]
+    for family, members in families.items():
+        ranked = sorted(sizes[member] for member in members)
+        range_of_sizes = f"{ranked[0]:,}" if ranked[0] == ranked[-1] else f"{ranked[0]:,} to {ranked[-1]:,}"
+        size = f"{_count(len(members))}, {range_of_sizes} triangles"
+        entries = _entries([f"{prefix}{member}" for member in members], base)
+        sections += _FAMILY_SECTION.format(name=_toml(family), paths=_paths(entries, size))
+        summary.append(f"family {family}: {size}")
+    if counts:
+        decimated = _DECIMATED_SECTION.format(path=_toml(path), sizes=counts)
+        if families:
             lines = ["Compare with decimation: remove the # in front of these lines.", *decimated.split("\n")[1:-1]]
             decimated = "\n" + "".join(f"# {line}\n" for line in lines)
         sections += decimated
     return sections, tuple(summary)
 
 
-def _several_objects(layout: Layout, base: Path, prefix: str) -> tuple[str, tuple[str, ...]]:
+def _sections_of_several(
+    references: Mapping[str, PurePosixPath], methods: _Methods, base: Path, prefix: str
+) -> tuple[str, tuple[str, ...]]:
     """Return the sections of a study of several objects, and what they hold."""
-    wanted = {(name, REFERENCE_LABEL): {f"{prefix}{file.path}"} for name, file in layout.references.items()}
-    wanted |= {key: {f"{prefix}{file.path}" for file in files} for key, files in layout.files.items()}
-    references = {prefix + _replaced(file.path, name, OBJECT) for name, file in layout.references.items()}
-    templates = {prefix + _template(file, *key) for key, files in layout.files.items() for file in files}
-    everything = [file for files in layout.files.values() for file in files]
-    sections = _REFERENCE.format(remark="of each object", paths=_paths(sorted(references))) + _FAMILY.format(
-        name=_toml(METHOD), paths=_paths(sorted(templates), _size(everything))
+    wanted = {(name, REFERENCE_LABEL): {f"{prefix}{path}"} for name, path in references.items()}
+    wanted |= {key: {f"{prefix}{path}" for path in paths} for key, paths in methods.items()}
+    templates = {prefix + _replaced(str(path), name, OBJECT) for name, path in references.items()}
+    sections = _REFERENCE_SECTION.format(remark="of each object", paths=_paths(sorted(templates)))
+    templates = {prefix + _template(path, *key) for key, paths in methods.items() for path in paths}
+    counts: dict[str, int] = {}
+    for (_, method), paths in methods.items():
+        counts[method] = counts.get(method, 0) + len(paths)
+    sections += _FAMILY_SECTION.format(
+        name=_toml(METHOD), paths=_paths(sorted(templates), _count(sum(counts.values())))
     )
     if _named_files(_HEAD.format(name='"draft"') + sections, base) != wanted:
         rows = [
@@ -208,11 +400,8 @@ def _several_objects(layout: Layout, base: Path, prefix: str) -> tuple[str, tupl
             for path in sorted(paths)
         ]
         sections = f"[objects]\nmeshes = [\n{''.join(rows)}]\n"
-    names = list(layout.references)
+    names = list(references)
     more = f" and {len(names) - _MOST_OBJECTS} more" if len(names) > _MOST_OBJECTS else ""
-    counts: dict[str, int] = {}
-    for (_, method), files in layout.files.items():
-        counts[method] = counts.get(method, 0) + len(files)
     return sections, (
         f"{len(names)} objects: {', '.join(names[:_MOST_OBJECTS])}{more}",
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
@@ -243,7 +432,7 @@ def _entries(paths: Sequence[str], base: Path) -> list[str]:
         kinds.setdefault((path.parent, path.name.removeprefix(mesh_stem(Path(path)))), []).append(str(path))
     entries: list[str] = []
     for (folder, ending), alike in kinds.items():
-        stems = {"*", with_any_size(mesh_stem(Path(alike[0])))} if len(alike) > 1 else set()
+        stems = {"*", _with_any_size(mesh_stem(Path(alike[0])))} if len(alike) > 1 else set()
         globs = [str(folder / f"{stem}{ending}") for stem in sorted(stems) if "*" in stem]
         entries += [glob for glob in globs if _matches(glob, base) == set(alike)][:1] or alike
     return entries
@@ -261,11 +450,11 @@ def _relative(paths: Iterable[Path], base: Path) -> set[str]:
     return {Path(os.path.relpath(path, base)).as_posix() for path in paths}
 
 
-def _template(file: MeshFile, name: str, method: str) -> str:
+def _template(path: PurePosixPath, name: str, method: str) -> str:
     """Return the path of a file with placeholders for object and method, and a wildcard for its size."""
-    path = PurePosixPath(_replaced(_replaced(file.path, name, OBJECT), method, METHOD))
-    stem = mesh_stem(Path(path))
-    return str(path.with_name(with_any_size(stem) + path.name.removeprefix(stem)))
+    path = PurePosixPath(_replaced(_replaced(str(path), name, OBJECT), method, METHOD))
+    stem = _stem(path)
+    return str(path.with_name(_with_any_size(stem) + path.name.removeprefix(stem)))
 
 
 def _replaced(path: str, name: str, placeholder: str) -> str:
@@ -298,10 +487,3 @@ def _toml(text: str) -> str:
 
 def _count(number: int) -> str:
     return f"{number} mesh{'es' * (number != 1)}"
-
-
-def _size(files: Sequence[MeshFile]) -> str:
-    """Return the number and the sizes of the meshes."""
-    counts = sorted(file.triangles for file in files)
-    sizes = f"{counts[0]:,}" if counts[0] == counts[-1] else f"{counts[0]:,} to {counts[-1]:,}"
-    return f"{_count(len(files))}, {sizes} triangles"

@@ -10,7 +10,6 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.batch.study.collection import read_study
-from sobolev_batch.batch.study.mesh_folder import guess_layout
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.commands import call
 
@@ -174,7 +173,7 @@ def test_large_files_do_not_keep_small_ones_from_being_read(tmp_path: Path) -> N
     with (tmp_path / "b.stl").open("r+b") as file:
         file.truncate(1000)
     write(tmp_path / "c.stl", 1)
-    assert "b.stl" in guess_layout(tmp_path).left_out
+    assert "b.stl" in sb.init_study(tmp_path, tmp_path / "study.toml").left_out
 
 
 def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> None:
