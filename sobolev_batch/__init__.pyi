@@ -33,7 +33,7 @@ from .fitting.refine import refine as refine
 from .fitting.tensors import jax_function as jax_function
 from .fitting.tensors import torch_function as torch_function
 from .results.accessor import SobolevAccessor as SobolevAccessor
-from .results.figures.export import write_witness as write_witness
+from .results.figures.meshes import write_witness as write_witness
 from .results.figures.plots import plot_convergence as plot_convergence
 from .results.figures.plots import plot_energy as plot_energy
 from .results.figures.plots import plot_evolution as plot_evolution

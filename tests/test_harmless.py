@@ -23,7 +23,7 @@ ALLOWED_LOADS = {("surfaces/sources/conformance.py", "loads")}
 # Of CUDA's libraries, and of the package's own modules, by names that stand in these modules.
 ALLOWED_IMPORTS = {("spectral/backends/backends.py", "import_module"), ("__init__.py", "import_module")}
 # Of this interpreter, with a script of the package and two files of its own making.
-ALLOWED_PROCESSES = {"results/figures/render.py"}
+ALLOWED_PROCESSES = {"results/figures/views.py"}
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[str, str, ast.Call]]:

@@ -324,22 +324,21 @@ def witness_command(
     length. The study makes the meshes again; a mesh is skipped and named if that fails, or if it is not the one that
     was computed.
     """
-    from sobolev_batch.results.figures.export import Exporter
+    from sobolev_batch.results.figures.meshes import exported
 
-    exporter = Exporter.from_store(store, orders or None, folder)
-    labels = exporter.labels(meshes)
+    made, labels, chosen = exported(store, meshes, orders or None, folder)
     _require_folder(output)
     output.mkdir(parents=True, exist_ok=True)
     is_complete = True
     for label in labels:
         try:
-            field = exporter.field(label)
+            mesh, values = made.with_witness(label, chosen)
         except SobolevBatchError as error:
             echo(f"{label}: {error}", err=True)
             is_complete = False
             continue
-        path = output / f"{exporter.stem(label)}.{style}"
-        field.write(path)
+        path = output / f"{made.stem(label)}.{style}"
+        made.write(path, label, mesh, values, chosen)
         echo(path)
     if not is_complete:
         context.exit(EXIT_SOME_FAILED)

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.export import VertexField
+from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.errors.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 
@@ -74,16 +73,13 @@ def write_difference(
     for label, own, mesh in zip("ab", (a, b), centered, strict=True):
         if not isinstance(own, Mesh) or not isinstance(mesh, Mesh):
             continue
-        used = mesh.used_vertices
-        values = np.full((1, len(mesh.vertices)), np.nan)
-        values[0, used] = witness(fields[0], fields[1], order, mesh.vertices[used], dtype="complex64")
+        values = witness_at_vertices(fields[0], fields[1], (order,), mesh, dtype="complex64")
         vertex = int(np.nanargmax(np.abs(values[0])))
         if abs(values[0, vertex]) > abs(greatest):
             greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
         file = path.with_name(f"{path.name}-{label}.ply")
-        VertexField(own, values, (order,), 1 / similarity.scale, label, "b", path.name, context="comparison").write(
-            file
-        )
+        title = f"{label} against b, comparison {path.name}"
+        write_vertex_values(file, own, values, (order,), title, 1 / similarity.scale, context="comparison")
         written.append(file)
     if not written:
         return "no witness: neither surface is a mesh"

@@ -1,159 +1,30 @@
-"""Meshes of a store for display: made again by its study, simplified, with their witness functions at vertices."""
+"""Meshes of a store for display: simplified, with their witness functions at vertices, and drawn off screen."""
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import fast_simplification
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.study.plan import members_of
-from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, matching_labels, witness_at_vertices
 from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group, reference_of
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
-from sobolev_batch.surfaces.shapes.surface import Similarity
-from sobolev_batch.surfaces.sources.registry import Member
-
-# Labels that a message lists as examples.
-_MOST_LISTED = 3
-
-
-@dataclass(frozen=True)
-class MeshRebuilder:
-    """Makes meshes of a store again.
-
-    Attributes:
-        members: Family and member of each surface that the study lists on this machine, by label.
-        meshes: Table of the store about the computed meshes.
-        similarity: Similarity from the meshes' own unit of length to the study's.
-    """
-
-    members: Mapping[str, tuple[str, Member]]
-    meshes: xr.Dataset
-    similarity: Similarity
-
-    @classmethod
-    def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
-        """Return the rebuilder of an open store.
-
-        Args:
-            tree: Open store.
-            folder: Folder where relative paths in its study start.
-
-        Raises:
-            InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
-        """
-        meshes = finished_group(tree, "meshes")
-        try:
-            members = members_of(Study.from_table(tree.attrs["study"]["table"], folder=folder))
-        except SobolevBatchError as error:
-            raise InputError(f"the study's meshes cannot be listed here: {error}") from error
-        similarity = tree.attrs["similarity"]
-        return cls(members, meshes, Similarity(similarity["scale"], tuple(similarity["origin"])))
-
-    def rebuild(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
-        """Return the mesh of a label in its own unit of length, and in the study's.
-
-        Files may have changed, and a store may name files that its study never read: only a mesh with the
-        stored digest passes.
-
-        Raises:
-            SobolevBatchError: The mesh cannot be made, is too large, or is not the one that was computed.
-        """
-        row = self.meshes.sel(mesh=label)
-        triangles = row["triangles"].item()
-        if row["status"].item() != "complete":
-            raise InputError(f"its status is {row['status'].item()!r}")
-        if label not in self.members:
-            raise InputError("the study makes no such mesh here")
-        if not triangles:
-            raise InputError("a surface that is no mesh has no triangles")
-        if triangles > most_triangles:
-            raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
-        own = self.members[label][1].load()
-        scaled = self.similarity.apply(own)
-        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
-            raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
-        return own, scaled
-
-
-def matching_labels(names: Sequence[str], meshes: xr.Dataset, reference: str) -> tuple[str, ...]:
-    """Return the labels that are meant by names, each once.
-
-    Args:
-        names: Labels, or patterns of them with the wildcards ``*``, ``?`` and ``[...]``. A pattern stands for meshes
-            that are computed and have triangles.
-        meshes: Table of all meshes.
-        reference: Label of the reference, which no pattern stands for.
-
-    Raises:
-        InputError: The store has no such label; the message suggests one of the store.
-    """
-    known: list[str] = meshes["mesh"].values.tolist()
-    usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference)
-    candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
-    chosen: list[str] = []
-    for name in names:
-        if name in known:
-            chosen.append(name)
-            continue
-        is_pattern = any(character in name for character in "*?[")
-        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
-        if not matches:
-            similar = difflib.get_close_matches(name, known, n=1)
-            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
-            raise InputError(
-                f"the store has no computed mesh with triangles that matches {name!r}; "
-                f"its labels are such as {_listed(candidates or known)}"
-                if is_pattern
-                else f"the store has no mesh {name!r}, {remedy}"
-            )
-        chosen += matches
-    return tuple(dict.fromkeys(chosen))
-
-
-def _listed(labels: Sequence[str]) -> str:
-    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])
-
-
-def witness_at(
-    tree: xr.DataTree, label: str, orders: Sequence[float], points: Reals, dtype: ComplexDtype = "complex128"
-) -> Reals:
-    """Return values (orders, n) from the stored fields at points (n, 3) in the study's unit; see `witness`."""
-    fields = tree["fourier"].to_dataset()["fourier"]
-    pair = fields.sel(mesh=label), fields.sel(mesh=reference_of(tree))
-    return np.asarray(witness(*pair, list(orders), points, dtype=dtype).to_numpy(), dtype=np.float64)
-
-
-def witness_at_vertices(tree: xr.DataTree, label: str, mesh: Mesh, orders: Sequence[float]) -> Reals:
-    """Return values (orders, n) at a mesh's own vertices.
-
-    Vertices that no triangle uses have NaN: they may lie beyond the lattice's period.
-
-    Args:
-        tree: Open store with tables.
-        label: Label of the mesh.
-        mesh: Mesh in the study's unit.
-        orders: Orders s.
-    """
-    used = mesh.used_vertices
-    values = np.full((len(orders), len(mesh.vertices)), np.nan)
-    values[:, used] = witness_at(tree, label, orders, mesh.vertices[used])
-    return values
-
 
 Reals = NDArray[np.float64]
 Triangles = NDArray[np.int32]
@@ -175,28 +46,22 @@ _ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
 _MOST_EXTREMES = 4
 _ENOUGH_TRIANGLES = 6_000
 # Larger meshes take minutes to be made again.
-_LARGEST_REBUILT = 2_000_000
-
-
-@dataclass(frozen=True)
-class ViewLimits:
-    """Limits on the size of views.
-
-    Attributes:
-        meshes: Number of meshes.
-        triangles: Number of triangles of each mesh; larger ones are simplified.
-        values: Number of values of all meshes and orders together.
-    """
-
-    meshes: int
-    triangles: int
-    values: int
-
-
-# Beyond, a page would take long to load and to turn; values take 4 bytes each.
-PAGE = ViewLimits(meshes=4, triangles=8_000, values=300_000)
+_LARGEST_MADE = 2_000_000
+# Meshes, triangles of each (larger ones are simplified), and values of all meshes and orders together. A page takes 4
+# bytes for each value, and beyond these limits long to load and to turn.
+PAGE_LIMITS = 4, 8_000, 300_000
 # A picture has hardly more dots on a mesh; values take 8 bytes each, in memory.
-PICTURES = ViewLimits(meshes=100, triangles=200_000, values=50_000_000)
+PICTURE_LIMITS = 100, 200_000, 50_000_000
+
+
+# Pictures (k, height, width, 3) in red, green and blue.
+Pictures = NDArray[np.uint8]
+
+_PROGRAM = Path(__file__).with_name("_render_process.py")
+_REMEDY = (
+    "drawing without a display needs EGL and a renderer, on Debian and Ubuntu: "
+    "apt-get install libegl1 libgl1-mesa-dri libx11-6"
+)
 
 
 @dataclass(frozen=True)
@@ -267,28 +132,15 @@ class MeshView:
         return np.asarray(np.cross(second - first, third - first))
 
 
-@dataclass(frozen=True)
-class Views:
-    """Views of meshes, and reasons for those that are missing.
-
-    Attributes:
-        views: Views in the order of the study.
-        missing: Reason for each requested mesh without a view.
-    """
-
-    views: tuple[MeshView, ...]
-    missing: Mapping[str, str]
-
-
 def make_views(
     tree: xr.DataTree,
     folder: str | Path,
     meshes: Sequence[str] = (),
-    limits: ViewLimits = PAGE,
+    limits: tuple[int, int, int] = PAGE_LIMITS,
     up: Axis = "z",
     orders: Sequence[float] | None = None,
     family: Families = None,
-) -> Views:
+) -> tuple[list[MeshView], dict[str, str]]:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
     Args:
@@ -296,33 +148,37 @@ def make_views(
         folder: Folder where relative paths in the study start.
         meshes: Labels, or patterns such as "scans/*"; by default the closest mesh of each chosen family at the first
             order, and the farthest ones.
-        limits: Limits on the size of the views.
+        limits: Numbers of meshes, of triangles of each, and of values of all of them at most.
         up: Axis that points upwards in the meshes' own coordinates.
         orders: Orders s of the witness functions; default the store's.
         family: Families to choose from, by names or globs; default all.
 
+    Returns:
+        Views in the order of the study, and the reason for each requested mesh without a view, by its label.
+
     Raises:
         InputError: A label or family is unknown, or more meshes are named than may be shown.
     """
-    named = matching_labels(meshes, finished_group(tree, "meshes"), reference_of(tree))
-    if len(named) > limits.meshes:
-        raise InputError(f"at most {limits.meshes} meshes can be shown, found {len(named)}")
+    most_meshes, most_triangles, most_values = limits
+    named = matching_labels(tree, meshes)
+    if len(named) > most_meshes:
+        raise InputError(f"at most {most_meshes} meshes can be shown, found {len(named)}")
     chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
     labels = named or tuple(_extremes(tree, chosen[0], chosen_families(tree, family)))
     try:
-        rebuilder = MeshRebuilder.from_tree(tree, folder)
+        study_meshes = StudyMeshes.from_tree(tree, folder)
     except InputError as error:
-        return Views((), dict.fromkeys(labels, str(error)))
+        return [], dict.fromkeys(labels, str(error))
     # A closed mesh has half as many vertices as triangles.
-    most_triangles = min(limits.triangles, 2 * limits.values // (max(1, len(labels)) * len(chosen)))
+    most_triangles = min(most_triangles, 2 * most_values // (max(1, len(labels)) * len(chosen)))
     views, missing = [], {}
     for label in labels:
         try:
-            _, mesh = rebuilder.rebuild(label, _LARGEST_REBUILT)
+            _, mesh = study_meshes.make(label, _LARGEST_MADE)
             views.append(_view(tree, label, mesh, chosen, most_triangles, up))
         except SobolevBatchError as error:
             missing[label] = str(error)
-    return Views(tuple(views), missing)
+    return views, missing
 
 
 def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Iterator[str]:
@@ -341,11 +197,11 @@ def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], 
     own, corners = mesh.vertices[used], number[mesh.triangles]
     vertices, triangles = _for_display(own, corners, most)
     if vertices is own:
-        values = witness_at_vertices(tree, label, mesh, orders)[:, used]
+        values = witness_at_vertices(*fields_of(tree, label), orders, mesh)[:, used]
     else:
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
-        values = witness_at(tree, label, orders, vertices, dtype="complex64")
+        values = witness(*fields_of(tree, label), list(orders), vertices, dtype="complex64").to_numpy()
     # A cyclic permutation of the axes, which does not mirror the mesh.
     upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
     return MeshView(label, upright, triangles, values, orders, len(corners)).towards_worst()
@@ -360,3 +216,83 @@ def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Real
         finer = subdivided(Mesh(vertices, triangles))
         vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
     return vertices, triangles
+
+
+def render(
+    views: Sequence[MeshView],
+    orders: int,
+    side: int = 900,
+    *,
+    common: bool = False,
+    program: Path = _PROGRAM,
+    timeout_seconds: float = 300.0,
+) -> list[Pictures]:
+    """Draw each mesh from the side of its eye, once for each of its first orders.
+
+    Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" between plus and
+    minus `color_limits`.
+
+    Args:
+        views: Meshes to draw.
+        orders: Number of orders of each, at most.
+        side: Longer side of each picture, in pixels.
+        common: Colour all meshes on one scale.
+        program: Program that draws.
+        timeout_seconds: Time for all pictures, at a second or two of a processor each.
+
+    Raises:
+        InputError: VTK is not installed, or cannot draw on this machine.
+    """
+    if not views:
+        return []
+    if find_spec("pyvista") is None:
+        raise InputError(
+            "drawing meshes needs the library pyvista, which is not installed; "
+            "the extra has it: pip install 'sobolev-batch[vtk]'"
+        )
+    scene: dict[str, Any] = {"count": np.array(len(views)), "side": np.array(side)}
+    for i, (view, limits) in enumerate(zip(views, color_limits(views, common), strict=True)):
+        scene |= {
+            f"limits_{i}": limits[:orders],
+            f"eye_{i}": view.eye,
+            f"vertices_{i}": view.vertices,
+            f"triangles_{i}": view.triangles,
+            f"values_{i}": view.values[:orders],
+        }
+    with tempfile.TemporaryDirectory(prefix="sobolev-") as folder:
+        files = Path(folder, "scene.npz"), Path(folder, "pictures.npz")
+        np.savez(files[0], **scene)
+        _draw([str(program), *map(str, files)], Path(folder), timeout_seconds)
+        with np.load(files[1], allow_pickle=False) as pictures:
+            return [pictures[f"picture_{i}"] for i in range(len(views))]
+
+
+def color_limits(views: Sequence[MeshView], common: bool) -> list[Reals]:
+    """Return the end of the scale of colours for each order, of each mesh or the same for all of them."""
+    limits = [view.color_limits for view in views]
+    return [np.max(limits, axis=0)] * len(views) if common else limits
+
+
+def _draw(arguments: Sequence[str], folder: Path, timeout_seconds: float) -> None:
+    """Draw in a process of its own: without OpenGL, VTK crashes instead of raising."""
+    environment = dict(os.environ)
+    if sys.platform == "linux":
+        # Otherwise VTK tries a display first, which may be remote or gone. Without EGL it takes OSMesa.
+        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    # -P keeps modules beside the program from shadowing libraries of the same name.
+    command = [sys.executable, "-P", *arguments]
+    try:
+        done = subprocess.run(  # noqa: S603
+            command, env=environment, cwd=folder, capture_output=True, timeout=timeout_seconds, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(f"meshes cannot be drawn here: VTK took more than {timeout_seconds:g} s") from error
+    if done.returncode:
+        raise InputError(f"meshes cannot be drawn here: {_reason(done.returncode, done.stderr)}; {_REMEDY}")
+
+
+def _reason(status: int, errors: bytes) -> str:
+    if status < 0:
+        return f"VTK crashed ({signal.strsignal(-status) or f'signal {-status}'})"
+    lines = errors.decode(errors="replace").strip().splitlines()
+    return f"VTK failed ({lines[-1] if lines else f'exit status {status}'})"

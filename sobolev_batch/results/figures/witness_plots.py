@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.render import Pictures, color_limits, render
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import (
     EXTENDS,
@@ -25,7 +24,17 @@ from sobolev_batch.results.figures.style import (
     set_title,
     shortened,
 )
-from sobolev_batch.results.figures.views import COVERED_AREA, FRONT, PICTURES, Axis, MeshView, make_views
+from sobolev_batch.results.figures.views import (
+    COVERED_AREA,
+    FRONT,
+    PICTURE_LIMITS,
+    Axis,
+    MeshView,
+    Pictures,
+    color_limits,
+    make_views,
+    render,
+)
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read
 from sobolev_batch.results.tables.groups import chosen_order, finished_group
 from sobolev_batch.surfaces.sources.names import file_stem
@@ -75,12 +84,12 @@ def plot_witness(
     tree = as_tree(store)
     order = chosen_order(tree, order)
     with fields_read(store):
-        made = make_views(tree, folder, [mesh], PICTURES, up, [order])
-    if len(made.views) + len(made.missing) > 1:
+        views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, [order])
+    if len(views) + len(missing) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
-    for label, reason in made.missing.items():
+    for label, reason in missing.items():
         raise InputError(f"{label}: {reason}")
-    (view,) = made.views
+    (view,) = views
     ((picture,),) = render([view], 1)
     axes = ax or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
     axes.set_axis_off()
@@ -119,23 +128,23 @@ def write_witness_plots(
         StoreError: The folder cannot be written.
     """
     tree, output = selection.tree, output or Output()
-    made = make_views(tree, folder, meshes, PICTURES, up, selection.orders, selection.families)
+    views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
-    compared = [replace(view, eye=FRONT) for view in made.views[:_MOST_MESHES]]
+    compared = [replace(view, eye=FRONT) for view in views[:_MOST_MESHES]]
     try:
-        rendered = render(made.views, MOST_ORDERS)
+        rendered = render(views, MOST_ORDERS)
         on_one_scale = render(compared, 1, common=True) if len(compared) > 1 else []
     except InputError as error:
-        return (), {**made.missing, **{view.label: str(error) for view in made.views}}
+        return (), {**missing, **{view.label: str(error) for view in views}}
     with output.drawing():
         figures = {
             f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, pictures, output.size)
-            for view, pictures in zip(made.views, rendered, strict=True)
+            for view, pictures in zip(views, rendered, strict=True)
         }
         if on_one_scale:
             pictures = [one_order for (one_order, *_) in on_one_scale]
-            figures["witness"] = _comparison_figure(compared, pictures, len(made.views), output.size)
-    return output.write(figures, output_folder), made.missing
+            figures["witness"] = _comparison_figure(compared, pictures, len(views), output.size)
+    return output.write(figures, output_folder), missing
 
 
 def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:

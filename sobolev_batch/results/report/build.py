@@ -163,14 +163,13 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     selection = Selection.from_store(tree, most_spectra=limits.spectra)
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
-        views = make_views(tree, folder, witnesses, up=up)
+        views, missing = make_views(tree, folder, witnesses, up=up)
     charts = chart_data(tree, spectra, views, limits)
     pictures = study_pictures(selection, views)
-    text = _filled("study", content, charts, spectra=spectra, views=views, pictures=pictures)
+    text = _filled("study", content, charts, spectra=spectra, views=views, missing=missing, pictures=pictures)
     require_unchanged(tree)
-    return Page(
-        text, (*content["omissions"], *chart_omissions(tree, charts, spectra, views), *unpictured(tree, pictures))
-    )
+    cut = chart_omissions(tree, charts, spectra, views, missing)
+    return Page(text, (*content["omissions"], *cut, *unpictured(tree, pictures)))
 
 
 def _collection_page(collection: CollectionStore, limits: ReportLimits) -> Page:

@@ -18,10 +18,9 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.curves import LEAGUE
 from sobolev_batch.results.figures.pair_plots import clustered_order, embedded
 from sobolev_batch.results.figures.plots import PLOTS
-from sobolev_batch.results.figures.render import render
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
-from sobolev_batch.results.figures.views import MeshView, Views
+from sobolev_batch.results.figures.views import MeshView, render
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
 from sobolev_batch.results.report.content import ReportLimits
 from sobolev_batch.results.tables.convergence import table
@@ -47,7 +46,7 @@ _COLORS, _QUALITY = 128, 90
 Json = dict[str, Any]
 
 
-def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits: ReportLimits) -> Json:
+def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView], limits: ReportLimits) -> Json:
     """Return the data of all charts of an open store.
 
     Texts are not escaped; the page does so. Missing numbers are null.
@@ -63,7 +62,7 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Views, limits:
         "matrix": _matrices(tree, orders, limits),
         "spectrum": None if spectra is None else _spectra(spectra),
         "energy": None if spectra is None else _energy(spectra, families_of(tree)),
-        "witness": [_view(view) for view in views.views],
+        "witness": [_view(view) for view in views],
     }
 
 
@@ -88,8 +87,10 @@ def _method(method: str, scores: Scores) -> Json:
     }
 
 
-def chart_omissions(tree: xr.DataTree, charts: Json, spectra: Spectra | None, views: Views) -> Iterator[str]:
-    """Yield what the charts of an open store leave out, for people."""
+def chart_omissions(
+    tree: xr.DataTree, charts: Json, spectra: Spectra | None, views: Sequence[MeshView], missing: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what the charts of an open store leave out, and the reasons for meshes without views, for people."""
     compared = len(set(complete_meshes(tree)) - {reference_of(tree)})
     drawn = sum(len(family["labels"]) for order in charts["convergence"] for family in order)
     if drawn < (total := len(_drawable(tree))):
@@ -100,11 +101,11 @@ def chart_omissions(tree: xr.DataTree, charts: Json, spectra: Spectra | None, vi
         yield "the chart of distances over time: they are too many"
     if spectra is not None and spectra.omission:
         yield f"spectra: only those of {spectra.omission} are shown"
-    if 0 < len(views.views) < compared:
-        yield f"witness functions: only {len(views.views)} of {compared:,} meshes are drawn; --witness chooses them"
-    for label, reason in views.missing.items():
+    if 0 < len(views) < compared:
+        yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --witness chooses them"
+    for label, reason in missing.items():
         yield f"the witness function of {label}: {reason}"
-    for view in views.views:
+    for view in views:
         if len(view.triangles) < view.original_triangles:
             yield f"triangles: {view.label} is drawn with {len(view.triangles):,} of {view.original_triangles:,}"
 
@@ -234,7 +235,7 @@ Picture = Mapping[str, str | None]
 Pictures = dict[str, list[Picture]]
 
 
-def study_pictures(selection: Selection, views: Views) -> Pictures:
+def study_pictures(selection: Selection, views: Sequence[MeshView]) -> Pictures:
     """Return the pictures of an open store, by the chart that they stand for."""
     pictures: Pictures = {
         name: [
@@ -272,9 +273,9 @@ def league_pictures(leagues: Sequence[League]) -> Pictures:
     }
 
 
-def _witness_pictures(views: Views) -> list[Picture]:
+def _witness_pictures(views: Sequence[MeshView]) -> list[Picture]:
     try:
-        rendered = render(views.views, MOST_ORDERS)
+        rendered = render(views, MOST_ORDERS)
     except InputError as error:
         return [{"source": None, "text": str(error)}]
     return [
@@ -282,7 +283,7 @@ def _witness_pictures(views: Views) -> list[Picture]:
             "source": _data_url(witness_figure(view, drawn), is_shaded=True),
             "text": f"{view.label}, coloured by its witness function",
         }
-        for view, drawn in zip(views.views, rendered, strict=True)
+        for view, drawn in zip(views, rendered, strict=True)
     ]
 
 

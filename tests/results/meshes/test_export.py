@@ -16,8 +16,7 @@ from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from sobolev_batch.results.figures.export import Exporter
-from sobolev_batch.results.figures.views import witness_at_vertices
+from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, witness_at_vertices
 from tests.support.spheres import CENTER, LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 
 Spheres = tuple[str, Path]
@@ -133,10 +132,10 @@ def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_vertices_that_no_triangle_uses_may_lie_anywhere(spheres: Spheres) -> None:
     place, folder = spheres
-    exporter = Exporter.from_store(place, folder=folder)
-    _, scaled = exporter.rebuilder.rebuild(LABELS[1])
+    tree = sb.open_store(place)
+    _, scaled = StudyMeshes.from_tree(tree, folder).make(LABELS[1])
     mesh = sb.Mesh(np.vstack([scaled.vertices, [[1e6, 0, 0], [0, 0, 0]]]), scaled.triangles)
-    values = witness_at_vertices(exporter.tree, LABELS[1], mesh, ORDERS)
+    values = witness_at_vertices(*fields_of(tree, LABELS[1]), ORDERS, mesh)
     assert np.isnan(values[:, -2:]).all()
     assert np.isfinite(values[:, :-2]).all()
 
@@ -208,12 +207,9 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.slow
-def test_without_a_reference_there_is_nothing_to_compare_with(
-    spheres: Spheres, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_reference_there_is_nothing_to_compare_with(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    monkeypatch.setattr("sobolev_batch.results.figures.export.as_tree", lambda _: tree)
     with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
-        Exporter.from_store(place, folder=folder)
+        sb.write_witness(tree, LABELS[1], tmp_path / "a.ply", folder=folder)

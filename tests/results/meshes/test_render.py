@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
-from sobolev_batch.results.figures import render as rendering
-from sobolev_batch.results.figures.render import render
+from sobolev_batch.results.figures import views as rendering
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.views import MeshView, make_views
+from sobolev_batch.results.figures.views import MeshView, make_views, render
 from sobolev_batch.results.figures.witness_plots import write_witness_plots
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
@@ -107,7 +106,7 @@ def test_meshes_beside_each_other(spheres: Spheres, tmp_path: Path) -> None:
 def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spheres) -> None:
     place, folder = spheres
     tree = open_store(place)
-    plain, turned = (make_views(tree, folder, [LABELS[1]], up=axis).views[0].vertices for axis in ("z", up))
+    plain, turned = (make_views(tree, folder, [LABELS[1]], up=axis)[0][0].vertices for axis in ("z", up))
     assert (turned[:, 2] == plain[:, "xyz".index(up)]).all()
     # Turned, not mirrored.
     volumes = [np.linalg.det(vertices[[0, 100, 300]]) for vertices in (plain, turned)]

@@ -1,0 +1,332 @@
+"""Meshes of a store, made again by its study, with witness functions at their vertices; and as files."""
+
+from __future__ import annotations
+
+import difflib
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.batch.study.study import Study
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read
+from sobolev_batch.results.tables.groups import finished_group, reference_of
+from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.metrics.witness import witness
+from sobolev_batch.spectral.shells import Orders, check_orders
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.sources.names import file_stem
+from sobolev_batch.surfaces.sources.registry import Member
+
+Reals = NDArray[np.float64]
+
+SUFFIXES = (".ply", ".vtp")
+# Labels that a message lists as examples, and characters of a comment in a file.
+_MOST_LISTED, _LONGEST_COMMENT = 3, 600
+
+
+@dataclass(frozen=True)
+class StudyMeshes:
+    """The meshes of an open store, made again by its study.
+
+    Attributes:
+        tree: Open store with tables.
+        members: Family and member of each surface that the study lists on this machine, by label.
+        table: Table of the store about its meshes.
+        similarity: Similarity from the meshes' own unit of length to the study's.
+    """
+
+    tree: xr.DataTree
+    members: Mapping[str, tuple[str, Member]]
+    table: xr.Dataset
+    similarity: Similarity
+
+    @classmethod
+    def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
+        """List the meshes of an open store.
+
+        Args:
+            tree: Open store.
+            folder: Folder where relative paths in its study start.
+
+        Raises:
+            InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
+        """
+        table = finished_group(tree, "meshes")
+        try:
+            members = members_of(Study.from_table(tree.attrs["study"]["table"], folder=folder))
+        except SobolevBatchError as error:
+            raise InputError(f"the study's meshes cannot be listed here: {error}") from error
+        similarity = tree.attrs["similarity"]
+        return cls(tree, members, table, Similarity(similarity["scale"], tuple(similarity["origin"])))
+
+    def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
+        """Return the mesh of a label in its own unit of length, and in the study's.
+
+        Files may have changed, and a store may name files that its study never read: only a mesh with the
+        stored digest passes.
+
+        Raises:
+            SobolevBatchError: The mesh cannot be made, is too large, or is not the one that was computed.
+        """
+        row = self.table.sel(mesh=label)
+        triangles = row["triangles"].item()
+        if row["status"].item() != "complete":
+            raise InputError(f"its status is {row['status'].item()!r}")
+        if label not in self.members:
+            raise InputError("the study makes no such mesh here")
+        if not triangles:
+            raise InputError("a surface that is no mesh has no triangles")
+        if triangles > most_triangles:
+            raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
+        own = self.members[label][1].load()
+        scaled = self.similarity.apply(own)
+        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
+            raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
+        return own, scaled
+
+    def with_witness(self, label: str, orders: Sequence[float]) -> tuple[Mesh, Reals]:
+        """Return the mesh of a label in its own unit, and its witness function (orders, vertices) in the study's.
+
+        Raises:
+            SobolevBatchError: The mesh cannot be made again, or its field is damaged.
+        """
+        own, scaled = self.make(label)
+        with fields_read(self.tree):
+            return own, witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
+
+    def write(self, path: Path, label: str, mesh: Mesh, values: Reals, orders: Sequence[float]) -> None:
+        """Write what `with_witness` returns; see `write_vertex_values`."""
+        title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
+        write_vertex_values(path, mesh, values, orders, title, 1 / self.similarity.scale)
+
+    def stem(self, label: str) -> str:
+        """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
+        return file_stem(self.table["mesh"].values.tolist().index(label), label)
+
+
+def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the labels of an open store that are meant by names, each once.
+
+    Args:
+        tree: Open store.
+        names: Labels, or patterns of them with the wildcards ``*``, ``?`` and ``[...]``. A pattern stands for meshes
+            that are computed and have triangles, and never for the reference.
+
+    Raises:
+        InputError: The store has no such label; the message suggests one of the store.
+    """
+    meshes = finished_group(tree, "meshes")
+    known: list[str] = meshes["mesh"].values.tolist()
+    usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference_of(tree))
+    candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
+    chosen: list[str] = []
+    for name in names:
+        if name in known:
+            chosen.append(name)
+            continue
+        is_pattern = any(character in name for character in "*?[")
+        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
+        if not matches:
+            similar = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
+            raise InputError(
+                f"the store has no computed mesh with triangles that matches {name!r}; "
+                f"its labels are such as {_listed(candidates or known)}"
+                if is_pattern
+                else f"the store has no mesh {name!r}, {remedy}"
+            )
+        chosen += matches
+    return tuple(dict.fromkeys(chosen))
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])
+
+
+def fields_of(tree: xr.DataTree, label: str) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return the stored fields of a mesh and of the reference."""
+    fields = tree["fourier"].to_dataset()["fourier"]
+    return fields.sel(mesh=label), fields.sel(mesh=reference_of(tree))
+
+
+def witness_at_vertices(
+    a: xr.DataArray, b: xr.DataArray, orders: Sequence[float], mesh: Mesh, dtype: ComplexDtype = "complex128"
+) -> Reals:
+    """Return the witness function of two fields, (orders, n), at a mesh's own vertices.
+
+    Vertices that no triangle uses have NaN: they may lie beyond the lattice's period.
+    """
+    used = mesh.used_vertices
+    values = np.full((len(orders), len(mesh.vertices)), np.nan)
+    values[:, used] = witness(a, b, list(orders), mesh.vertices[used], dtype=dtype)
+    return values
+
+
+def exported(
+    store: AnyStore, meshes: Sequence[str] = (), order: Orders | None = None, folder: str | Path = "."
+) -> tuple[StudyMeshes, tuple[str, ...], tuple[float, ...]]:
+    """Return the meshes of a store, with the labels and the orders whose witness functions are to be written.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        meshes: Labels, or patterns such as "scans/*"; by default all computed ones with triangles but the reference.
+        order: One order below -1/2, or several; by default those of the study.
+        folder: Folder where relative paths in the study start.
+
+    Raises:
+        InputError: The store has no tables yet, no field of its reference or no such label, or the label is that of the
+            reference, or the study's meshes cannot be listed on this machine.
+        OrderError: An order is not below -1/2.
+        StoreError: The location has no store of a study.
+    """
+    tree = as_tree(store)
+    of_study = finished_group(tree, "convergence")["order"].values.tolist()
+    orders = tuple(dict.fromkeys(check_orders(of_study if order is None else order)))
+    made, reference = StudyMeshes.from_tree(tree, folder), reference_of(tree)
+    status = made.table["status"].sel(mesh=reference).item()
+    if status != "complete":
+        raise InputError(f"the reference {reference!r} is {status}: no mesh can be compared with it")
+    labels = matching_labels(tree, meshes or ["*"])
+    if reference in labels:
+        raise InputError(f"{reference!r} is the reference: its witness is zero everywhere")
+    return made, labels, orders
+
+
+def write_witness(
+    store: AnyStore,
+    mesh: str,
+    path: str | Path,
+    order: Orders | None = None,
+    folder: str | Path = ".",
+) -> Path:
+    """Write a mesh of a store with its witness function against the reference at its vertices.
+
+    The study makes the mesh again, and it is written only if it is, to the bit, the one that was computed. A
+    PLY file holds the vertices in the mesh's own unit in double precision, a property such as
+    ``witness_minus_2`` for each order, and the first order as ``quality``, which MeshLab shows; a .vtp file
+    (XML PolyData, for ParaView) holds arrays such as ``witness, order -2``. Both explain their numbers in comments.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        mesh: Label of the mesh, such as "family/name".
+        path: File to write; its suffix is .ply or .vtp. The latter needs the extra "vtk".
+        order: One order below -1/2, or several; by default those of the study.
+        folder: Folder where relative paths in the study start.
+
+    Returns:
+        The path of the file. Its values are in 1 / unit length of the study, positive where the mesh has area
+        that the reference lacks; see `witness`.
+
+    Raises:
+        InputError: The label or suffix is unknown; a library is not installed; the mesh cannot be
+            made again, or is not the one that was computed.
+        StoreError: The location has no store, or the file cannot be written.
+
+    >>> import sobolev_batch as sb
+    >>> path = sb.write_witness("storage/icosphere.zarr", "icosphere/2", "icosphere-2.ply", order=-4)
+    >>> sb.read_mesh(path).vertices.shape
+    (162, 3)
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: a witness is written as {' or '.join(SUFFIXES)}, found {path.suffix!r}")
+    made, labels, orders = exported(store, [mesh], order, folder)
+    if len(labels) > 1:
+        raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
+    made.write(path, labels[0], *made.with_witness(labels[0], orders), orders)
+    return path
+
+
+def write_vertex_values(
+    path: Path,
+    mesh: Mesh,
+    values: Reals,
+    orders: Sequence[float],
+    title: str,
+    unit: float,
+    context: str = "study",
+) -> None:
+    """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
+
+    Args:
+        path: File to write.
+        mesh: Mesh in its own unit of length.
+        values: Witness function (orders, vertices) in 1 / unit length of the context.
+        orders: Orders s.
+        title: What was compared with what.
+        unit: Unit of length of the context, in that of the mesh.
+        context: Where the mesh was compared: a "study" or a "comparison".
+
+    Raises:
+        InputError: The library that writes the format is not installed.
+        StoreError: The file cannot be written.
+    """
+    escaped = title.encode("unicode_escape").decode("ascii")
+    notes = [
+        f"witness function of the mesh {escaped[:_LONGEST_COMMENT]}",
+        "positive where the mesh has area that the reference lacks, negative where it lacks area",
+        f"in 1 / unit length of the {context}, orders " + ", ".join(map(_number, orders)),
+        f"coordinates are in the unit of the mesh; one unit of the {context} is {unit!r} of them",
+    ]
+    data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), notes)
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise StoreError(f"{path}: the witness cannot be written there: {error.strerror or error}") from error
+
+
+def _number(order: float) -> str:
+    return repr(float(order)).removesuffix(".0")
+
+
+def _ply(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:
+    # Letters, digits and underscores, which readers of PLY accept.
+    rows = {f"witness_minus_{_number(-order)}".replace(".", "_").replace("+", ""): row for order, row in values.items()}
+    first = next(iter(rows))
+    # The quality is the scalar that MeshLab and similar programs show.
+    columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), "quality": rows[first], **rows}
+    kinds = [(name, "<f4" if name == "quality" else "<f8") for name in columns]
+    vertices = np.empty(len(mesh.vertices), dtype=kinds)
+    for name, column in columns.items():
+        vertices[name] = column
+    faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    file = io.BytesIO()
+    PlyData(elements, text=False, byte_order="<", comments=[*notes, f"quality repeats {first}"]).write(file)
+    return file.getvalue()
+
+
+def _vtp(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:
+    try:
+        import pyvista
+        from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+    except ImportError as error:
+        raise InputError(
+            f"a .vtp file needs the library {error.name}, which is not installed; "
+            "the extra has it: pip install 'sobolev-batch[vtk]'"
+        ) from error
+    surface = pyvista.PolyData.from_regular_faces(np.array(mesh.vertices), mesh.triangles)
+    for order, row in values.items():
+        surface.point_data[f"witness, order {_number(order)}"] = row
+    surface.point_data.active_scalars_name = f"witness, order {_number(next(iter(values)))}"
+    surface.field_data["notes"] = list(notes)
+    # In memory: VTK does not report a full disk.
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(surface)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString()).encode("ascii")
