@@ -36,6 +36,11 @@ class CollectionStore:
     table: Mapping[str, Any]
 
     @property
+    def stores(self) -> dict[str, Location]:
+        """Location of the store of each object, by its name."""
+        return {name: self.location.below(name) for name in self.objects}
+
+    @property
     def existing_stores(self) -> dict[str, Location]:
         """Stores of the objects that have one, by name: none has until its reference was made."""
         stores = {name: Store(place) for name, place in self.stores.items()}
@@ -44,17 +49,12 @@ class CollectionStore:
     @classmethod
     def read(cls, location: Location) -> CollectionStore | None:
         """Return the store of a collection at a location; None where there is none."""
-        content = location.read(ROOT)
-        document = _parsed(content) if content is not None else {}
-        table = document.get("attributes", {}).get(COLLECTION)
-        if not isinstance(table, dict):
+        try:
+            table = json.loads(location.read(ROOT) or b"")["attributes"][COLLECTION]
+            return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
+        except (ValueError, TypeError, KeyError):
+            # There is nothing, or the store of one study.
             return None
-        return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
-
-    @classmethod
-    def for_collection(cls, location: Location, collection: StudyCollection) -> CollectionStore:
-        """Return the store that a collection has, or would have, at a location."""
-        return cls(location, collection.title, collection.name, tuple(collection.studies), collection.table)
 
     @classmethod
     def prepared(cls, location: Location, collection: StudyCollection) -> CollectionStore:
@@ -81,12 +81,7 @@ class CollectionStore:
         attributes = {"title": collection.title, "schema_version": SCHEMA_VERSION, COLLECTION: entry}
         root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         location.write({ROOT: json.dumps(root).encode()})
-        return cls.for_collection(location, collection)
-
-    @property
-    def stores(self) -> dict[str, Location]:
-        """Location of the store of each object, by its name."""
-        return {name: self.location.below(name) for name in self.objects}
+        return cls(location, collection.title, collection.name, tuple(collection.studies), collection.table)
 
 
 def for_each_object(
@@ -102,10 +97,9 @@ def for_each_object(
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}
-    stores = CollectionStore.for_collection(location, collection).stores
     for name, study in collection.studies.items():
         try:
-            results[name] = act(name, study, stores[name])
+            results[name] = act(name, study, location.below(name))
         except StoreError:
             raise
         except InputError as error:
@@ -113,10 +107,6 @@ def for_each_object(
     return results, refused
 
 
-def _parsed(content: bytes) -> dict[str, Any]:
-    """Return a metadata document; an empty one where it is none."""
-    try:
-        document = json.loads(content)
-        return document if isinstance(document["attributes"], dict) else {}
-    except (ValueError, TypeError, KeyError):
-        return {}
+def labelled(entries: Mapping[str, Mapping[str, Result]]) -> dict[str, Result]:
+    """Return what the objects of a collection have by label, under labels that begin with the name of the object."""
+    return {f"{name}/{label}": entry for name, own in entries.items() for label, entry in own.items()}

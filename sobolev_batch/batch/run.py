@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from distributed import Client
@@ -20,7 +19,7 @@ from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thre
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
 from sobolev_batch.batch.cluster.workers import require_store_access
-from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
+from sobolev_batch.batch.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
@@ -28,8 +27,7 @@ from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.collection import StudyCollection
-from sobolev_batch.batch.study.lattice_choice import LatticeChoice
-from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
@@ -40,8 +38,6 @@ from sobolev_batch.spectral.errors.budget import NormEstimate
 from sobolev_batch.visible import reasons, table_html
 
 _log = logging.getLogger(__name__)
-
-Entry = TypeVar("Entry")
 
 # A study whose distances miss the accuracy requested is computed again on a larger lattice,
 # this often in all.
@@ -105,21 +101,18 @@ def run(
 
     Args:
         study: Study to carry out, or collection: studies of several objects, one after the other.
-        store: Path or URL of a new or existing store. All workers must reach it under the same name. A store
-            in memory://, which is gone when the process ends, is computed by threads of this process.
-        client: Client of the cluster to compute on. By default a cluster of single-threaded processes on
-            this machine is started for the time of the call, unless nothing is missing. A script that relies on
-            it must guard its main part by ``if __name__ == "__main__"``, as all that starts processes must.
-        workers: Number of workers of the cluster on this machine; by default one for each core.
-        memory: Memory of each of these workers, in bytes or as a text such as "4GB"; by default the
-            machine's, divided equally.
+        store: Path or URL of a new or existing store, which all workers reach under this name. A store in memory:// is
+            computed by threads of this process, and gone when it ends.
+        client: Client of the cluster to compute on. By default single-threaded processes on this machine are started
+            where anything is missing; a script must then guard its main part by ``if __name__ == "__main__"``.
+        workers: Number of these processes; by default one for each core.
+        memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
         on_progress: Callback for each step; it is called in this thread.
-        reuse: Paths or URLs of other stores. Fields that they have already are copied, not computed: of the same
-            surface, reference, scaling, accuracy and lattice, whatever the mesh is called there. So the stores of parts
-            of a study become one. From the store of a collection, those of the same object are used. If the study
-            requests an accuracy, a new store takes the lattice of the first one.
-        give_up_after: Time in seconds after which a worker that says nothing is given up: its tasks are given to
-            others. A scheduler that says nothing for so long counts as lost.
+        reuse: Paths or URLs of other stores. Their fields of the same surface, reference, scaling, accuracy and lattice
+            are copied, whatever the mesh is called there; from the store of a collection, those of the same object. If
+            the study requests an accuracy, a new store takes the lattice of the first one.
+        give_up_after: Seconds after which a worker that says nothing is given up, and its tasks are given to others. A
+            scheduler that says nothing for so long counts as lost.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
@@ -128,12 +121,10 @@ def run(
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
         AccuracyError: The accuracy that the study requests is out of reach; nothing was computed.
-        StoreError: The store cannot be reached or written, belongs to another study, or is being
-            written by another run (LockError).
-        ClusterError: No worker has the GPU that the study requests, or enough memory for its lattice; or
-            the scheduler was lost.
-        InputError: The memory is not a size, or too little for a worker; or the study or its workers ask for more than
-            there is; or give_up_after is less than 10 seconds.
+        StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
+            (LockError).
+        ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
+        InputError: The memory is no size, or not there; or give_up_after is less than 10 seconds.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -148,60 +139,52 @@ def run(
     ('ball/sphere', 'reference')
     >>> sb.run(study, "memory://run-example.zarr").reused
     ('ball/sphere', 'reference')
-    >>> tree = sb.open_store("memory://run-example.zarr")
-    >>> tree["distances"]["distance"].sizes["mesh"]
-    2
     """
     require_give_up_after(give_up_after)
-    location, reusable = Location.parse(store), _reusable_stores([Location.parse(other) for other in reuse])
-    cluster: AbstractContextManager[Client]
-    if client is None:
-        # The workers of another cluster are asked before anything is computed.
-        for part in [study] if isinstance(study, Study) else study.studies.values():
-            if part.accuracy is not None and part.accuracy.asks_for_memory:
-                require_machine_memory(part.accuracy.allowed_bytes, "[accuracy]: memory")
-        if memory is not None:
-            # Otherwise a store would be made before the cluster refuses it.
-            memory_limit(memory, workers or available_cores())
-        # In threads, where no other process would see the store.
-        cluster = thread_client(workers) if location.is_in_memory else local_client(workers, memory)
-    else:
-        location, cluster = location.absolute(), nullcontext(client)
+    location, reusable = Location.parse(store), _reusable_stores(map(Location.parse, reuse))
+    if client is not None:
+        location = location.absolute()
     with ExitStack() as stack:
         # One cluster serves all studies, and none is started where nothing is missing.
-        start = cache(lambda: stack.enter_context(cluster))
+        own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
+        start = cache(lambda: stack.enter_context(own))
         driver = Driver(start, give_up_after, on_progress or (lambda progress: None), client is not None)
-        if isinstance(study, StudyCollection):
-            return _run_collection(study, location, driver, reusable)
-        others = [place for stores in reusable for place in stores.values()]
-        return _run_study(study, location, driver, others)
+        if isinstance(study, Study):
+            return _run_study(study, location, driver, [place for _, place in reusable])
+        return _run_collection(study, location, driver, reusable)
 
 
-def _reusable_stores(locations: Iterable[Location]) -> list[Mapping[str, Location]]:
-    """Return the stores at each location by the names of their objects; that of a single study has no name.
+def _own_cluster(
+    study: Study | StudyCollection, location: Location, workers: int | None, memory: float | str | None
+) -> AbstractContextManager[Client]:
+    """Return a cluster on this machine, not yet started, after a look at whether the machine has the memory."""
+    for part in [study] if isinstance(study, Study) else study.studies.values():
+        if part.accuracy is not None and part.accuracy.asks_for_memory:
+            require_machine_memory(part.accuracy.allowed_bytes, "[accuracy]: memory")
+    if memory is not None:
+        # Otherwise a store would be made before the cluster refuses it.
+        memory_limit(memory, workers or available_cores())
+    # In threads, where no other process would see the store.
+    return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
+
+
+def _reusable_stores(locations: Iterable[Location]) -> list[tuple[str, Location]]:
+    """Return the stores at some locations with the names of their objects; that of a single study has no name.
 
     Raises:
         StoreError: One of them does not exist or cannot be read.
     """
-    reusable: list[Mapping[str, Location]] = []
+    reusable: list[tuple[str, Location]] = []
     for location in locations:
         collection = CollectionStore.read(location)
-        stores = {"": location} if collection is None else collection.existing_stores
-        for place in stores.values():
-            Store.open(place)
-        reusable.append(stores)
+        reusable += [("", location)] if collection is None else collection.existing_stores.items()
+    for _, place in reusable:
+        Store.open(place)
     return reusable
 
 
 def _run_study(study: Study, location: Location, driver: Driver, others: Sequence[Location]) -> Summary:
-    """Lock the store of a study and run it.
-
-    Args:
-        study: Study to run.
-        location: Location of its store.
-        driver: Driver of the run.
-        others: Other stores, whose fields are copied.
-    """
+    """Lock the store of a study and run it; fields of other stores are copied."""
     lock = Lock.of_this_process()
     require_usable(location)
     with locked(location, lock):
@@ -213,7 +196,7 @@ def _run_study(study: Study, location: Location, driver: Driver, others: Sequenc
 
 
 def _run_collection(
-    collection: StudyCollection, location: Location, driver: Driver, reusable: Sequence[Mapping[str, Location]]
+    collection: StudyCollection, location: Location, driver: Driver, reusable: Sequence[tuple[str, Location]]
 ) -> Summary:
     """Run the study of each object of a collection; see `_run_study`."""
     CollectionStore.prepared(location, collection)
@@ -222,7 +205,7 @@ def _run_collection(
     def run_object(name: str, study: Study, place: Location) -> Summary:
         part = f"{name}, {names.index(name) + 1} of {len(names)}"
         telling = replace(driver, notify=lambda progress: driver.notify(replace(progress, part=part)))
-        others = [stores[key] for stores in reusable for key in ("", name) if key in stores]
+        others = [other for owner, other in reusable if owner in ("", name)]
         try:
             return _run_study(study, place, telling, others)
         except InputError as error:
@@ -231,19 +214,16 @@ def _run_collection(
 
     summaries, refused = for_each_object(collection, location, run_object)
 
-    def labels(of: Callable[[Summary], Iterable[str]]) -> tuple[str, ...]:
-        return tuple(f"{name}/{label}" for name, summary in summaries.items() for label in of(summary))
-
-    def entries(of: Callable[[Summary], Mapping[str, Entry]]) -> dict[str, Entry]:
-        return {f"{name}/{label}": entry for name, summary in summaries.items() for label, entry in of(summary).items()}
+    def of_all(part: Callable[[Summary], Iterable[str]]) -> tuple[str, ...]:
+        return tuple(f"{name}/{label}" for name, summary in summaries.items() for label in part(summary))
 
     return Summary(
         str(location),
-        labels(lambda summary: summary.computed),
-        labels(lambda summary: summary.reused),
-        refused | entries(lambda summary: summary.failed),
-        entries(lambda summary: summary.not_compared),
-        entries(lambda summary: summary.imprecise),
+        of_all(lambda summary: summary.computed),
+        of_all(lambda summary: summary.reused),
+        refused | labelled({name: summary.failed for name, summary in summaries.items()}),
+        labelled({name: summary.not_compared for name, summary in summaries.items()}),
+        labelled({name: summary.imprecise for name, summary in summaries.items()}),
     )
 
 
@@ -264,14 +244,7 @@ class Driver:
     has_foreign_cluster: bool = False
 
     def run(self, study: Study, location: Location, lock: Lock, others: Sequence[Location] = ()) -> Summary:
-        """Run a study in a store that this process has locked; see `run`.
-
-        Args:
-            study: Study to run.
-            location: Location of the store.
-            lock: Lock of the store.
-            others: Other stores, whose fields are copied.
-        """
+        """Run a study in a store that this process has locked; fields of other stores are copied."""
         plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
         # Planning may take minutes.
         lock.require(location)
@@ -303,13 +276,15 @@ class Driver:
 
 def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Summary:
     """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities."""
-    rows = workspace.pending
+    rows, study = workspace.pending, workspace.plan.study
     workspace.withdraw_results_of(rows)
     computed: set[int] = set()
     for rounds_left in reversed(range(_MOST_ROUNDS)):
         repaired, distances = _compute_repairing(cluster, workspace, rows)
         computed.update(rows, repaired)
-        choice = _larger_lattice(workspace.plan, distances) if rounds_left else None
+        if not rounds_left or distances is None or study.accuracy is None:
+            break
+        choice = workspace.plan.choice.grown(distances, study.orders, study.accuracy)
         if choice is None:
             break
         # The records are laid out anew, that of the run with them.
@@ -327,8 +302,7 @@ def _compute_repairing(
 ) -> tuple[set[int], NormEstimate | None]:
     """Compute the fields of rows and the tables, and again the fields that turn out damaged.
 
-    Returns:
-        Rows that were damaged, and the distances to the reference if they are new.
+    Return the rows that were damaged, and the distances to the reference if they are new.
     """
     repaired: set[int] = set()
     for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
@@ -365,10 +339,10 @@ def _imprecise(workspace: Workspace) -> dict[str, float]:
     """Return the largest relative error of each mesh whose distances miss the accuracy, by its label."""
     if workspace.plan.study.accuracy is None:
         return {}
-    group = "convergence"
-    labels = workspace.store.read_strings(f"{group}/mesh")
+    labels = workspace.store.read_strings("convergence/mesh")
     distances, errors, relative, within = (
-        np.asarray(workspace.store.read(f"{group}/{name}", ...)) for name in ("distance", "error", "relative", "within")
+        np.asarray(workspace.store.read(f"convergence/{name}", ...))
+        for name in ("distance", "error", "relative", "within")
     )
     # Of what is next to equal to the reference, no computation gives digits.
     short = ~within.astype(bool) & (relative > NEXT_TO_EQUAL)
@@ -377,13 +351,3 @@ def _imprecise(workspace: Workspace) -> dict[str, float]:
         for i, label in enumerate(labels)
         if short[i].any()
     }
-
-
-def _larger_lattice(plan: Plan, distances: NormEstimate | None) -> LatticeChoice | None:
-    """Return a larger lattice where distances to the reference miss the accuracy that is requested."""
-    if plan.study.accuracy is None or distances is None:
-        return None
-    complete = ~np.isnan(distances.values).any(axis=0)
-    return plan.choice.grown(
-        NormEstimate(*(array[:, complete] for array in distances)), plan.study.orders, plan.study.accuracy
-    )

@@ -31,6 +31,8 @@ from sobolev_batch.errors import ClusterError, StoreError
 
 _log = logging.getLogger(__name__)
 
+# Time within which the scheduler has to take a study.
+_ACCEPTANCE_SECONDS = 60.0
 _POLL_SECONDS = 0.05
 
 
@@ -63,7 +65,6 @@ def submit(
     store: str | Path | Location,
     client: Client,
     *,
-    timeout_seconds: float = 60.0,
     give_up_after: float = GIVE_UP_AFTER,
 ) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
@@ -76,7 +77,6 @@ def submit(
         study: Study to carry out, of one object or of several.
         store: Path or URL of a new or existing store, which this process and all workers reach under this name.
         client: Client of the cluster; it may be closed afterwards.
-        timeout_seconds: Time within which the scheduler has to take the study.
         give_up_after: Time in seconds after which a worker that says nothing is given up; see `run`.
 
     Raises:
@@ -84,38 +84,25 @@ def submit(
         ClusterError: No worker has the GPU that the study requests, or the scheduler did not take the study in time.
         InputError: See `run`.
 
-    >>> import tempfile
-    >>> from distributed import Client, wait
     >>> import sobolev_batch as sb
-    >>> study = sb.Study.from_table({
-    ...     "study": {"name": "balls"},
-    ...     "lattice": {"xi_max": 3.0, "M": 16},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "reference": {"source": "sphere"},
-    ...     "family": [{"name": "ball", "source": "sphere", "radius": 0.5}],
-    ... })
-    >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +SKIP
-    ...     with Client("tls://scheduler:8786") as client:
-    ...         sb.submit(study, f"{folder}/results.zarr", client).missing
+    >>> with Client("tls://scheduler:8786") as client:  # doctest: +SKIP
+    ...     sb.submit(sb.Study.from_toml("study.toml"), "s3://bucket/results.zarr", client).missing
     2
     """
     require_give_up_after(give_up_after)
     location = Location.parse(store).absolute()
     if isinstance(study, Study):
-        return _submit(study, location, client, timeout_seconds, give_up_after)
+        return _submit(study, location, client, give_up_after)
     CollectionStore.prepared(location, study)
     objects, refused = for_each_object(
-        study, location, lambda _, part, place: _submit(part, place, client, timeout_seconds, give_up_after)
+        study, location, lambda _, part, place: _submit(part, place, client, give_up_after)
     )
-    surfaces, missing = (
-        sum(getattr(submission, name) for submission in objects.values()) for name in ("surfaces", "missing")
-    )
+    surfaces = sum(submission.surfaces for submission in objects.values())
+    missing = sum(submission.missing for submission in objects.values())
     return Submission(str(location), surfaces, missing, objects, refused)
 
 
-def _submit(
-    study: Study, location: Location, client: Client, timeout_seconds: float, give_up_after: float
-) -> Submission:
+def _submit(study: Study, location: Location, client: Client, give_up_after: float) -> Submission:
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
@@ -131,20 +118,14 @@ def _submit(
         heartbeat.cluster = client.scheduler.address
         heartbeat.write("submitted")
         arguments = dict(study.table), str(study.folder.absolute()), workspace.store.path, lock.run, give_up_after
-        _hand_over(arguments, client, timeout_seconds)
+        # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
+        future = client.submit(drive, *arguments, key=f"sobolev-batch-drive-{uuid4().hex}", pure=False, priority=1)
+        fire_and_forget(future)
+        _await_acceptance(client, future)
     except BaseException:
         release(location, lock)
         raise
     return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
-
-
-def _hand_over(arguments: tuple[Any, ...], client: Client, timeout_seconds: float) -> None:
-    """Have a worker call `drive`."""
-    key = f"sobolev-batch-drive-{uuid4().hex}"
-    # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-    future = client.submit(drive, *arguments, key=key, pure=False, priority=1)
-    fire_and_forget(future)
-    _await_acceptance(client, future, timeout_seconds)
 
 
 def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_after: float) -> None:
@@ -157,7 +138,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
         folder: Folder that paths in the study are relative to.
         store: Path or URL of the store.
         run: Run that the store is locked for.
-        give_up_after: Seconds after which what is silent is given up.
+        give_up_after: See `submit`.
     """
     location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)
@@ -186,9 +167,9 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
     release(location, lock)
 
 
-def _await_acceptance(client: Client, future: Future, timeout_seconds: float) -> None:
+def _await_acceptance(client: Client, future: Future) -> None:
     """Return when the scheduler itself wants the task: the client may be killed from then on."""
-    deadline = time.monotonic() + timeout_seconds
+    deadline = time.monotonic() + _ACCEPTANCE_SECONDS
     while not future.done():
         # A lambda travels by value, so the scheduler need not have this package.
         if client.run_on_scheduler(
@@ -201,7 +182,7 @@ def _await_acceptance(client: Client, future: Future, timeout_seconds: float) ->
             return
         if time.monotonic() > deadline:
             raise ClusterError(
-                f"the scheduler at {client.scheduler.address} did not take the study within {timeout_seconds:g} s; "
+                f"the scheduler at {client.scheduler.address} did not take the study within {_ACCEPTANCE_SECONDS:g} s; "
                 "see its log"
             )
         time.sleep(_POLL_SECONDS)

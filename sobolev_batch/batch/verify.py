@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task
-from sobolev_batch.batch.collection_store import CollectionStore
+from sobolev_batch.batch.collection_store import CollectionStore, labelled
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.records import Record
@@ -54,24 +53,6 @@ class Verification:
     tables: Mapping[str, str]
     withdrawn: bool
     objects: Mapping[str, Verification] = field(default_factory=dict)
-
-    @classmethod
-    def _of_objects(cls, store: Location, objects: Mapping[str, Verification]) -> Self:
-        """Return the verification of a collection; labels begin with the name of the object."""
-
-        def joined(damage: Callable[[Verification], Mapping[str, str]]) -> dict[str, str]:
-            return {f"{name}/{label}": what for name, one in objects.items() for label, what in damage(one).items()}
-
-        damaged = [one for one in objects.values() if not one.is_sound]
-        return cls(
-            str(store),
-            sum(one.complete for one in objects.values()),
-            sum(one.total for one in objects.values()),
-            joined(lambda one: one.fields),
-            joined(lambda one: one.tables),
-            bool(damaged) and all(one.withdrawn for one in damaged),
-            objects,
-        )
 
     def _repr_html_(self) -> str:
         damage = [*reasons("field", self.fields), *reasons("table", self.tables)]
@@ -120,7 +101,16 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         else Verification(str(place), 0, 0, {}, {}, withdrawn=False)
         for name, place in collection.stores.items()
     }
-    return Verification._of_objects(collection.location, verified)
+    damaged = [one for one in verified.values() if not one.is_sound]
+    return Verification(
+        str(collection.location),
+        sum(one.complete for one in verified.values()),
+        sum(one.total for one in verified.values()),
+        labelled({name: one.fields for name, one in verified.items()}),
+        labelled({name: one.tables for name, one in verified.items()}),
+        bool(damaged) and all(one.withdrawn for one in damaged),
+        verified,
+    )
 
 
 def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int], None] | None) -> Verification:

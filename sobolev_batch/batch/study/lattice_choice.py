@@ -109,7 +109,7 @@ class LatticeChoice:
         return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"], tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
-        """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy.
+        """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.
 
         That is a larger or finer lattice; with octaves, more samples, one more octave or a finer lattice. Return None
         if all distances meet the accuracy, if frequencies do not limit them, or if no more of them fit into the memory.
@@ -118,9 +118,9 @@ class LatticeChoice:
         short = ~accuracy.met(distances) & (distances.values > distances.discretisation)
         if not short.any():
             return None
-        values = np.where(short, distances.values, np.inf)
+        values = np.where(short, distances.values, 1.0)
         parts = (distances.truncation, distances.aliasing, distances.statistical)
-        truncation, aliasing, statistical = (np.max(part / values, axis=1) for part in parts)
+        truncation, aliasing, statistical = (np.max(np.where(short, part, 0.0) / values, axis=1) for part in parts)
         if self.tail is None:
             more = _larger_lattice(self.lattice, truncation, aliasing, orders, accuracy)
             before = f"xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}"
