@@ -8,8 +8,7 @@ import sobolev_batch as sb
 from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import XI_MAX, settings_of_the_paper
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.backends.backends import gpu_backend
+from sobolev_batch.spectral.backends import ComplexDtype, gpu_backend
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 

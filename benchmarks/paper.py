@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh, Sphere
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.quadrature.rules import gauss_rule
 
 Complexes = NDArray[np.complexfloating[Any, Any]]

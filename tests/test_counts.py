@@ -14,7 +14,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral.exact import triangles
+from sobolev_batch.spectral import triangles
 from sobolev_batch.spectral.quadrature import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 

@@ -21,7 +21,7 @@ ALLOWED_OF_PICKLE = {"dumps", "register_pickle_by_value"}
 # Of bytes that it has just made itself.
 ALLOWED_LOADS = {("surfaces/sources/conformance.py", "loads")}
 # Of CUDA's libraries, and of the package's own modules, by names that stand in these modules.
-ALLOWED_IMPORTS = {("spectral/backends/backends.py", "import_module"), ("__init__.py", "import_module")}
+ALLOWED_IMPORTS = {("spectral/backends.py", "import_module"), ("__init__.py", "import_module")}
 # Of this interpreter, with a script of the package and two files of its own making.
 ALLOWED_PROCESSES = {"results/figures/views.py"}
 

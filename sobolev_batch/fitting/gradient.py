@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh
-from sobolev_batch.spectral.backends.arrays import Complexes
-from sobolev_batch.spectral.backends.backends import backend_named
-from sobolev_batch.spectral.errors.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
+from sobolev_batch.spectral.backends import Complexes, backend_named
+from sobolev_batch.spectral.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes

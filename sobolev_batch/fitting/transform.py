@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, vstack
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.arrays import Complexes
-from sobolev_batch.spectral.backends.backends import Backend, NufftSpec
+from sobolev_batch.spectral.backends import Backend, Complexes, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import RuleAssignment, TriangleBatch, WeightedPoints
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule

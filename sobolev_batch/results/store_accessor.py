@@ -15,7 +15,7 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.results.open import location_of
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,

@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
-from sobolev_batch.spectral.backends.backends import backend_named
-from sobolev_batch.spectral.errors.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
+from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_named
 from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.quality import Quality

@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.errors.probe import Probe, norms_of_checks
 from sobolev_batch.spectral.octaves.remainder import Remainder
+from sobolev_batch.spectral.probe import Probe, norms_of_checks
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 

@@ -11,7 +11,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface

@@ -10,7 +10,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import members_of
-from sobolev_batch.spectral.backends.backends import NufftSpec
+from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from sobolev_batch.fitting.transform import MeshTransform
-from sobolev_batch.spectral.backends import backends
+from sobolev_batch.spectral import backends
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from tests.support.fake_device import Device
 from tests.support.moving_meshes import PlainSums

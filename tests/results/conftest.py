@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sobolev_batch.spectral.errors.probe import Probe
+from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 

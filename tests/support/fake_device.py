@@ -19,7 +19,7 @@ import finufft
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sobolev_batch.spectral.backends.backends import GPU_COSTS, Cuda, Gpu
+from sobolev_batch.spectral.backends import GPU_COSTS, Cuda, Gpu
 
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:
 # with like= NumPy passes on a keyword that CuPy's do not know.

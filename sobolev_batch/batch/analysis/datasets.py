@@ -19,7 +19,7 @@ from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.surfaces.sources.names import natural_key

@@ -27,7 +27,7 @@ from sobolev_batch.batch.store.store import QUALITY, Store
 from sobolev_batch.batch.store.tables import hide_tables, table_attributes, write_table
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling

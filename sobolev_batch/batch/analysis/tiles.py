@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.analysis.tails import TailReducer
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.budget import (
+from sobolev_batch.spectral.budget import (
     NormEstimate,
     Sums,
     Support,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from threading import Lock
 
 from sobolev_batch.errors import BackendError
-from sobolev_batch.spectral.backends.backends import INSTALL
+from sobolev_batch.spectral.backends import INSTALL
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 # The device of this process and its lock. It has one at most, since CUDA settles on the devices that it sees at its

@@ -26,13 +26,13 @@ from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import Pilot, coarser_than, permits_octaves, prefers_octaves, run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate, Support
-from sobolev_batch.spectral.errors.probe import estimate
+from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.probe import estimate
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 

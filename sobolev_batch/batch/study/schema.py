@@ -33,7 +33,7 @@ from pydantic_core import ErrorDetails, PydanticKnownError
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders

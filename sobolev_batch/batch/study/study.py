@@ -19,7 +19,7 @@ from sobolev_batch.batch.study.schema import (
 )
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings

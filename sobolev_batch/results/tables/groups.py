@@ -15,7 +15,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import require_unchanged
 from sobolev_batch.results.store_accessor import StoreAccessor, stored_fields
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import Orders, check_orders

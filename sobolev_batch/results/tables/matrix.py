@@ -24,7 +24,7 @@ from sobolev_batch.results.tables.groups import (
     reference_of,
 )
 from sobolev_batch.results.tables.text import LINE_LENGTH, concise, machine_table, middle_cut, printed_table, prose
-from sobolev_batch.spectral.errors.budget import quotients
+from sobolev_batch.spectral.budget import quotients
 from sobolev_batch.spectral.shells import check_orders
 
 Reals = NDArray[np.float64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_of
 from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
-from sobolev_batch.spectral.errors.budget import (
+from sobolev_batch.spectral.budget import (
     NormEstimate,
     ReferenceEstimate,
     Sums,

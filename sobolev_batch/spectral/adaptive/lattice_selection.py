@@ -13,7 +13,7 @@ from scipy.fft import next_fast_len
 from scipy.special import betainc
 
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
-from sobolev_batch.spectral.errors.budget import (
+from sobolev_batch.spectral.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,
     Sums,

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
-from sobolev_batch.spectral.errors.budget import aliased, change_of_root, sums_of_shells
-from sobolev_batch.spectral.errors.probe import estimate as estimate_from
+from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
 from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, SurfaceSize
@@ -25,6 +24,7 @@ from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSamp
 from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, window_integral
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.probe import estimate as estimate_from
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.smooth import Smooth

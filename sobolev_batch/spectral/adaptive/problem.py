@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate, Support
-from sobolev_batch.spectral.errors.probe import Sample, draws_for, needs_probe
+from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SampledOctave
+from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Similarity, Surface

@@ -12,7 +12,7 @@ from sobolev_batch.spectral.adaptive.frequencies import Frequencies
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, centering, error_target, support_of
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
-from sobolev_batch.spectral.errors.budget import ReferenceEstimate
+from sobolev_batch.spectral.budget import ReferenceEstimate
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 

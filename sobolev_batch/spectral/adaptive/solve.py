@@ -17,13 +17,13 @@ from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.budget import NormEstimate, Sums, area_bound, estimate_norms, sums_of_shells
-from sobolev_batch.spectral.errors.probe import Sample, estimate
+from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.budget import NormEstimate, Sums, area_bound, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
+from sobolev_batch.spectral.probe import Sample, estimate
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings

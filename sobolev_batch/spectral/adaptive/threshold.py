@@ -14,10 +14,10 @@ from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import difference_on, solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import area_bound, area_bounds
-from sobolev_batch.spectral.errors.probe import Sample, draws_for, needs_probe
+from sobolev_batch.spectral.budget import area_bound, area_bounds
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes

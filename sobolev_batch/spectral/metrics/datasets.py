@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.spectral.errors.budget import NormEstimate, ReferenceEstimate
+from sobolev_batch.spectral.budget import NormEstimate, ReferenceEstimate
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.shells import Orders, Reals
 

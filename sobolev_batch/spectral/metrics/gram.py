@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.errors.budget import Sums, outer_windows
+from sobolev_batch.spectral.budget import Sums, outer_windows
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.shells import SobolevWeights
 

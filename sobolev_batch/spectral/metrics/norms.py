@@ -20,14 +20,13 @@ from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import (
+from sobolev_batch.spectral.budget import (
     NormEstimate,
     ReferenceEstimate,
     Support,
     estimate_norms,
     sums_of_shells,
 )
-from sobolev_batch.spectral.exact.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import LENGTH, VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.spectral.metrics.inputs import (
@@ -41,6 +40,7 @@ from sobolev_batch.spectral.metrics.inputs import (
     shells_of,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.backends.backends import CPU, NufftSpec
+from sobolev_batch.spectral.backends import CPU, ComplexDtype, NufftSpec
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import KERNEL, LENGTH, described, lattice_attributes, order_axis
 from sobolev_batch.spectral.metrics.inputs import BLOCK_SAMPLES, OperandLike, pair_of, point_array, read_blocks

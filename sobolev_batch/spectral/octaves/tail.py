@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.errors.budget import NormEstimate, change_of_root
+from sobolev_batch.spectral.budget import NormEstimate, change_of_root
 from sobolev_batch.spectral.octaves.sums import OctaveSums, statistical_errors
 
 Reals = NDArray[np.float64]

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.errors.probe import norms_of_checks
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize
 from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
+from sobolev_batch.spectral.probe import norms_of_checks
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.transform.settings import (
     ON_CPU,

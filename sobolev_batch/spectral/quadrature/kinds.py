@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.backends import CPU, Backend
-from sobolev_batch.spectral.exact.spheres import sphere_block, sphere_transform
-from sobolev_batch.spectral.exact.triangles import exact_transform, sampled_transform
+from sobolev_batch.spectral.backends import CPU, Backend
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.spectral.quadrature.meshes import (
     AUTO,
@@ -31,6 +29,8 @@ from sobolev_batch.spectral.quadrature.meshes import (
     weight_masses,
 )
 from sobolev_batch.spectral.quadrature.smooth import Resolution, exact_values, resolution_of
+from sobolev_batch.spectral.spheres import sphere_block, sphere_transform
+from sobolev_batch.spectral.triangles import exact_transform, sampled_transform
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.arrays import Array, combine, sums_of_runs
-from sobolev_batch.spectral.backends.backends import Backend
+from sobolev_batch.spectral.backends import Array, Backend, combine, sums_of_runs
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.rules import (
     FINEST_TOLERANCE,

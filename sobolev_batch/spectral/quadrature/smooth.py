@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.arrays import cosine_and_sine
+from sobolev_batch.spectral.backends import cosine_and_sine
 from sobolev_batch.surfaces.shapes.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 

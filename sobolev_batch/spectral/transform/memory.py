@@ -12,7 +12,7 @@ from itertools import product
 from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends.backends import Costs, NufftSpec, Shape
+from sobolev_batch.spectral.backends import Costs, NufftSpec, Shape
 from sobolev_batch.spectral.lattice import Block
 
 # Points of one NUFFT: two million take 0.3 GB with their strengths and sorting, and make the FFT a small part of

@@ -7,8 +7,17 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.backends.arrays import Array, ComplexDtype, Complexes, combine, cosine_and_sine
-from sobolev_batch.spectral.backends.backends import CPU, Backend, NufftPlan, NufftSpec
+from sobolev_batch.spectral.backends import (
+    CPU,
+    Array,
+    Backend,
+    ComplexDtype,
+    Complexes,
+    NufftPlan,
+    NufftSpec,
+    combine,
+    cosine_and_sine,
+)
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.memory import Batching, sub_blocks

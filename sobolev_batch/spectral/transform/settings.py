@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.backends.backends import CPU, Backend
+from sobolev_batch.spectral.backends import CPU, Backend, ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature, weight_masses

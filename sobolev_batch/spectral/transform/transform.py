@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError, one_line
-from sobolev_batch.spectral.backends.arrays import ComplexDtype, Complexes
-from sobolev_batch.spectral.backends.backends import CPU, CPU_COSTS, Backend, Gpu, NufftSpec
+from sobolev_batch.spectral.backends import CPU, CPU_COSTS, Backend, ComplexDtype, Complexes, Gpu, NufftSpec
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching

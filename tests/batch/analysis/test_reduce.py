@@ -15,7 +15,7 @@ from sobolev_batch.batch.analysis.reduce import Results
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import tables
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from tests.support.stores import assert_same_tables
 from tests.support.studies import small_table
 

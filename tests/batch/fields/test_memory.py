@@ -7,7 +7,7 @@ import pytest
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.compute import size_tasks
-from sobolev_batch.spectral.backends.backends import CPU_COSTS, NufftSpec
+from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.settings import TransformSettings

@@ -20,7 +20,7 @@ from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.spectral.adaptive.solve import run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 from tests.support.studies import small_table, variable
 
 # So high that one lattice is chosen, and no octaves.

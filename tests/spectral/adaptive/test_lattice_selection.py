@@ -9,7 +9,7 @@ import numpy as np
 from sobolev_batch import Sphere
 from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, good_intervals
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import Support
+from sobolev_batch.spectral.budget import Support
 
 
 def test_intervals_suit_ffts() -> None:

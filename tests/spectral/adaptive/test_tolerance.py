@@ -7,7 +7,7 @@ import pytest
 
 from sobolev_batch import InputError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.errors.budget import NormEstimate
+from sobolev_batch.spectral.budget import NormEstimate
 
 
 def test_memory_limits_the_lattice() -> None:

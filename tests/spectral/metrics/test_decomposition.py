@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, proportion
-from sobolev_batch.spectral.exact.spheres import sphere_inner_product
 from sobolev_batch.spectral.metrics import inputs as operands
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
+from sobolev_batch.spectral.spheres import sphere_inner_product
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 

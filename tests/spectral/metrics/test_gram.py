@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
-from sobolev_batch.spectral.errors.budget import Sums, add_sums, sums_of_shells
+from sobolev_batch.spectral.budget import Sums, add_sums, sums_of_shells
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import Surface

@@ -22,7 +22,7 @@ from sobolev_batch import (
     icosphere,
     witness,
 )
-from sobolev_batch.spectral.backends.backends import NufftSpec
+from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints

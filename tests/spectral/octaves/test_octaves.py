@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Mesh, Sphere, Torus, icosphere
-from sobolev_batch.spectral.exact.triangles import exact_transform
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.partition import Octave
@@ -20,6 +19,7 @@ from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squar
 from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.spectral.transform.settings import ErrorTarget
+from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.rectangles import Rectangles
 

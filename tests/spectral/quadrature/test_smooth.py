@@ -25,7 +25,7 @@ from sobolev_batch import (
     inner_product,
     norm,
 )
-from sobolev_batch.spectral.backends.backends import CPU
+from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolution_of

@@ -8,7 +8,7 @@ from math import prod
 import numpy as np
 import pytest
 
-from sobolev_batch.spectral.backends.backends import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
+from sobolev_batch.spectral.backends import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.memory import Batching, Workload, _sub_shapes, fastest_batching, sub_blocks
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, SizeHistogram
 from sobolev_batch.spectral.shells import SobolevWeights

@@ -12,14 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.backends.backends import NufftSpec
-from sobolev_batch.spectral.exact.triangles import exact_transform
+from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
+from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX

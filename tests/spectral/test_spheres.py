@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, OrderError, Sphere, distance, icosphere, norm
-from sobolev_batch.spectral.exact.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
+from sobolev_batch.spectral.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.backends.arrays import cosine_and_sine
+from sobolev_batch.spectral.backends import cosine_and_sine
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
 
 Reals = NDArray[np.float64]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.backends.arrays import Complexes
+from sobolev_batch.spectral.backends import Complexes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes

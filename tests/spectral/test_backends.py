@@ -15,9 +15,19 @@ import numpy as np
 import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends import backends
-from sobolev_batch.spectral.backends.arrays import ComplexDtype
-from sobolev_batch.spectral.backends.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral import backends
+from sobolev_batch.spectral.backends import (
+    CPU,
+    GPU_COSTS,
+    ComplexDtype,
+    Gpu,
+    backend_named,
+    combine,
+    cosine_and_sine,
+    gpu_backend,
+    sums_of_runs,
+    try_out,
+)
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
@@ -381,7 +391,7 @@ def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cu
     code = """
 import sys
 from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends.backends import gpu_backend
+from sobolev_batch.spectral.backends import gpu_backend
 try:
     print("found", gpu_backend().description)
 except BackendError as error:
@@ -396,9 +406,8 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     code = """
-from sobolev_batch.spectral.backends import backends
-from sobolev_batch.spectral.backends.backends import Gpu
-from sobolev_batch.spectral.backends.backends import GPU_COSTS, NufftSpec
+from sobolev_batch.spectral import backends
+from sobolev_batch.spectral.backends import GPU_COSTS, Gpu, NufftSpec
 backends._require_device = lambda cupy: None
 backend = Gpu("gpu", "cufinufft", GPU_COSTS, backends.load_cuda())
 try:
@@ -416,7 +425,7 @@ def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     code = """
 from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends import backends
+from sobolev_batch.spectral import backends
 try:
     backends.load_cuda()
 except BackendError:
@@ -471,3 +480,26 @@ def test_a_gpu_out_of_memory_falls_back(gpu: Gpu) -> None:
         pool.set_limit(size=0)
     assert found.backend == "finufft after cufinufft: out of memory"
     assert on(gpu, icosphere(4)).backend == "cufinufft"
+
+
+def test_the_exceptions_agree_with_numpy() -> None:
+    rng = np.random.default_rng(7)
+    device = Device()
+    rows, values = rng.normal(size=(3, 50)), rng.normal(size=50)
+    starts = np.array([0, 3, 4, 20, 49])
+    for coefficients in (rng.normal(size=3), rng.normal(size=(5, 3))):
+        found = combine(coefficients, device.upload(rows))
+        assert isinstance(found, Array)
+        assert np.abs(found.host - coefficients @ rows).max() < 1e-14
+    sums = sums_of_runs(device.upload(values), device.upload(starts))
+    assert np.abs(sums.host - np.add.reduceat(values, starts)).max() < 1e-14
+
+
+def test_both_are_as_good_as_the_library_functions() -> None:
+    rng = np.random.default_rng(31)
+    phases = np.concatenate(
+        [rng.uniform(-100, 100, 10_000), np.pi * np.arange(-9, 10), [0.0, 1e-300, np.nextafter(np.pi, 0)]]
+    )
+    cosines, sines = cosine_and_sine(phases)
+    assert np.abs(cosines - np.cos(phases)).max() < 1e-15
+    assert np.abs(sines - np.sin(phases)).max() < 1e-15

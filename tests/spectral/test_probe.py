@@ -17,8 +17,8 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
-from sobolev_batch.spectral.errors.probe import Sample, draw, draws_for, estimate, measure, needs_probe
 from sobolev_batch.spectral.fields import PROBED_ORDERS
+from sobolev_batch.spectral.probe import Sample, draw, draws_for, estimate, measure, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
