@@ -256,31 +256,31 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.curves import LEAGUE
+    from sobolev_batch.results.figures.drawing import LEAGUE
     from sobolev_batch.results.figures.plots import write_plots
     from sobolev_batch.results.figures.selection import Selection
-    from sobolev_batch.results.figures.style import Output, parse_size
+    from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
     from sobolev_batch.results.figures.witness_plots import write_witness_plots
     from sobolev_batch.results.open import fields_read
     from sobolev_batch.results.tables.groups import EDGE_LENGTH
     from sobolev_batch.results.tables.league import league
 
-    written_as = Output(formats or ("png",), None if size is None else parse_size(size))
+    formats, panel = formats or ("png",), None if size is None else parse_size(size)
     _require_folder(output)
     if CollectionStore.read(store) is not None:
         if meshes:
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
         leagues = league(store, orders or None, x=x or "triangles", methods=families or None)
-        with written_as.drawing():
-            figure = LEAGUE.figure(leagues, size=written_as.size)
-        for path in written_as.write({"league": figure}, output):
+        with drawing(panel):
+            figure = LEAGUE.figure(leagues, size=panel)
+        for path in write_figures({"league": figure}, output, formats, panel):
             echo(path)
         return
     with fields_read(store):
         selection = Selection.from_store(store, orders or None, families or None, x or EDGE_LENGTH)
         # First, since a label may be wrong.
-        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, written_as)
-        paths, omissions = write_plots(selection, output, written_as)
+        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, formats, panel)
+        paths, omissions = write_plots(selection, output, formats, panel)
     for path in (*paths, *witness_paths):
         echo(path)
     for name, notes in omissions.items():
@@ -356,11 +356,13 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its
     league; each object has a store, and a report, of its own.
     """
-    from sobolev_batch.results.report.build import write_report
+    from sobolev_batch.results.report.build import make_report, written_to
 
-    page = write_report(store, output, folder=folder, witnesses=meshes, up=up)
+    with written_to(output) as write:
+        page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
+        write(page)
     echo(output)
-    for omission in page.omissions:
+    for omission in omissions:
         echo(f"left out: {omission}", err=True)
 
 

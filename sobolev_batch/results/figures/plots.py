@@ -8,68 +8,22 @@ from pathlib import Path
 from matplotlib.axes import Axes
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.curves import (
-    LEAGUE,
-    computed_members,
-    draw_convergence,
-    draw_energy,
-    draw_evolution,
-    draw_spectrum,
-    draw_transform,
-    moving_families,
-    transform_panels,
-)
-from sobolev_batch.results.figures.pair_plots import draw_map, draw_matrix, has_pairs
+from sobolev_batch.results.figures.drawing import LEAGUE, PLOTS, computed_members
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.style import Output, Plot, notes_of
+from sobolev_batch.results.figures.style import PictureFormat, Size, drawing, notes_of, write_figures
 from sobolev_batch.results.open import AnyStore, fields_read
 from sobolev_batch.results.tables.groups import EDGE_LENGTH, Families
 from sobolev_batch.results.tables.league import League
 
 
-def _orders(selection: Selection) -> Sequence[float]:
-    return selection.orders
-
-
-def _orders_of_pairs(selection: Selection) -> Sequence[float]:
-    return selection.orders if has_pairs(selection.tree) else ()
-
-
-# By the names of their files. The panels show one order each, or one family.
-PLOTS: dict[str, Plot[Selection]] = {
-    "convergence": Plot(draw_convergence, _orders, 3.6, "Relative distance over mean edge length"),
-    "over-time": Plot(
-        draw_evolution,
-        lambda selection: selection.orders if moving_families(selection) else (),
-        3.6,
-        "Distance over time",
-    ),
-    "transform": Plot(draw_transform, transform_panels, 3.4, "Fourier fields along the first axis"),
-    "matrix": Plot(draw_matrix, _orders_of_pairs, 5.6, "Distances of all pairs", "compressed"),
-    "map": Plot(draw_map, _orders_of_pairs, 4.4, "Map of the meshes"),
-    "spectrum": Plot(
-        draw_spectrum,
-        lambda selection: selection.orders if selection.has_spectra else (),
-        4.0,
-        "Squared distance by wavelength",
-    ),
-    "energy": Plot(
-        draw_energy,
-        lambda selection: (None,) if selection.has_spectra else (),
-        3.6,
-        "Energy of the differences by wavelength",
-    ),
-}
-
-
 def write_plots(
-    selection: Selection, folder: str | Path, output: Output | None = None
+    selection: Selection, folder: str | Path, formats: Sequence[PictureFormat] = ("png",), size: Size | None = None
 ) -> tuple[tuple[Path, ...], Mapping[str, Sequence[str]]]:
     """Write the plots of a store into a folder, with a panel for each order or family.
 
     The files are convergence, transform, spectrum and energy, which has one panel; where the study requests the
-    distances of all pairs, matrix and map too, and where meshes have times, over-time. Each has the suffixes that the
-    output requests.
+    distances of all pairs, matrix and map too, and where meshes have times, over-time. Each has the suffixes of the
+    formats.
 
     Returns:
         Paths of the pictures, and what each of them leaves out, by its name.
@@ -78,15 +32,14 @@ def write_plots(
         InputError: The store lacks the horizontal axis.
         StoreError: The folder cannot be written.
     """
-    output = output or Output()
-    with output.drawing():
+    with drawing(size):
         figures = {
-            name: plot.figure(selection, items, output.size)
+            name: plot.figure(selection, items, size)
             for name, plot in PLOTS.items()
             if (items := plot.items(selection))
         }
     notes = {name: notes_of(figure) for name, figure in figures.items()}
-    return output.write(figures, folder), {name: lines for name, lines in notes.items() if lines}
+    return write_figures(figures, folder, formats, size), {name: lines for name, lines in notes.items() if lines}
 
 
 def _plotted(name: str, selection: Selection, axes: Axes | None) -> Axes:
@@ -146,15 +99,8 @@ def plot_evolution(
 
     The vertical axis is logarithmic; bars show errors, and a dotted line marks the first time at which a new mesh pays.
 
-    Args:
-        store: Path, URL or opened DataTree of a store whose meshes have times.
-        order: One of the store's orders; default its first.
-        ax: Axes to draw on.
-        truth: Family of the true surface at the same times; default the study's reference.
-        family: Families to draw, by names or globs; default all that move.
-
-    Returns:
-        The axes.
+    `plot_convergence` describes the arguments; ``truth`` is the family of the true surface at the same times, by
+    default the study's reference.
 
     Raises:
         InputError: See `evolution`; or no family that moves is chosen.
@@ -184,14 +130,7 @@ def plot_matrix(
     Colours are on a logarithmic scale; where a few distances lie far beyond the others, arrows end it. White pairs are
     equal. Up to 300 meshes are drawn: the first ones and the reference.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders; default its first.
-        ax: Axes to draw on; its figure gets a colour bar too.
-        family: Families to draw beside the reference, by names or globs; default all.
-
-    Returns:
-        The axes.
+    `plot_convergence` describes the arguments; the figure of `ax` gets a colour bar too.
 
     Raises:
         InputError: The store has no tables yet, lacks the order or a family, or has distances to the reference alone.
@@ -210,14 +149,7 @@ def plot_map(store: AnyStore, order: float | None = None, ax: Axes | None = None
     The plane shows most of the meshes' variance (classical scaling); distances in it are never larger than the true
     ones. Up to 300 meshes are drawn: the first ones and the reference.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders; default its first.
-        ax: Axes to draw on.
-        family: Families to draw beside the reference, by names or globs; default all.
-
-    Returns:
-        The axes.
+    `plot_convergence` describes the arguments.
 
     Raises:
         InputError: The store has no tables yet, lacks the order or a family, or has distances to the reference alone.
@@ -237,14 +169,7 @@ def plot_spectrum(
 
     The field of each mesh is read; up to 24 meshes are drawn, evenly through each family. The title says so.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: One of the store's orders; default its first.
-        ax: Axes to draw on; its figure gets a colour bar too.
-        family: Families to draw, by names or globs; default all.
-
-    Returns:
-        The axes.
+    `plot_convergence` describes the arguments; the figure of `ax` gets a colour bar too.
 
     Raises:
         InputError: The store has no tables yet, lacks the order or a family, or has no mesh to compare.
@@ -267,13 +192,7 @@ def plot_energy(store: AnyStore, ax: Axes | None = None, *, family: Families = N
     standard errors. The field of each mesh is read; up to 24 meshes are drawn, evenly through each family. The title
     says so.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        ax: Axes to draw on.
-        family: Families to draw, by names or globs; default all.
-
-    Returns:
-        The axes.
+    `plot_convergence` describes the arguments.
 
     Raises:
         InputError: The store has no tables yet, lacks a family, or has no mesh to compare.

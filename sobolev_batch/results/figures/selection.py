@@ -32,7 +32,7 @@ Item = TypeVar("Item")
 Reals = NDArray[np.float64]
 
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
-MOST_MESHES = 24
+MOST_SPECTRA = 24
 _MOST_SAMPLES = 1 << 28
 
 
@@ -46,7 +46,6 @@ class Selection:
         families: Names of families.
         x: Horizontal axis of convergence.
         truth: Family of the true surface of meshes that move; default the reference.
-        most_spectra: Number of meshes at most in spectra.
     """
 
     tree: xr.DataTree
@@ -54,7 +53,6 @@ class Selection:
     families: tuple[str, ...]
     x: str = EDGE_LENGTH
     truth: str | None = None
-    most_spectra: int = MOST_MESHES
 
     @classmethod
     def from_store(
@@ -64,7 +62,6 @@ class Selection:
         family: Families = None,
         x: str = EDGE_LENGTH,
         truth: str | None = None,
-        most_spectra: int = MOST_MESHES,
     ) -> Self:
         """Choose orders, and families by names or globs; by default all of a store.
 
@@ -73,7 +70,7 @@ class Selection:
         """
         tree = as_tree(store)
         orders = chosen_orders(finished_group(tree, "convergence"), order)
-        return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth, most_spectra)
+        return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth)
 
     @cached_property
     def styles(self) -> Mapping[str, Style]:
@@ -89,7 +86,7 @@ class Selection:
             DamageError: A field is damaged.
         """
         with fields_read(self.tree):
-            spectra = Spectra.from_tree(self.tree, self.orders, self.families, self.most_spectra)
+            spectra = Spectra.from_tree(self.tree, self.orders, self.families)
         if spectra is None:
             raise InputError("the store has no mesh to compare: the reference or all others are not computed")
         return spectra
@@ -129,16 +126,10 @@ class Spectra:
     own: float
 
     @classmethod
-    def from_tree(
-        cls, tree: xr.DataTree, orders: Sequence[float], families: Sequence[str], most: int = MOST_MESHES
-    ) -> Self | None:
-        """Return the spectra of an open store; None where it has nothing to compare.
+    def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], families: Sequence[str]) -> Self | None:
+        """Return the spectra of some meshes of an open store, evenly through each of some families.
 
-        Args:
-            tree: Open store.
-            orders: Orders of it.
-            families: Names of families.
-            most: Number of meshes at most, evenly through each family.
+        None where it has nothing to compare.
         """
         reference, complete = reference_of(tree), complete_meshes(tree)
         family_of = families_of(tree)
@@ -147,7 +138,9 @@ class Spectra:
             return None
         fields = tree["fourier"].to_dataset()["fourier"]
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
-        labels = _spread_over_families([(family_of[label], label) for label in others], max(1, min(most, affordable)))
+        labels = _spread_over_families(
+            [(family_of[label], label) for label in others], max(1, min(MOST_SPECTRA, affordable))
+        )
         scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
             accessor = StoreAccessor(tree)

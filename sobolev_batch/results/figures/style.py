@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -29,7 +29,6 @@ Size = tuple[float, float]
 # Layouts that leave room for labels and legends; the latter is for axes of a fixed aspect, such as images.
 Layout = Literal["constrained", "compressed"]
 PictureFormat = Literal["png", "svg", "pdf"]
-Subject = TypeVar("Subject")
 
 WIDTH_INCHES = 6.4
 # Arrows of a colour bar by whether values lie below it and above it.
@@ -59,24 +58,23 @@ _SAVING: dict[Any, Any] = {"pdf.fonttype": 42, "svg.hashsalt": "sobolev-batch"}
 _METADATA: Mapping[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 
-@dataclass(frozen=True)
-class Style:
-    """Colour, marker and dashes of a family; only all of them together are unique where there are many."""
-
-    color: str
-    marker: str
-    dashes: str | tuple[int, tuple[float, ...]]
+# Colour, marker and dashes of a family, by the names that Matplotlib has for them.
+Style = Mapping[str, Any]
 
 
 def style_of(i: int) -> Style:
-    """Return the style of the i-th family."""
+    """Return the style of the i-th family; only all of its parts together are unique where there are many families."""
     turn = i // len(_COLORS)
-    return Style(_COLORS[i % len(_COLORS)], _MARKERS[(i + turn) % len(_MARKERS)], _DASHES[turn % len(_DASHES)])
+    return {
+        "color": _COLORS[i % len(_COLORS)],
+        "marker": _MARKERS[(i + turn) % len(_MARKERS)],
+        "linestyle": _DASHES[turn % len(_DASHES)],
+    }
 
 
 @dataclass(frozen=True)
-class Plot(Generic[Subject]):
-    """A kind of plot, which has a panel for each item of a subject.
+class Plot:
+    """A kind of plot, which has a panel for each item of a subject, such as a `Selection`.
 
     Attributes:
         draw: Function that draws an item of the subject on axes.
@@ -86,13 +84,13 @@ class Plot(Generic[Subject]):
         layout: Layout of the figure.
     """
 
-    draw: Callable[[Subject, Any, Axes], None]
-    items: Callable[[Subject], Sequence[Any]]
+    draw: Callable[[Any, Any, Axes], None]
+    items: Callable[[Any], Sequence[Any]]
     height: float
     text: str
     layout: Layout = "constrained"
 
-    def figure(self, subject: Subject, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:
+    def figure(self, subject: Any, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:
         """Return a figure with a panel for each item, below each other, and one legend.
 
         Args:
@@ -108,7 +106,7 @@ class Plot(Generic[Subject]):
         _add_legend(figure)
         return figure
 
-    def on(self, axes: Axes | None, subject: Subject, item: Any) -> Axes:
+    def on(self, axes: Axes | None, subject: Any, item: Any) -> Axes:
         """Draw one item on axes with a legend within them, or on axes of a new figure, and return the axes."""
         if axes is None:
             return self.figure(subject, [item]).axes[0]
@@ -192,64 +190,53 @@ def draw_curve(
     axes: Axes, places: Reals, values: Reals, errors: Reals, style: Style, label: str, *, is_joined: bool = True
 ) -> None:
     """Draw the values of a family with error bars, on a logarithmic axis which the bars do not stretch."""
-    axes.plot(
-        places,
-        values,
-        marker=style.marker,
-        linestyle=style.dashes if is_joined else "none",
-        color=style.color,
-        label=label,
-        markersize=4,
-        linewidth=1.2,
-    )
+    dashes = {} if is_joined else {"linestyle": "none"}
+    axes.plot(places, values, **{**style, **dashes}, label=label, markersize=4, linewidth=1.2)
     known = np.nan_to_num(errors)
     # A bar that ends near zero is cut off.
     low, high = np.maximum(values - known, _OUT_OF_SIGHT * values), values + known
     bars = np.stack([np.column_stack([places, low]), np.column_stack([places, high])], axis=1)
-    axes.add_collection(LineCollection(list(bars), colors=style.color, linewidths=0.8), autolim=False)
+    axes.add_collection(LineCollection(list(bars), colors=style["color"], linewidths=0.8), autolim=False)
     seen = np.concatenate([np.maximum(low, _SHOWN_OF_BARS * values), high])
     axes.update_datalim(np.column_stack([np.tile(places, 2), seen]))
     axes.autoscale_view()
 
 
-@dataclass(frozen=True)
-class Output:
-    """Formats and size of pictures.
+@contextmanager
+def drawing(size: Size | None) -> Iterator[None]:
+    """Draw and save with text that can be read at a size of panels, and edited in an SVG; nothing stays set."""
+    is_narrow = size is not None and size[0] < LEGEND_BESIDE
+    settings: dict[Any, Any] = {"font.size": _SMALL_FONT_SIZE if is_narrow else _FONT_SIZE, "svg.fonttype": "none"}
+    with mpl.rc_context(settings):
+        yield
 
-    Attributes:
+
+def write_figures(
+    figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[PictureFormat], size: Size | None
+) -> tuple[Path, ...]:
+    """Write figures into a folder by their file names without suffix, and return the paths.
+
+    Args:
+        figures: Figures that were made while `drawing` with the size.
+        folder: Folder, which is created.
         formats: Formats of each picture.
-        size: Width and height of each panel in inches; default those of the plots.
+        size: Width and height of each panel in inches; None for those of the plots.
+
+    Raises:
+        StoreError: The folder cannot be written.
     """
-
-    formats: tuple[PictureFormat, ...] = ("png",)
-    size: Size | None = None
-
-    @contextmanager
-    def drawing(self) -> Iterator[None]:
-        """Draw and save with text that can be read at this size, and edited in an SVG; nothing stays set afterwards."""
-        is_narrow = self.size is not None and self.size[0] < LEGEND_BESIDE
-        settings: dict[Any, Any] = {"font.size": _SMALL_FONT_SIZE if is_narrow else _FONT_SIZE, "svg.fonttype": "none"}
-        with mpl.rc_context(settings):
-            yield
-
-    def write(self, figures: Mapping[str, Figure], folder: str | Path) -> tuple[Path, ...]:
-        """Write figures into a folder by their file names without suffix, and return the paths.
-
-        Raises:
-            StoreError: The folder cannot be written.
-        """
-        folder, paths = Path(folder), []
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for stem, figure in figures.items():
-                for style in self.formats:
-                    dpi = _SCREEN_DPI if style == "png" and self.size is None else _PAPER_DPI
-                    paths.append(folder / f"{stem}.{style}")
-                    with self.drawing():
-                        save(figure, paths[-1], style, dpi)
-        except OSError as error:
-            raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
-        return tuple(paths)
+    folder, paths = Path(folder), []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for stem, figure in figures.items():
+            for style in formats:
+                dpi = _SCREEN_DPI if style == "png" and size is None else _PAPER_DPI
+                paths.append(folder / f"{stem}.{style}")
+                with drawing(size):
+                    save(figure, paths[-1], style, dpi)
+    except OSError as error:
+        raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
+    return tuple(paths)
 
 
 def save(figure: Figure, target: object, style: PictureFormat, dpi: int = _SCREEN_DPI) -> None:

@@ -18,11 +18,13 @@ from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import (
     EXTENDS,
     WIDTH_INCHES,
-    Output,
+    PictureFormat,
     Size,
+    drawing,
     escaped,
     set_title,
     shortened,
+    write_figures,
 )
 from sobolev_batch.results.figures.views import (
     COVERED_AREA,
@@ -105,7 +107,8 @@ def write_witness_plots(
     folder: str | Path = ".",
     meshes: Sequence[str] = (),
     up: Axis = "z",
-    output: Output | None = None,
+    formats: Sequence[PictureFormat] = ("png",),
+    size: Size | None = None,
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder.
 
@@ -118,7 +121,8 @@ def write_witness_plots(
         folder: Folder where relative paths in the study start.
         meshes: Labels, or patterns such as "scans/*"; by default those that `make_views` chooses.
         up: Axis that points upwards in the meshes' own coordinates.
-        output: Formats and size of the pictures.
+        formats: Formats of each picture.
+        size: Width and height of each picture in inches; default those of the plots.
 
     Returns:
         Paths of the pictures, and the reason for each mesh without one.
@@ -127,7 +131,7 @@ def write_witness_plots(
         InputError: A label, order or family is unknown, or too many meshes are named.
         StoreError: The folder cannot be written.
     """
-    tree, output = selection.tree, output or Output()
+    tree = selection.tree
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
     compared = [replace(view, eye=FRONT) for view in views[:_MOST_MESHES]]
@@ -136,15 +140,15 @@ def write_witness_plots(
         on_one_scale = render(compared, 1, common=True) if len(compared) > 1 else []
     except InputError as error:
         return (), {**missing, **{view.label: str(error) for view in views}}
-    with output.drawing():
+    with drawing(size):
         figures = {
-            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, pictures, output.size)
+            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, pictures, size)
             for view, pictures in zip(views, rendered, strict=True)
         }
         if on_one_scale:
             pictures = [one_order for (one_order, *_) in on_one_scale]
-            figures["witness"] = _comparison_figure(compared, pictures, len(views), output.size)
-    return output.write(figures, output_folder), missing
+            figures["witness"] = _comparison_figure(compared, pictures, len(views), size)
+    return write_figures(figures, output_folder, formats, size), missing
 
 
 def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:

@@ -8,7 +8,6 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,7 +29,7 @@ from sobolev_batch.results.report.charts import (
     study_pictures,
     unpictured,
 )
-from sobolev_batch.results.report.content import ReportLimits, utc_text
+from sobolev_batch.results.report.content import utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.visible import visible
 
@@ -39,17 +38,8 @@ _FOLDER = "page"
 _LIBRARIES = ("jinja2", "plotly", "tomli_w")
 
 
-@dataclass(frozen=True)
-class Page:
-    """A page of a report.
-
-    Attributes:
-        text: Page as HTML.
-        omissions: What it leaves out, for people.
-    """
-
-    text: str
-    omissions: tuple[str, ...]
+# A page as HTML, and what it leaves out, for people.
+Page = tuple[str, tuple[str, ...]]
 
 
 def report(
@@ -86,28 +76,13 @@ def report(
     >>> sb.report("storage/icosphere.zarr", "report.html").name  # doctest: +SKIP
     'report.html'
     """
-    write_report(store, path, folder=folder, witnesses=witnesses, up=up)
+    with written_to(Path(path)) as write:
+        write(make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
     return Path(path)
 
 
-def write_report(
-    store: AnyStore,
-    path: str | Path,
-    *,
-    folder: str | Path = ".",
-    witnesses: Sequence[str] = (),
-    up: Axis = "z",
-) -> Page:
-    """Write the report of a store, and return the page; see `report`."""
-    path = Path(path)
-    with _written_to(path) as write:
-        page = make_report(store, folder=folder, witnesses=witnesses, up=up)
-        write(page.text)
-    return page
-
-
 @contextmanager
-def _written_to(path: Path) -> Iterator[Callable[[str], object]]:
+def written_to(path: Path) -> Iterator[Callable[[str], object]]:
     """Refuse a path that cannot be written before there is anything to write; the old file stays until the new one is.
 
     Raises:
@@ -134,52 +109,48 @@ def make_report(
     folder: str | Path = ".",
     witnesses: Sequence[str] = (),
     up: Axis = "z",
-    limits: ReportLimits | None = None,
 ) -> Page:
-    """Return the report of a store; see `report`."""
+    """Return the report of a store, and what it leaves out; see `report`."""
     missing = next((library for library in _LIBRARIES if find_spec(library) is None), None)
     if missing is not None:
         raise InputError(
             f"a report needs the library {missing}, which is not installed; "
             "the extra has it: pip install 'sobolev-batch[report]'"
         )
-    limits = limits or ReportLimits()
     collection = CollectionStore.read(Location.parse(location_of(store)))
     if collection is None:
-        return _study_page(store, folder, witnesses, up, limits)
+        return _study_page(store, folder, witnesses, up)
     if witnesses:
         raise InputError(
             f"{collection.location}: meshes are shown in the report of one object, such as "
             f"{collection.location.below(collection.objects[0])}"
         )
-    return _collection_page(collection, limits)
+    return _collection_page(collection)
 
 
-def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis, limits: ReportLimits) -> Page:
+def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis) -> Page:
     from sobolev_batch.results.report.content import study_content
 
     tree = as_tree(store)
-    content = study_content(tree, Status.from_store(store), limits)
-    selection = Selection.from_store(tree, most_spectra=limits.spectra)
+    content = study_content(tree, Status.from_store(store))
+    selection = Selection.from_store(tree)
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
-    charts = chart_data(tree, spectra, views, limits)
+    charts = chart_data(tree, spectra, views)
     pictures = study_pictures(selection, views)
     text = _filled("study", content, charts, spectra=spectra, views=views, missing=missing, pictures=pictures)
     require_unchanged(tree)
     cut = chart_omissions(tree, charts, spectra, views, missing)
-    return Page(text, (*content["omissions"], *cut, *unpictured(tree, pictures)))
+    return text, (*content["omissions"], *cut, *unpictured(tree, pictures))
 
 
-def _collection_page(collection: CollectionStore, limits: ReportLimits) -> Page:
+def _collection_page(collection: CollectionStore) -> Page:
     from sobolev_batch.results.report.collection import league_content
 
-    content = league_content(collection, Status.of_collection(collection), limits)
+    content = league_content(collection, Status.of_collection(collection))
     charts = league_data(content["leagues"], content["name"], content["orders"])
-    return Page(
-        _filled("league", content, charts, pictures=league_pictures(content["leagues"])), tuple(content["omissions"])
-    )
+    return _filled("league", content, charts, pictures=league_pictures(content["leagues"])), content["omissions"]
 
 
 def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) -> str:

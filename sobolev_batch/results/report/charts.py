@@ -15,14 +15,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.curves import LEAGUE
-from sobolev_batch.results.figures.pair_plots import clustered_order, embedded
-from sobolev_batch.results.figures.plots import PLOTS
+from sobolev_batch.results.figures.drawing import LEAGUE, MOST_MESHES, PLOTS, clustered_order, embedded
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
 from sobolev_batch.results.figures.views import MeshView, render
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
-from sobolev_batch.results.report.content import ReportLimits
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.groups import (
@@ -40,13 +37,15 @@ from sobolev_batch.results.tables.text import minus
 
 # Orders that printed pictures show; more would make the page heavy.
 MOST_PICTURED_ORDERS = 6
+# Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
+MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
 # Colours of plots, which have few, and quality of those that have many. SVG takes up to six times as much room.
 _COLORS, _QUALITY = 128, 90
 
 Json = dict[str, Any]
 
 
-def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView], limits: ReportLimits) -> Json:
+def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView]) -> Json:
     """Return the data of all charts of an open store.
 
     Texts are not escaped; the page does so. Missing numbers are null.
@@ -57,9 +56,9 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshV
         "orders": [minus(f"{order:g}") for order in orders],
         "families": list(dict.fromkeys(families_of(tree).values())),
         "reference": reference_of(tree),
-        "convergence": _convergence(tree, orders, limits.points // len(orders)),
-        "evolution": _evolution(tree, limits.points // len(orders)),
-        "matrix": _matrices(tree, orders, limits),
+        "convergence": _convergence(tree, orders, MOST_POINTS // len(orders)),
+        "evolution": _evolution(tree, MOST_POINTS // len(orders)),
+        "matrix": _matrices(tree, orders),
         "spectrum": None if spectra is None else _spectra(spectra),
         "energy": None if spectra is None else _energy(spectra, families_of(tree)),
         "witness": [_view(view) for view in views],
@@ -162,9 +161,9 @@ def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
     ]
 
 
-def _matrices(tree: xr.DataTree, orders: list[float], limits: ReportLimits) -> Json | None:
+def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
     """Return for each order the lower triangle of distances and errors, an order of similar meshes, and the map."""
-    most = min(limits.pairs, int(math.sqrt(limits.matrix_numbers / len(orders))))
+    most = min(MOST_MESHES, int(math.sqrt(MOST_NUMBERS / len(orders))))
     matrices = [matrix for order in orders if (matrix := Matrix.from_tree(tree, order, most)) is not None]
     if not matrices or not matrices[0].labels:
         return None

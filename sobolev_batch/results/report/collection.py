@@ -13,7 +13,6 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import open_store
 from sobolev_batch.results.report.content import (
     PageTable,
-    ReportLimits,
     Row,
     large_count,
     reasons_table,
@@ -49,11 +48,11 @@ _OBJECT_COLUMNS = (
 _LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
 
 _NO_LEAGUE = "Methods cannot be compared over the objects."
-# Methods that a sentence names.
-_MOST_NAMED = 3
+# Methods that a sentence names, and missing meshes that are listed with their reasons.
+_MOST_NAMED, _MOST_REASONS = 3, 2_000
 
 
-def league_content(collection: CollectionStore, status: Status, limits: ReportLimits) -> dict[str, Any]:
+def league_content(collection: CollectionStore, status: Status) -> dict[str, Any]:
     """Return the texts and tables of a collection that its template takes, none of them escaped.
 
     Raises:
@@ -68,7 +67,6 @@ def league_content(collection: CollectionStore, status: Status, limits: ReportLi
     objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
     at_orders = [league.order for league in leagues]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
-    shown, failures = limits.reasons, status.failed
     return {
         "title": collection.title,
         "name": collection.name,
@@ -81,14 +79,14 @@ def league_content(collection: CollectionStore, status: Status, limits: ReportLi
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
-        "failed": reasons_table("failed", "mesh", dict(list(failures.items())[:shown])),
-        "not_compared": reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:shown])),
+        "failed": reasons_table("failed", "mesh", dict(list(status.failed.items())[:_MOST_REASONS])),
+        "not_compared": reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:_MOST_REASONS])),
         "summary": dict(_summary(tables, orders)),
         "settings": dict(_settings(collection.table)),
         "run": dict(run_facts(status)),
         "versions": open_store(collection.location.below(next(iter(tables)))).attrs["versions"],
         "study_text": study_text(collection.table),
-        "omissions": tuple(_omissions(collection, status, leagues, shown)),
+        "omissions": tuple(_omissions(collection, status, leagues)),
     }
 
 
@@ -183,9 +181,9 @@ def _settings(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
 
 
-def _omissions(collection: CollectionStore, status: Status, leagues: Sequence[League], shown: int) -> Iterator[str]:
+def _omissions(collection: CollectionStore, status: Status, leagues: Sequence[League]) -> Iterator[str]:
     one = collection.location.below(collection.objects[0])
     yield f"single meshes: each object has a report of its own, such as that of {one}"
     yield from (f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues))
-    if len(status.failed) > shown:
-        yield f"missing meshes: only {shown:,} of {len(status.failed):,} are listed"
+    if len(status.failed) > _MOST_REASONS:
+        yield f"missing meshes: only {_MOST_REASONS:,} of {len(status.failed):,} are listed"

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
-from sobolev_batch.results.figures.pair_plots import MOST_MESHES
-from sobolev_batch.results.figures.selection import MOST_MESHES as MOST_SPECTRA
 from sobolev_batch.results.figures.selection import spread
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import nearest, page_columns, smallest_of, table, with_remarks
@@ -20,6 +18,8 @@ from sobolev_batch.results.tables.groups import finished_group, has_proximity, p
 from sobolev_batch.results.tables.text import Column, count, duration, minus, percent
 from sobolev_batch.spectral.lattice import Lattice
 
+# Rows of all convergence tables together, and of the table of meshes; browsers become slow beyond.
+MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS = 10_000, 5_000
 _LONGEST_VALUE = 300
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
@@ -62,29 +62,6 @@ def reasons_table(name: str, label: str, reasons: Mapping[str, str]) -> PageTabl
     columns = Column(label, label, kind="label"), Column("reason", "reason", kind="text")
     rows = [{label: key, "reason": reason} for key, reason in reasons.items()]
     return PageTable(name, columns, rows, is_sortable=False) if rows else None
-
-
-@dataclass(frozen=True)
-class ReportLimits:
-    """Limits on the size of a report, which browsers set.
-
-    Attributes:
-        convergence_rows: Rows of all convergence tables together; browsers become slow beyond.
-        mesh_rows: Rows of the table of meshes.
-        pairs: Meshes in the matrix and on the map.
-        spectra: Meshes in the spectra.
-        matrix_numbers: Numbers of all matrices together: 10 bytes each, on a page of up to 15 MB.
-        points: Points of all convergence charts together.
-        reasons: Meshes of a collection that are missing, with their reasons.
-    """
-
-    convergence_rows: int = 10_000
-    mesh_rows: int = 5_000
-    pairs: int = MOST_MESHES
-    spectra: int = MOST_SPECTRA
-    matrix_numbers: int = 400_000
-    points: int = 50_000
-    reasons: int = 2_000
 
 
 def utc_text(time: str) -> str:
@@ -160,51 +137,38 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class StudyVerdict:
-    """The verdict on a study, at each order.
+def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], PageTable, str]:
+    """Return the verdict on a study at each order, from the rows of `table`.
 
-    Attributes:
-        sentences: A sentence for each order.
-        table: Nearest meshes, smallest meshes below bounds, and meshes that are missing or imprecise.
-        omitted: Note on the sizes and families that the table leaves out; empty where it has all.
+    Args:
+        frame: Rows of all orders.
+        failed: Reason for each mesh that is missing.
+
+    Returns:
+        A sentence for each order; the table of nearest meshes, smallest meshes below bounds, and meshes that are
+        missing or imprecise; and a note on the sizes and families that the table leaves out, empty where it has all.
     """
-
-    sentences: tuple[str, ...]
-    table: PageTable
-    omitted: str
-
-    @classmethod
-    def from_table(cls, frame: pd.DataFrame, failed: Mapping[str, str]) -> Self:
-        """Return the verdict on the rows of `table`.
-
-        Args:
-            frame: Rows of all orders.
-            failed: Reason for each mesh that is missing.
-        """
-        groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
-        sizes = _sizes(groups[0][1])
-        shown_sizes = spread(sizes, _MOST_SIZES)
-        sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
-        lines: list[Row] = []
-        for order, rows in groups:
-            at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
-            nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
-            of_order = (*nearest_rows, *smallest_rows, *_imprecise_rows(rows), *_missing_rows(failed))
-            lines += [{**line, "order": order} for line in of_order]
-        omitted = [
-            f"{shown} of {total} {things}"
-            for shown, total, things in (
-                (len(shown_sizes), len(sizes), "sizes"),
-                (min(len(sized), _MOST_FAMILIES), len(sized), "families"),
-            )
-            if shown < total
-        ]
-        return cls(
-            tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups),
-            PageTable("verdict", _COLUMNS, lines, [order for order, _ in groups], is_sortable=False),
-            " and ".join(omitted),
+    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
+    sizes = _sizes(groups[0][1])
+    shown_sizes = spread(sizes, _MOST_SIZES)
+    sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
+    lines: list[Row] = []
+    for order, rows in groups:
+        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
+        nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
+        of_order = (*nearest_rows, *smallest_rows, *_imprecise_rows(rows), *_missing_rows(failed))
+        lines += [{**line, "order": order} for line in of_order]
+    omitted = [
+        f"{shown} of {total} {things}"
+        for shown, total, things in (
+            (len(shown_sizes), len(sizes), "sizes"),
+            (min(len(sized), _MOST_FAMILIES), len(sized), "families"),
         )
+        if shown < total
+    ]
+    sentences = tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups)
+    table = PageTable("verdict", _COLUMNS, lines, [order for order, _ in groups], is_sortable=False)
+    return sentences, table, " and ".join(omitted)
 
 
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
@@ -306,7 +270,7 @@ def _names(labels: Sequence[str]) -> str:
     return ", ".join(labels[:_MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def study_content(tree: xr.DataTree, status: Status, limits: ReportLimits) -> dict[str, Any]:
+def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return the texts and tables of an open store that its template takes, none of them escaped.
 
     Raises:
@@ -317,9 +281,9 @@ def study_content(tree: xr.DataTree, status: Status, limits: ReportLimits) -> di
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
     orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
     frame, failed = table(tree), _failures(meshes)
-    verdict = StudyVerdict.from_table(frame, failed)
-    distances = convergence_table(tree, frame, families, limits.convergence_rows // len(orders))
-    sizes = _meshes_table(meshes, families, limits.mesh_rows)
+    sentences, verdict, omitted = study_verdict(frame, failed)
+    distances = convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // len(orders))
+    sizes = _meshes_table(meshes, families, MOST_MESH_ROWS)
     tables = {"distances": distances, "meshes and timings": sizes}
     cut = [f"the table of {name}: {table.omitted:,} more meshes" for name, table in tables.items() if table.omitted]
     return {
@@ -329,10 +293,12 @@ def study_content(tree: xr.DataTree, status: Status, limits: ReportLimits) -> di
         "settings": dict(_settings(attributes, meshes)),
         "summary": dict(_summary(meshes, convergence, orders)),
         "orders": orders,
+        "sentences": sentences,
         "verdict": verdict,
+        "verdict_omitted": omitted,
         "convergence": distances,
         "meshes": sizes,
-        "omissions": [*cut, *([f"verdict: only {verdict.omitted} are shown"] if verdict.omitted else [])],
+        "omissions": [*cut, *([f"verdict: only {omitted} are shown"] if omitted else [])],
         "failed": reasons_table("failed", "mesh", failed),
         "not_compared": reasons_table("lacking", "mesh", status.not_compared),
         "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.plots import PLOTS
+from sobolev_batch.results.figures.drawing import PLOTS
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import notes_of
 

@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.pair_plots import clustered_order, embedded
+from sobolev_batch.results.figures.drawing import clustered_order, embedded
 
 DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 

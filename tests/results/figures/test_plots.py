@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import sobolev_batch as sb
 from sobolev_batch.results.figures.plots import write_plots
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.style import Output, Plot, parse_size, set_log_scale, style_of
+from sobolev_batch.results.figures.style import Plot, drawing, parse_size, set_log_scale, style_of
 
 DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 
@@ -113,8 +113,8 @@ def lines(_subject: object, count: int, axes: Axes) -> None:
 @pytest.mark.parametrize("size", [(6.4, 3.6), (3.3, 2.4)])
 @pytest.mark.parametrize("count", [1, 8, 40])
 def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: tuple[float, float]) -> None:
-    with Output(("png",), size).drawing():
-        figure = Plot[None](lines, lambda _: (), 3.6, "").figure(None, [1, count], size)
+    with drawing(size):
+        figure = Plot(lines, lambda _: (), 3.6, "").figure(None, [1, count], size)
         figure.draw_without_rendering()
     (legend,) = figure.legends
     names = [text.get_text() for text in legend.get_texts()]
@@ -129,14 +129,14 @@ def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: 
 
 
 def test_forty_families_have_styles_of_their_own() -> None:
-    assert len({style_of(i) for i in range(49)}) == 49
+    assert len({tuple(style_of(i).values()) for i in range(49)}) == 49
 
 
 @pytest.mark.all
 def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path) -> None:
     settings = dict(mpl.rcParams)
-    selection, output = Selection.from_store(tree), Output(("pdf", "svg", "png"))
-    written = [write_plots(selection, tmp_path / folder, output)[0] for folder in ("a", "b")]
+    selection = Selection.from_store(tree)
+    written = [write_plots(selection, tmp_path / folder, ("pdf", "svg", "png"))[0] for folder in ("a", "b")]
     assert [path.name for path in written[0]][:3] == ["convergence.pdf", "convergence.svg", "convergence.png"]
     for one, other in zip(*written, strict=True):
         assert one.read_bytes() == other.read_bytes(), one
@@ -153,8 +153,7 @@ def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path
 
 @pytest.mark.slow
 def test_the_size_is_that_of_a_panel(tree: xr.DataTree, tmp_path: Path) -> None:
-    output = Output(("png",), parse_size("3x2in"))
-    (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path, output)
+    (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path, size=parse_size("3x2in"))
     # The header of a PNG: two panels of 300 dots per inch.
     assert struct.unpack(">II", path.read_bytes()[16:24]) == (900, 1200)
 

@@ -22,11 +22,11 @@ from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere,
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.cli import cli
+from sobolev_batch.results.figures import selection
 from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.figures.views import make_views
-from sobolev_batch.results.report import build, charts
+from sobolev_batch.results.report import build, charts, content
 from sobolev_batch.results.report.build import make_report
-from sobolev_batch.results.report.content import ReportLimits
 from sobolev_batch.results.status import Status
 from tests.support.browser import Browser, browser
 
@@ -288,15 +288,22 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: dict[str, list[Any]] = {name: [] for name in _CHARTS}
     monkeypatch.setattr(build, "study_pictures", lambda *_: nothing)
-    limits = ReportLimits(convergence_rows=6, mesh_rows=2, pairs=3, spectra=2, points=6)
-    page = make_report(store, folder=folder, limits=limits)
+    for module, name, most in (
+        (content, "MOST_CONVERGENCE_ROWS", 6),
+        (content, "MOST_MESH_ROWS", 2),
+        (charts, "MOST_MESHES", 3),
+        (charts, "MOST_POINTS", 6),
+        (selection, "MOST_SPECTRA", 2),
+    ):
+        monkeypatch.setattr(module, name, most)
+    page, omissions = make_report(store, folder=folder)
     for note in (
         "2 more meshes are not shown here; <code>sobolev-batch table --format csv</code>",
         "4 more meshes are not shown here.",
         "The first 3 of 5 meshes are shown, including the reference",
         "2 of 4 meshes are shown, spread evenly through the study",
     ):
-        assert note in page.text
+        assert note in page
     for omission in (
         "the table of distances: 2 more meshes",
         "the table of meshes and timings: 4 more meshes",
@@ -304,7 +311,7 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         "all pairs: only 3 of 5 meshes are shown",
         "spectra: only those of 2 of 4 meshes are shown",
     ):
-        assert omission in page.omissions
+        assert omission in omissions
 
 
 @pytest.mark.all
@@ -318,9 +325,9 @@ def test_a_page_without_rendered_pictures_says_why(
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
     monkeypatch.setattr(charts, "render", nothing)
-    page_without = make_report(store, folder=folder)
-    assert page_without.text.count(note) == 1
-    assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in page_without.omissions
+    text, omissions = make_report(store, folder=folder)
+    assert text.count(note) == 1
+    assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in omissions
 
 
 def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path) -> None:
@@ -350,7 +357,7 @@ def test_hausdorff_and_chamfer_distances_are_columns_like_others(tmp_path: Path)
 def test_comparisons_that_are_lacking(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(Status.from_store(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
     monkeypatch.setattr(Status, "from_store", lambda _: status)
-    text = make_report(store).text
+    text, _ = make_report(store)
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
     assert "no proximity: &lt;i&gt;changed&lt;/i&gt;" in text
@@ -387,7 +394,7 @@ def test_a_page_shows_one_state_of_a_store(
 def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="it holds no store of a study"):
         make_report(tmp_path)
-    monkeypatch.setattr(build, "make_report", lambda *_, **__: build.Page("", ()))
+    monkeypatch.setattr(build, "make_report", lambda *_, **__: ("", ()))
     with pytest.raises(StoreError, match="cannot be written there"):
         sb.report(store, tmp_path / "nowhere" / "a.html")
 

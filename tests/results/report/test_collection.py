@@ -99,7 +99,7 @@ def test_a_collection_without_league_says_why(store: str, monkeypatch: pytest.Mo
         raise InputError("no object has all of the methods <a>")
 
     monkeypatch.setattr(collection_module, "leagues_of", refuse)
-    text = make_report(store).text
+    text = make_report(store)[0]
     assert "<strong>There is no league.</strong> no object has all of the methods &lt;a&gt;" in text
     assert "left out: methods cannot be compared" in text
     assert 'id="table-objects"' in text

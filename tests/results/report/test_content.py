@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.results.report.content import StudyVerdict, convergence_table
+from sobolev_batch.results.report.content import convergence_table, study_verdict
 from sobolev_batch.results.tables.convergence import table
 
 
@@ -65,23 +65,22 @@ def frame(meshes: Meshes, error: float = 1e-3, **changes: Any) -> pd.DataFrame:
     return made
 
 
-def lines(verdict: StudyVerdict) -> dict[str, list[str]]:
-    """Return the texts of the rows at the first order."""
-    (_, _, rows), *_ = verdict.table.bodies
-    return {
-        row["verdict"]: [row["absent"]]
-        if "absent" in row
-        else [column.text(row) for column in verdict.table.columns[1:]]
+def verdict_on(made: pd.DataFrame, failed: dict[str, str] | None = None) -> tuple[str, dict[str, list[str]], str]:
+    """Return the sentence at the first order, the texts of its rows, and what the table leaves out."""
+    sentences, table, omitted = study_verdict(made, failed or {})
+    (_, _, rows), *_ = table.bodies
+    texts = {
+        row["verdict"]: [row["absent"]] if "absent" in row else [column.text(row) for column in table.columns[1:]]
         for row in rows
     }
+    return sentences[0], texts, omitted
 
 
 def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     meshes = [("a", 100, 0.2), ("b", 110, 0.1), ("a", 400, 0.02), ("b", 390, 0.04), ("b", 4000, 0.005)]
-    verdict = StudyVerdict.from_table(frame(meshes), {})
-    rows = lines(verdict)
-    assert verdict.sentences == (
-        "Of 5 meshes, b/4000 is nearest to the reference at order −2: it differs by 0.5000\xa0%\xa0±\xa00.0005\xa0%.",
+    sentence, rows, omitted = verdict_on(frame(meshes))
+    assert sentence == (
+        "Of 5 meshes, b/4000 is nearest to the reference at order −2: it differs by 0.5000\xa0%\xa0±\xa00.0005\xa0%."
     )
     assert rows["100 to 110 triangles"] == ["b/110", "10.00 % ± 0.01 %", "110", "2 times nearer than a/100"]
     assert rows["390 to 400 triangles"][0] == "a/400"
@@ -90,56 +89,45 @@ def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     assert rows["below 5 %: b"][0] == "b/390"
     assert rows["below 1 %: a"] == ["none; a/400 has 2.000 % ± 0.002 %"]
     assert rows["below 1 %: b"][0] == "b/4000"
-    assert verdict.omitted == ""
+    assert omitted == ""
 
 
-def test_one_family_has_no_sizes() -> None:
-    rows = lines(StudyVerdict.from_table(frame([("a", 100, 0.2), ("a", 105, 0.04)]), {}))
+def test_few_meshes() -> None:
+    sentence, rows, _ = verdict_on(frame([("a", 100, 0.2)]))
+    assert sentence == "a/100 differs from the reference by 20.00\xa0%\xa0±\xa00.02\xa0% at order −2."
+    assert rows["nearest of all"] == ["a/100", "20.00 % ± 0.02 %", "100", ""]
+    # One family has no sizes.
+    _, rows, _ = verdict_on(frame([("a", 100, 0.2), ("a", 105, 0.04)]))
     assert list(rows) == ["nearest of all", "below 5 %: a", "below 1 %: a"]
 
 
-def test_one_mesh() -> None:
-    verdict = StudyVerdict.from_table(frame([("a", 100, 0.2)]), {})
-    assert verdict.sentences == ("a/100 differs from the reference by 20.00\xa0%\xa0±\xa00.02\xa0% at order −2.",)
-    assert lines(verdict)["nearest of all"] == ["a/100", "20.00 % ± 0.02 %", "100", ""]
-
-
 def test_errors_that_leave_a_place_open_are_said() -> None:
-    verdict = StudyVerdict.from_table(frame([("a", 100, 0.2), ("b", 100, 0.21)], error=0.1), {})
-    assert verdict.sentences[0].endswith("and the errors leave open whether b/100 is nearer.")
-    assert lines(verdict)["100 triangles"][-1] == "errors leave open b/100"
-    unresolved = StudyVerdict.from_table(frame([("a", 100, 0.2), ("b", 100, 0.21)], error=2.0), {})
-    assert unresolved.sentences == (
-        "No distance to the reference is above its error at order −2: the meshes may be equal to it.",
-    )
-    assert lines(unresolved)["nearest of all"] == ["no distance is above its error"]
+    pair = [("a", 100, 0.2), ("b", 100, 0.21)]
+    sentence, rows, _ = verdict_on(frame(pair, error=0.1))
+    assert sentence.endswith("and the errors leave open whether b/100 is nearer.")
+    assert rows["100 triangles"][-1] == "errors leave open b/100"
+    sentence, rows, _ = verdict_on(frame(pair, error=2.0))
+    assert sentence == "No distance to the reference is above its error at order −2: the meshes may be equal to it."
+    assert rows["nearest of all"] == ["no distance is above its error"]
+    _, rows, _ = verdict_on(frame(pair, within=False))
+    assert rows["above rtol"] == ["a/100, b/100"]
 
 
 def test_failures_only() -> None:
     nothing = dict.fromkeys(("distance", "error", "relative", "relative_error"), np.nan)
-    failed = {f"a/{i}": "no triangles" for i in range(5)}
     made = frame([("a", 0, 0.1)] * 5, resolved=False, within=False, **nothing)
-    verdict = StudyVerdict.from_table(made, failed)
-    assert verdict.sentences == ("No mesh could be compared with the reference.",)
-    assert lines(verdict) == {
-        "nearest of all": ["no distance is known"],
-        "missing": ["a/0, a/1, a/2 and 2 more"],
-    }
+    sentence, rows, _ = verdict_on(made, {f"a/{i}": "no triangles" for i in range(5)})
+    assert sentence == "No mesh could be compared with the reference."
+    assert rows == {"nearest of all": ["no distance is known"], "missing": ["a/0, a/1, a/2 and 2 more"]}
 
 
 def test_surfaces_without_triangles_have_no_sizes() -> None:
-    verdict = StudyVerdict.from_table(frame([("a", 0, 0.1), ("b", 0, 0.2)]), {})
-    assert lines(verdict)["nearest of all"] == ["a/0", "10.00 % ± 0.01 %", "", "2 times nearer than b/0"]
-    assert len(lines(verdict)) == 1
-
-
-def test_distances_above_rtol_are_named() -> None:
-    verdict = StudyVerdict.from_table(frame([("a", 100, 0.2), ("b", 100, 0.21)], within=False), {})
-    assert lines(verdict)["above rtol"] == ["a/100, b/100"]
+    _, rows, _ = verdict_on(frame([("a", 0, 0.1), ("b", 0, 0.2)]))
+    assert rows == {"nearest of all": ["a/0", "10.00 % ± 0.01 %", "", "2 times nearer than b/0"]}
 
 
 def test_hundreds_of_meshes_are_summed_up() -> None:
     meshes = [(f"f{i}", 100 * 2**k, 1 / 2**k + i / 1000) for i in range(20) for k in range(10)]
-    verdict = StudyVerdict.from_table(frame(meshes), {})
-    assert len(verdict.table.rows) < 25
-    assert verdict.omitted == "8 of 10 sizes and 6 of 20 families"
+    _, rows, omitted = verdict_on(frame(meshes))
+    assert len(rows) < 25
+    assert omitted == "8 of 10 sizes and 6 of 20 families"

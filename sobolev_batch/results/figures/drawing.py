@@ -1,17 +1,22 @@
-"""Plots of curves: distances against sizes, costs or time, means of methods, Fourier fields, and spectra."""
+"""What each plot draws on axes, and the table of plots."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import leaves_list, linkage
+from scipy.spatial.distance import squareform
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.selection import Selection, spread
 from sobolev_batch.results.figures.style import (
+    EXTENDS,
     LEGEND_BESIDE,
     Plot,
     Reals,
@@ -37,11 +42,9 @@ from sobolev_batch.results.tables.groups import (
     sizes_of,
 )
 from sobolev_batch.results.tables.league import League
+from sobolev_batch.results.tables.matrix import Matrix
 
-_HEIGHT_INCHES = 3.6
 _MOST_NAMED = 3
-
-
 # By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
 _MISSING = {"edge_length": "edges", "triangles": "triangles", "vertices": "vertices", "seconds": "a time"}
 _SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
@@ -63,8 +66,8 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
         draw_curve(axes, places, values, errors, style, shortened(str(name)), is_joined=is_joined)
         hollow = rows[~rows["resolved"].astype(bool)]
         if len(hollow):
-            look = {"color": style.color, "markerfacecolor": "white", "markersize": 4}
-            axes.plot(hollow["x"], hollow["relative"], style.marker, **look)  # type: ignore[arg-type]
+            look = {**style, "linestyle": "none", "markerfacecolor": "white", "markersize": 4}
+            axes.plot(hollow["x"], hollow["relative"], **look)
         sequences += [rows] if is_joined else []
     joined = pd.concat(sequences) if sequences else drawn.iloc[:0]
     if len(joined) > 1 and (slope := _SLOPES.get(selection.x)):
@@ -123,7 +126,7 @@ def draw_evolution(selection: Selection, order: float, axes: Axes) -> None:
         draw_curve(axes, times, values, errors, style, shortened(name))
         if np.isfinite(moment := rows["remesh_time"].item()):
             is_marked = True
-            axes.axvline(moment, color=style.color, linestyle=":", linewidth=1)
+            axes.axvline(moment, color=style["color"], linestyle=":", linewidth=1)
     if is_marked:
         axes.plot([], [], ":", color="gray", linewidth=1, label="a new mesh pays")
     set_title(axes, f"order {order:g}", f"not drawn: {zeros} equal to the true surface" if zeros else "")
@@ -152,14 +155,11 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     axes.set_ylabel("relative Sobolev distance")
 
 
-LEAGUE = Plot[Sequence[League]](
-    draw_league, lambda leagues: leagues, _HEIGHT_INCHES, "Mean relative distance by method"
-)
+LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6, "Mean relative distance by method")
 
 
 # Smaller fractions are not written into their cells.
 _SMALLEST_SHARE = 0.005
-_MOST_HORIZONTAL_BANDS = 6
 # Points of the largest font of labels and of shares, and of the smallest that can be read.
 _LABEL_POINTS, _SHARE_POINTS, _SMALLEST_POINTS = 7.5, 7.0, 4.0
 # Meshes and families in pictures of transforms.
@@ -181,18 +181,13 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
             axes.text(middle, i, "equal to the reference", ha="center", va="center", fontsize=font)
         elif font >= _SMALLEST_POINTS:
             _write_shares(axes, i, fractions, 0.6 * np.nanmax(shares), font)
-    # Long labels would run into each other.
-    is_turned = len(spectra.bands) > _MOST_HORIZONTAL_BANDS or column_points < 0.6 * _LABEL_POINTS * max(
-        map(len, spectra.bands)
-    )
-    rotation, alignment = (40, "right") if is_turned else (0, "center")
     axes.set_xticks(
         range(len(spectra.bands)),
         spectra.bands,
         fontsize=_LABEL_POINTS,
-        rotation=rotation,
-        ha=alignment,
-        rotation_mode="anchor" if is_turned else "default",
+        rotation=40,
+        ha="right",
+        rotation_mode="anchor",
     )
     labels = [shortened(label) for label in spectra.labels]
     axes.set_yticks(range(len(labels)), labels, fontsize=min(_LABEL_POINTS, row_points))
@@ -260,7 +255,7 @@ def draw_transform(selection: Selection, families: Sequence[str], axes: Axes) ->
     omission = f"{len(shown)} of {len(labels)} meshes" if len(shown) < len(labels) else ""
     for i, label in enumerate(shown):
         values = np.real(fields.sel(mesh=label).to_numpy())
-        axes.plot(fields["xi_x"], values, color=style_of(i).color, linewidth=1.0, label=shortened(label))
+        axes.plot(fields["xi_x"], values, color=style_of(i)["color"], linewidth=1.0, label=shortened(label))
     if reference in complete_meshes(tree):
         values = np.real(fields.sel(mesh=reference).to_numpy())
         axes.plot(fields["xi_x"], values, "k--", linewidth=1.2, label=shortened(reference))
@@ -275,3 +270,174 @@ def draw_transform(selection: Selection, families: Sequence[str], axes: Axes) ->
     axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
     axes.set_ylabel("Re of the transform")
     axes.grid(visible=True, alpha=0.3)
+
+
+# In matrices and on maps.
+MOST_MESHES = 300
+# Points of the font of labels beside a matrix; smaller ones are left out.
+_SMALLEST_FONT, _LARGEST_FONT = 4.0, 8.0
+# Width of a character, as a multiple of the size of the font.
+_CHARACTER_WIDTH = 0.6
+# The colours of a matrix end at a percentile if the distances beyond it would take most of the scale.
+_PERCENTILES = (2.0, 98.0)
+
+
+def has_pairs(selection: Selection) -> bool:
+    """Return True if the store has the distances of all pairs of meshes."""
+    tree = selection.tree
+    return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
+
+
+def _chosen(selection: Selection, order: float) -> tuple[Matrix, str]:
+    """Return the distances of the chosen meshes, and a note on those left out."""
+    tree, family_of = selection.tree, families_of(selection.tree)
+    reference = reference_of(tree)
+    meshes = [label for label in complete_meshes(tree) if family_of[label] in selection.families or label == reference]
+    matrix = Matrix.from_tree(tree, order, MOST_MESHES, meshes)
+    if matrix is None:
+        raise InputError(
+            'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
+        )
+    shown = len(matrix.labels)
+    return matrix, f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else ""
+
+
+def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
+    """Draw the distances of all pairs as a heat map, with similar meshes beside each other."""
+    matrix, omission = _chosen(selection, order)
+    arrangement = clustered_order(matrix.values)
+    values = matrix.values[np.ix_(arrangement, arrangement)]
+    set_title(axes, f"Sobolev distance of order {matrix.order:g}", omission)
+    if not (values > 0).any():
+        axes.text(0.5, 0.5, "no two meshes differ", ha="center")
+        axes.set_axis_off()
+        return
+    low, high, extend = _color_range(values[values > 0])
+    image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=LogNorm(low, high), cmap="viridis", aspect="equal")
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit", extend=extend)
+    bar.ax.tick_params(which="both", labelsize="small")
+    labels = [shortened(matrix.labels[i]) for i in arrangement]
+    # Below the matrix, the longest label takes its part of the height.
+    points = 0.9 * 72 * min(inches(axes)) / (len(labels) + _CHARACTER_WIDTH * max(map(len, labels)))
+    if points >= _SMALLEST_FONT:
+        font = min(points, _LARGEST_FONT)
+        axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=font)
+        axes.set_yticks(range(len(labels)), labels, fontsize=font)
+    else:
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.set_xlabel(f"{len(labels)} meshes, similar ones beside each other")
+    hide_frame(axes)
+
+
+def _color_range(positive: Reals) -> tuple[float, float, str]:
+    """Return the ends of the scale of colours, and the ends that get an arrow."""
+    low, high = positive.min(), positive.max()
+    inner_low, inner_high = np.percentile(positive, _PERCENTILES)
+    most = max(inner_high / inner_low, 2.0)
+    ends = bool(inner_low / low > most), bool(high / inner_high > most)
+    extend = EXTENDS[ends]
+    low, high = inner_low if ends[0] else low, inner_high if ends[1] else high
+    # Equal ends would leave no scale.
+    return (low, high, extend) if low < high else (low / 1.1, high * 1.1, extend)
+
+
+def draw_map(selection: Selection, order: float, axes: Axes) -> None:
+    """Draw the meshes as points of a plane whose distances approximate the Sobolev distances."""
+    (matrix, omission), reference = _chosen(selection, order), reference_of(selection.tree)
+    family_of = families_of(selection.tree)
+    points, share = embedded(matrix.values)
+    families = [family_of[label] for label in matrix.labels]
+    for name in dict.fromkeys(families):
+        chosen = [i for i, label in enumerate(matrix.labels) if families[i] == name and label != reference]
+        if chosen:
+            look = {**selection.styles[name], "linestyle": "none", "markersize": 5, "alpha": 0.85}
+            axes.plot(*points[chosen].T, label=shortened(name), **look)
+    center = matrix.labels.index(reference) if reference in matrix.labels else None
+    if center is not None:
+        axes.plot(*points[center], "*", color="black", markersize=12, label=escaped(reference))
+    explained = "" if np.isnan(share) else f", {share:.0%} of the variance"
+    set_title(axes, f"map at order {matrix.order:g}{explained}", omission)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.1)
+    axes.grid(visible=True, alpha=0.3)
+    axes.set_xlabel("in the unit of distances")
+
+
+def clustered_order(distances: Reals) -> NDArray[np.intp]:
+    """Return an order of meshes with similar ones beside each other.
+
+    Hierarchical clustering by mean distances, its leaves in the order that makes neighbours closest
+    (Z. Bar-Joseph et al. 2001, doi:10.1093/bioinformatics/17.suppl_1.S22).
+
+    Args:
+        distances: Distances (meshes, meshes), symmetric, without NaN.
+
+    Returns:
+        Indices of meshes, (meshes,).
+    """
+    if len(distances) < 3:
+        return np.arange(len(distances))
+    pairs = squareform((distances + distances.T) / 2, checks=False)
+    return np.asarray(leaves_list(linkage(pairs, method="average", optimal_ordering=True)), dtype=np.intp)
+
+
+def embedded(distances: Reals) -> tuple[Reals, float]:
+    """Return meshes as points of the plane that is nearest to all, by classical scaling.
+
+    Distances of a norm are those of points in a Euclidean space, so that double centring gives their
+    inner products exactly, up to the errors of the distances. Its first two principal axes span the
+    plane that shows most of their variance. Distances in it are never larger than the true ones.
+
+    Args:
+        distances: Distances (meshes, meshes), symmetric, without NaN.
+
+    Returns:
+        Coordinates (meshes, 2) in the unit of the distances, the first axis the longer one; and the fraction of the
+        meshes' variance that the plane shows, NaN where all meshes are equal.
+
+    Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952),
+    doi:10.1007/BF02288916.
+    """
+    count = len(distances)
+    if count == 0:
+        return np.zeros((0, 2)), float("nan")
+    centring = np.eye(count) - 1 / count
+    products = -centring @ (distances**2 + distances.T**2) @ centring / 4
+    eigenvalues, axes = np.linalg.eigh(products)
+    # Rounding and the errors of the distances make some of them negative.
+    variances = np.maximum(eigenvalues[::-1], 0.0)
+    points = np.zeros((count, 2))
+    shown = min(2, count)
+    points[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
+    # Eigenvectors have no sign of their own: maps would flip between machines.
+    for axis in points.T:
+        axis *= np.sign(axis[np.argmax(np.abs(axis))]) or 1.0
+    total = variances.sum()
+    return points, float(variances[:2].sum() / total) if total > 0 else float("nan")
+
+
+def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequence[float]]:
+    """Return a function that returns the orders of a selection which has what a plot shows, else none."""
+    return lambda selection: selection.orders if has(selection) else ()
+
+
+# By the names of their files. The panels show one order each, or one family.
+PLOTS: dict[str, Plot] = {
+    "convergence": Plot(
+        draw_convergence, lambda selection: selection.orders, 3.6, "Relative distance over mean edge length"
+    ),
+    "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6, "Distance over time"),
+    "transform": Plot(draw_transform, transform_panels, 3.4, "Fourier fields along the first axis"),
+    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6, "Distances of all pairs", "compressed"),
+    "map": Plot(draw_map, _orders_if(has_pairs), 4.4, "Map of the meshes"),
+    "spectrum": Plot(
+        draw_spectrum, _orders_if(lambda selection: selection.has_spectra), 4.0, "Squared distance by wavelength"
+    ),
+    "energy": Plot(
+        draw_energy,
+        lambda selection: (None,) if selection.has_spectra else (),
+        3.6,
+        "Energy of the differences by wavelength",
+    ),
+}
