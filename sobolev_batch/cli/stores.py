@@ -385,8 +385,7 @@ def league_command(
 
     With --against, compare each method with itself in an earlier study instead.
     """
-    from sobolev_batch.results.tables.league import compare_studies, league
-    from sobolev_batch.results.tables.league_text import format_changes, format_league
+    from sobolev_batch.results.tables.league import compare_studies, format_changes, format_league, league
 
     if against is not None:
         echo_lines(format_changes(compare_studies(store, against, orders or None), style))

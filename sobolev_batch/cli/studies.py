@@ -264,8 +264,7 @@ def _show_objects(
 def _print_league(place: Location) -> None:
     """Print the league of a collection, or why there is none."""
     from sobolev_batch.errors import InputError
-    from sobolev_batch.results.tables.league import league
-    from sobolev_batch.results.tables.league_text import format_league
+    from sobolev_batch.results.tables.league import format_league, league
 
     try:
         echo_lines(format_league(league(place)))

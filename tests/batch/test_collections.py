@@ -210,7 +210,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
     leagues = sb.league(store)
     assert [one.order for one in leagues] == [-10.0, -3.0]
     assert leagues[1].table["method"].tolist() == ["ico", "egg"]
-    assert leagues[1].scores.objects[:2] == ("a", "b")
+    assert leagues[1].objects[:2] == ("a", "b")
 
 
 def test_what_is_no_collection_is_said(finished_store: Path) -> None:

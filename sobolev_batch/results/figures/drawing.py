@@ -146,10 +146,10 @@ def moving_families(selection: Selection) -> list[str]:
 def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     """Draw the mean relative distance of each method of a league against the mean size of its meshes."""
     set_log_scale(axes, "xy")
-    for number, method in enumerate(league.scores.methods):
-        mean = league.scores.mean_curve(method)
+    for number, method in enumerate(league.methods):
+        mean = league.mean_curve(method)
         draw_curve(axes, np.exp(mean.sizes), np.exp(mean.values), mean.bars, style_of(number), shortened(method))
-    count = len(league.scores.objects)
+    count = len(league.objects)
     set_title(axes, f"order {league.order:g}, mean of {count} object{'s' if count > 1 else ''}")
     axes.set_xlabel(escaped(label_of(league.x)))
     axes.set_ylabel("relative Sobolev distance")

@@ -31,7 +31,7 @@ from sobolev_batch.results.tables.groups import (
     label_of,
     reference_of,
 )
-from sobolev_batch.results.tables.league import League, Scores
+from sobolev_batch.results.tables.league import League
 from sobolev_batch.results.tables.matrix import Matrix
 from sobolev_batch.results.tables.text import minus
 
@@ -70,14 +70,14 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
     return {
         "name": name,
         "orders": list(orders),
-        "families": list(leagues[0].scores.methods) if leagues else [],
+        "families": list(leagues[0].methods) if leagues else [],
         "size": label_of(leagues[0].x) if leagues else "",
-        "league": [[_method(method, league.scores) for method in league.scores.methods] for league in leagues],
+        "league": [[_method(method, league) for method in league.methods] for league in leagues],
     }
 
 
-def _method(method: str, scores: Scores) -> Json:
-    curve = scores.mean_curve(method)
+def _method(method: str, league: League) -> Json:
+    curve = league.mean_curve(method)
     return {
         "family": method,
         "sizes": _numbers(np.exp(curve.sizes)),

@@ -22,11 +22,12 @@ from sobolev_batch.results.report.content import (
 )
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import tables_of
-from sobolev_batch.results.tables.league import League, Scores, leagues_of
-from sobolev_batch.results.tables.league_text import (
+from sobolev_batch.results.tables.league import (
     LEAGUE_COLUMNS,
     LEAGUE_NOTE,
     PAIR_COLUMNS,
+    League,
+    leagues_of,
     left_out,
     number_text,
     pair_lines,
@@ -96,10 +97,10 @@ def _at(leagues: Sequence[League], order: float) -> League | None:
 
 def sentence_of(league: League) -> str:
     """Return a sentence on which method is nearest at one order."""
-    table, count = league.table, len(league.scores.objects)
+    table, count = league.table, len(league.objects)
     first, amount = table["method"].iloc[0], percent_text(table["relative"].iloc[0])
     at_order = minus(f"at order {league.order:g}")
-    over = f"over {count} objects" if count > 1 else f"on {league.scores.objects[0]}"
+    over = f"over {count} objects" if count > 1 else f"on {league.objects[0]}"
     if len(table) == 1:
         return f"{first} differs from the references by {amount} {over} {at_order}."
     leaders = table[table["rank"] == 1]["method"].tolist()
@@ -116,7 +117,7 @@ def sentence_of(league: League) -> str:
 def _rows(league: League, name: Literal["table", "pairs"]) -> list[Row]:
     """Return the rows of a table of a league, with the colours of the methods."""
     frame: pd.DataFrame = getattr(league, name)
-    colors = frame["method"].map(league.scores.methods.index)
+    colors = frame["method"].map(league.methods.index)
     return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
 
 
@@ -132,20 +133,20 @@ def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: Leagu
             "missing": len(meshes) - len(known),
             "above_rtol": int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum()),
         }
-        if league is None or name not in league.scores.objects:
-            reason = league.scores.left_out.get(name, "no distances") if league else "methods cannot be compared"
+        if league is None or name not in league.objects:
+            reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
             yield {**row, "absent": f"left out: {reason}"}
         else:
-            yield {**row, **_best(league.scores, league.scores.objects.index(name))}
+            yield {**row, **_best(league, league.objects.index(name))}
 
 
-def _best(scores: Scores, number: int) -> Row:
+def _best(league: League, number: int) -> Row:
     """Return the best method of an object, and the next one."""
-    values, errors = scores.values[number], scores.errors[number]
+    values, errors = league.values[number], league.errors[number]
     first, *others = np.argsort(values, kind="stable").tolist()
     relative = float(np.exp(values[first]))
     row = {
-        "best": scores.methods[first],
+        "best": league.methods[first],
         "relative": relative,
         "relative_error": relative * float(np.expm1(errors[first])),
     }
@@ -155,7 +156,7 @@ def _best(scores: Scores, number: int) -> Row:
     is_open = values[second] - errors[second] < values[first] + errors[first]
     return {
         **row,
-        "next": scores.methods[second],
+        "next": league.methods[second],
         "ratio": float(np.exp(values[second] - values[first])),
         "mark": "within errors" if is_open else "",
     }

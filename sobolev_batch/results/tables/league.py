@@ -1,13 +1,13 @@
-"""A league: the methods of a collection, ranked over all objects; and a study against an earlier one."""
+"""A league: the methods of a collection, ranked over all objects; a study against an earlier one; both as text."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.convergence import table, tables_of
 from sobolev_batch.results.tables.groups import EDGE_LENGTH, finished_group, reference_of
 from sobolev_batch.results.tables.statistics import (
@@ -26,12 +27,26 @@ from sobolev_batch.results.tables.statistics import (
     Reals,
     adjusted,
     common_sizes,
+    least_objects,
     sign_flip_test,
     within_objects,
 )
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.shells import Orders
 from sobolev_batch.surfaces.sources.names import quoted
+
+LEAGUE_NOTE = """\
+Relative distances are geometric means over the objects, at equal {x}. Their 95 % intervals
+leave out what the objects themselves differ by, and hold the errors of the distances. A rank
+such as 1-3 says which places the intervals allow. Rates are orders of convergence in the edge
+length. Two methods differ where the permutation test of pairs says so, at the level of 5 %
+for all pairs together."""
+_CHANGES_NOTE = """\
+A ratio below 1 says that the new study is nearer to the references. It is the geometric mean
+over the {units}, with its 95 % interval. The verdict is that of the permutation test of pairs, at
+the level of 5 % for all methods together."""
+
 
 # The store of a collection, or stores of single objects by their names.
 AnyCollection = str | Path | Location | Mapping[str, AnyStore]
@@ -39,25 +54,79 @@ AnyCollection = str | Path | Location | Mapping[str, AnyStore]
 _KEYS = ["order", "mesh"]
 
 
+def percent_text(value: float) -> str:
+    """Return a fraction in per cent, with ? for one that nothing bounds."""
+    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{100 * value:.3g} %"
+
+
+def number_text(value: float) -> str:
+    """Return a number with three digits, with ? for one that nothing bounds."""
+    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{value:.3g}"
+
+
+def _interval(shown: Callable[[float], str]) -> Callable[[float, float], str]:
+    """Return the format of intervals, with ? for an end that nothing bounds."""
+    return lambda low, high: f"{shown(low)} to {shown(high)}"
+
+
+LEAGUE_COLUMNS = (
+    Column("method", "method", kind="label"),
+    Column("rank", "rank", lambda first, last: f"{first}" if first == last else f"{first}-{last}", "last_rank"),
+    Column("relative", "relative", percent_text),
+    Column("low", "95 % interval", _interval(percent_text), "high"),
+    Column("rate", "rate", number_text),
+    Column("rate_low", "95 % interval", _interval(number_text), "rate_high"),
+    Column("objects", "objects"),
+)
+PAIR_COLUMNS = (
+    Column("method", "method", kind="label"),
+    Column("other", "other", kind="text"),
+    Column("ratio", "ratio", number_text),
+    Column("low", "95 % interval", _interval(number_text), "high"),
+    Column("p", "p", "{:.2g}".format),
+    Column("nearer", "nearer", kind="text"),
+)
+_CHANGE_COLUMNS = (
+    Column("method", "method"),
+    Column("verdict", "verdict"),
+    Column("ratio", "new/old", number_text),
+    Column("low", "95 % interval", _interval(number_text), "high"),
+    Column("p", "p", "{:.2g}".format),
+    Column("meshes", "meshes"),
+    Column("worst_ratio", "largest new/old", lambda ratio, mesh: f"{number_text(ratio)}, {mesh}", "worst"),
+)
+
+
 @dataclass(frozen=True, eq=False)
-class Scores:
-    """Mean logarithms of relative distances at equal sizes.
+class League:
+    """The methods of a collection, compared over its objects at one order. Make it by `league`.
 
     Attributes:
+        order: Sobolev order s.
+        x: Size at which methods are compared, such as "triangles".
         objects: Names of the objects that have all methods.
         methods: Names of the methods.
+        left_out: Why other objects are not there, by name.
         sizes: Logarithms of the sizes (objects, sizes) at which the methods are compared.
         values_at: Logarithms of relative distances (objects, methods, sizes).
         errors_at: Bounds on the errors of these.
-        left_out: Why other objects are not there, by name.
+        slopes: Observed rates in the edge length, and bounds on their errors (objects, methods, 2); NaN without one.
+
+    >>> import sobolev_batch as sb
+    >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> at_order.x, at_order.methods, len(at_order.pairs)
+    ('triangles', ('icosphere',), 0)
     """
 
+    order: float
+    x: str
     objects: tuple[str, ...]
     methods: tuple[str, ...]
+    left_out: Mapping[str, str]
     sizes: Reals
     values_at: Reals
     errors_at: Reals
-    left_out: Mapping[str, str]
+    slopes: Reals
 
     @property
     def values(self) -> Reals:
@@ -75,67 +144,10 @@ class Scores:
         parts = self.sizes, self.values_at[:, number], self.errors_at[:, number]
         return Curve(*(np.mean(part, axis=0) for part in parts))
 
-    @classmethod
-    def from_curves(
-        cls, curves: Mapping[str, Mapping[str, Curve]], methods: Sequence[str], unfinished: Mapping[str, str]
-    ) -> Self:
-        """Return the scores of methods from their curves, by object and method; other objects have none yet."""
-        rows: dict[str, tuple[Reals, Reals, Reals]] = {}
-        left_out = dict(unfinished)
-        for name, by_method in curves.items():
-            lacking = [method for method in methods if method not in by_method]
-            if lacking:
-                left_out[name] = f"no distance of {', '.join(lacking)}"
-                continue
-            exact = [method for method in methods if by_method[method].is_exact]
-            if exact:
-                left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
-                continue
-            common = common_sizes([by_method[method] for method in methods])
-            if common is None:
-                left_out[name] = _gap(by_method, methods)
-                continue
-            at_sizes = [by_method[method].at(common) for method in methods]
-            rows[name] = (
-                common,
-                np.array([values for values, _ in at_sizes]),
-                np.array([errors for _, errors in at_sizes]),
-            )
-        sizes, values, errors = (np.array([row[k] for row in rows.values()]) for k in range(3))
-        return cls(tuple(rows), tuple(methods), sizes, values, errors, left_out)
-
-
-def _gap(curves: Mapping[str, Curve], methods: Sequence[str]) -> str:
-    """Return which methods have no range of sizes in common."""
-    first = max(methods, key=lambda method: curves[method].sizes[0])
-    last = min(methods, key=lambda method: curves[method].sizes[-1])
-    begin, end = np.exp(curves[first].sizes[0]), np.exp(curves[last].sizes[-1])
-    return f"no common range of sizes: {first} begins at {begin:,.5g}, {last} ends at {end:,.5g}"
-
-
-@dataclass(frozen=True, eq=False)
-class League:
-    """The methods of a collection, compared over its objects at one order. Make it by `league`.
-
-    Attributes:
-        order: Sobolev order s.
-        x: Size at which methods are compared, such as "triangles".
-        scores: Logarithms of relative distances, by object and method.
-        curves: Curve of each method over the sizes, by object and method.
-        edge_curves: The same over the edge length, from which rates follow.
-
-    >>> import sobolev_batch as sb
-    >>> alone = {"sphere": "storage/icosphere.zarr"}
-    >>> (at_order,) = sb.league(alone, -10)
-    >>> at_order.x, at_order.scores.methods, len(at_order.pairs)
-    ('triangles', ('icosphere',), 0)
-    """
-
-    order: float
-    x: str
-    scores: Scores
-    curves: Mapping[str, Mapping[str, Curve]]
-    edge_curves: Mapping[str, Mapping[str, Curve]]
+    @property
+    def caption(self) -> str:
+        """Caption of its table."""
+        return f"League at order {self.order:g}, over {_objects(len(self.objects))}"
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -146,20 +158,15 @@ class League:
         and high of its interval; rate, the mean observed order of convergence in the edge length, with rate_low and
         rate_high.
         """
-        scores, methods = self.scores, self.scores.methods
-        count = len(scores.objects)
-        spreads = within_objects(scores.values) if count > 1 else np.full(len(methods), np.nan)
+        count = len(self.objects)
+        spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
         rows = []
-        for k, method in enumerate(methods):
-            interval = Interval.from_values(scores.values[:, k], scores.errors[:, k], spreads[k]).exp()
-            rows.append(
-                {
-                    "method": method,
-                    "objects": count,
-                    **interval.named("relative"),
-                    **self._rate(method).named("rate", "rate_"),
-                }
-            )
+        for k, method in enumerate(self.methods):
+            interval = Interval.from_values(self.values[:, k], self.errors[:, k], spreads[k]).exp()
+            known = self.slopes[np.isfinite(self.slopes[:, k, 0]), k]
+            rate = Interval.from_values(known[:, 0], known[:, 1])
+            about = {"method": method, "objects": count}
+            rows.append({**about, **interval.named("relative"), **rate.named("rate", "rate_")})
         frame = pd.DataFrame(rows).sort_values("relative", kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
         # Where there are no intervals, any place is possible.
@@ -175,19 +182,13 @@ class League:
         sizes, with the ends low and high of its interval; p, the p-value of the paired permutation test, adjusted for
         the number of pairs (Holm); nearer, the method that is nearer by this test at the level of 5 %, or nothing.
         """
-        scores, rows = self.scores, []
-        for i, j in combinations(range(len(scores.methods)), 2):
-            differences = scores.values[:, i] - scores.values[:, j]
-            errors = scores.errors[:, i] + scores.errors[:, j]
-            interval = Interval.from_values(differences, errors).exp()
-            rows.append(
-                {
-                    "method": scores.methods[i],
-                    "other": scores.methods[j],
-                    **interval.named("ratio"),
-                    "p": sign_flip_test(differences, errors),
-                }
-            )
+        rows = []
+        for i, j in combinations(range(len(self.methods)), 2):
+            differences = self.values[:, i] - self.values[:, j]
+            errors = self.errors[:, i] + self.errors[:, j]
+            ratio = Interval.from_values(differences, errors).exp().named("ratio")
+            pair = {"method": self.methods[i], "other": self.methods[j]}
+            rows.append({**pair, **ratio, "p": sign_flip_test(differences, errors)})
         columns = ["method", "other", "ratio", "low", "high", "p"]
         frame = pd.DataFrame(rows, columns=columns)
         frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
@@ -196,17 +197,14 @@ class League:
         return frame
 
     def _repr_html_(self) -> str:
-        count = len(self.scores.objects)
         frames = [self.table, *([self.pairs] if len(self.pairs) else [])]
         # pandas escapes the names of methods.
         tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in frames)
-        caption = f"League at order {self.order:g}, over {count} object{'s' if count > 1 else ''}"
-        return f"<div><strong>{caption}</strong>{tables}</div>"
+        return f"<div><strong>{self.caption}</strong>{tables}</div>"
 
-    def _rate(self, method: str) -> Interval:
-        slopes = [self.edge_curves[name][method].slope() for name in self.scores.objects]
-        known = np.array([slope for slope in slopes if np.isfinite(slope[0])], dtype=np.float64).reshape(-1, 2)
-        return Interval.from_values(known[:, 0], known[:, 1])
+
+def _objects(count: int) -> str:
+    return f"{count} object{'s' if count > 1 else ''}"
 
 
 def league(
@@ -237,26 +235,19 @@ def league(
         StoreError: The location has no store.
 
     >>> import sobolev_batch as sb
-    >>> collection = sb.StudyCollection.from_table({
-    ...     "study": {"name": "balls"},
-    ...     "lattice": {"xi_max": 3.0, "M": 16},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "object": [
-    ...         {"name": "ball", "reference": {"source": "sphere"}},
-    ...         {"name": "large", "reference": {"source": "sphere", "radius": 1.1}, "scaling": {"mode": "none"}},
-    ...     ],
-    ...     "family": [
-    ...         {"name": "ico", "source": "icosphere", "levels": [1, 2]},
-    ...         {"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.7], "levels": [1, 2]},
-    ...     ],
-    ... })
-    >>> summary = sb.run(collection, "memory://league-example.zarr", workers=1)
-    >>> (at_order,) = sb.league("memory://league-example.zarr")
-    >>> at_order.table["method"].tolist(), at_order.scores.objects
-    (['ico', 'egg'], ('ball', 'large'))
+    >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> at_order.table[["method", "objects"]].to_dict("records")
+    [{'method': 'icosphere', 'objects': 1}]
     """
-    stores, objects = stores_of(store)
-    return leagues_of(tables_of(stores, order), objects, x=x, methods=methods)
+    if isinstance(store, Mapping):
+        return leagues_of(tables_of(store, order), tuple(store), x=x, methods=methods)
+    collection = CollectionStore.read(Location.parse(store))
+    if collection is None:
+        raise StoreError(
+            f"{store}: it holds no store of a collection; run a study with several objects, or give the stores of "
+            "single objects by their names"
+        )
+    return leagues_of(tables_of(collection.existing_stores, order), collection.objects, x=x, methods=methods)
 
 
 def leagues_of(
@@ -280,24 +271,44 @@ def leagues_of(
 def _league(
     tables: Mapping[str, pd.DataFrame], order: float, x: str, methods: Sequence[str], unfinished: Mapping[str, str]
 ) -> League:
-    at_order = {name: frame[frame["order"] == order] for name, frame in tables.items()}
-    curves = _curves(at_order, x, methods)
-    scores = Scores.from_curves(curves, methods, unfinished)
-    if not scores.objects:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(scores.left_out.items())[:3])
+    rows: dict[str, tuple[Reals, ...]] = {}
+    left_out = dict(unfinished)
+    for name, frame in tables.items():
+        at_order = frame[frame["order"] == order]
+        curves = _curves(at_order, x, methods)
+        common = common_sizes([curves[method] for method in methods]) if len(curves) == len(methods) else None
+        exact = [method for method, curve in curves.items() if curve.is_exact]
+        if len(curves) < len(methods):
+            left_out[name] = f"no distance of {', '.join(method for method in methods if method not in curves)}"
+        elif exact:
+            left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
+        elif common is None:
+            left_out[name] = _gap(curves)
+        else:
+            values, errors = zip(*(curve.at(common) for curve in curves.values()), strict=True)
+            slopes = [curve.slope() for curve in _curves(at_order, EDGE_LENGTH, methods).values()]
+            rows[name] = common, np.array(values), np.array(errors), np.array(slopes)
+    if not rows:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
         raise InputError(
             f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods"
         )
-    return League(order, x, scores, curves, _curves(at_order, EDGE_LENGTH, methods))
+    arrays = (np.array(parts) for parts in zip(*rows.values(), strict=True))
+    return League(order, x, tuple(rows), tuple(methods), left_out, *arrays)
 
 
-def _curves(tables: Mapping[str, pd.DataFrame], x: str, methods: Sequence[str]) -> dict[str, dict[str, Curve]]:
-    """Return the curves of all objects and methods that have distances."""
-    curves: dict[str, dict[str, Curve]] = {}
-    for name, frame in tables.items():
-        by_method = {method: Curve.from_rows(frame[frame["family"] == method], x) for method in methods}
-        curves[name] = {method: curve for method, curve in by_method.items() if curve is not None}
-    return curves
+def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Curve]:
+    """Return the curve of each method that has distances from an object."""
+    curves = {method: Curve.from_rows(frame[frame["family"] == method], x) for method in methods}
+    return {method: curve for method, curve in curves.items() if curve is not None}
+
+
+def _gap(curves: Mapping[str, Curve]) -> str:
+    """Return which methods have no range of sizes in common."""
+    first = max(curves, key=lambda method: curves[method].sizes[0])
+    last = min(curves, key=lambda method: curves[method].sizes[-1])
+    begin, end = np.exp(curves[first].sizes[0]), np.exp(curves[last].sizes[-1])
+    return f"no common range of sizes: {first} begins at {begin:,.5g}, {last} ends at {end:,.5g}"
 
 
 def compare_studies(
@@ -352,15 +363,11 @@ def compare_studies(
 
 
 def _stores(store: AnyCollection | AnyStore) -> Mapping[str, AnyStore]:
-    """Return the stores of objects; a store of one object has an empty name."""
-    if isinstance(store, xr.DataTree):
-        return {"": store}
-    if not isinstance(store, str | Path | Location):
+    """Return the store of each object that has one, by its name; a store of one object has an empty name."""
+    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         return store
-    collection = CollectionStore.read(Location.parse(store))
-    if collection is None:
-        return {"": store}
-    return dict(collection.existing_stores)
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
+    return {"": store} if collection is None else dict(collection.existing_stores)
 
 
 def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
@@ -409,19 +416,63 @@ def _change(meshes: pd.DataFrame) -> dict[str, object]:
     }
 
 
-def stores_of(store: AnyCollection) -> tuple[dict[str, AnyStore], tuple[str, ...]]:
-    """Return the store of each object that has one, by its name, and the names of all objects.
+def format_league(leagues: Sequence[League], style: Format = "text") -> str:
+    """Return leagues as text; see `league`."""
+    if style in ("csv", "json"):
+        frames = [one.table.assign(order=one.order) for one in leagues]
+        frame = pd.concat(frames, ignore_index=True)
+        return machine_table(frame[["order", *frame.columns.drop("order")]], style)
+    sections = []
+    for one in leagues:
+        rows = column_table(LEAGUE_COLUMNS[:-1], one.table.to_dict(orient="records"), style)
+        sections += [prose([one.caption], style), rows, prose(pair_lines(one), style)]
+    notes = LEAGUE_NOTE.format(x=leagues[0].x).splitlines()
+    notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
+    return "\n\n".join([*filter(None, sections), prose(notes, style)])
 
-    Raises:
-        StoreError: The location has no store of a collection.
-    """
-    if isinstance(store, Mapping):
-        return dict(store), tuple(store)
-    location = Location.parse(store)
-    collection = CollectionStore.read(location)
-    if collection is None:
-        raise StoreError(
-            f"{location}: it holds no store of a collection; run a study with several objects, or give the stores of "
-            "single objects by their names"
+
+def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
+    """Yield the objects that leagues leave out, at which of their orders (nothing for all of them), and why."""
+    orders: dict[tuple[str, str], list[float]] = {}
+    for one in leagues:
+        for name, reason in one.left_out.items():
+            orders.setdefault((name, reason), []).append(one.order)
+    for (name, reason), at in orders.items():
+        where = "" if len(at) == len(leagues) else f" at order {', '.join(f'{s:g}' for s in at)}"
+        yield name, where, reason
+
+
+def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
+    """Return the result of `compare_studies` as text."""
+    if style in ("csv", "json"):
+        return machine_table(changes, style)
+    sections = []
+    for order, frame in changes.groupby("order", sort=False):
+        sections += [
+            prose([f"New study against the old one at order {order:g}"], style),
+            column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style),
+        ]
+    units = "objects" if (changes["objects"] > 1).all() else "meshes"
+    notes = _CHANGES_NOTE.format(units=units).splitlines()
+    least = least_objects(changes["method"].nunique())
+    if (changes[units] < least).any():
+        notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
+    return "\n\n".join([*sections, prose(notes, style)])
+
+
+def pair_lines(league: League) -> list[str]:
+    """Return a line for each pair of methods that differ."""
+    lines = []
+    for row in league.pairs.itertuples():
+        if row.nearer:
+            farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
+            lines.append(f"{row.nearer} is {ratio:.3g} times nearer than {farther} (p = {row.p:.2g}).")
+    count, methods = len(league.objects), len(league.table)
+    if not lines and methods > 1:
+        least = least_objects(len(league.pairs))
+        lines.append(
+            "No two methods differ beyond chance and error."
+            if count >= least
+            else f"The test cannot tell {methods} methods from chance with {_objects(count)}; take {least} or more."
         )
-    return dict(collection.existing_stores), collection.objects
+    return lines

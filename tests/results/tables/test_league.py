@@ -12,8 +12,7 @@ import pytest
 from scipy import stats
 
 import sobolev_batch as sb
-from sobolev_batch.results.tables.league import League, leagues_of
-from sobolev_batch.results.tables.league_text import format_league
+from sobolev_batch.results.tables.league import League, format_league, leagues_of
 from sobolev_batch.results.tables.statistics import Interval, adjusted, sign_flip_test, within_objects
 
 SIZES = (100, 400, 1600)
@@ -116,10 +115,10 @@ def test_a_distance_below_its_error_bounds_nothing(ranked: Ranked) -> None:
 def test_objects_without_a_method_are_left_out_and_named(ranked: Ranked) -> None:
     both, one = of_powers({"a": 1, "b": 2}, 1.0), of_powers({"a": 1}, 1.0)
     made = ranked({"x": both, "y": one, "z": both})
-    assert made.scores.objects == ("x", "z")
-    assert made.scores.left_out == {"y": "no distance of b"}
+    assert made.objects == ("x", "z")
+    assert made.left_out == {"y": "no distance of b"}
     assert "y is left out: no distance of b." in format_league([made])
-    assert ranked({"x": both, "y": one}, methods=["a"]).scores.objects == ("x", "y")
+    assert ranked({"x": both, "y": one}, methods=["a"]).objects == ("x", "y")
     with pytest.raises(sb.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"):
         ranked({"y": one, "w": of_powers({"b": 1}, 1.0)})
     with pytest.raises(sb.InputError, match="no method is named 'c'; known are a, b"):
@@ -131,7 +130,7 @@ def test_objects_that_a_method_reproduced_are_left_out_and_named(distance: float
     plain = of_powers({"a": 1, "b": 2}, 1.0)
     box = frame({"a": dict.fromkeys(SIZES, distance), "b": {n: 1.0 / n for n in SIZES}}, error=0.03)
     made = ranked({"x": plain, "box": box, "z": plain})
-    assert made.scores.left_out == {"box": "a reproduced it, up to rounding"}
+    assert made.left_out == {"box": "a reproduced it, up to rounding"}
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
     np.testing.assert_allclose(made.table["rate"], 2.0)
 
@@ -155,7 +154,7 @@ def test_sizes_that_do_not_meet_are_not_compared(ranked: Ranked) -> None:
     near = frame({"a": {1000: 1.0}, "b": {1100: 2.0}})
     far = frame({"a": {1000: 1.0}, "b": {2000: 2.0}})
     made = ranked({"x": near, "y": far, "z": near})
-    assert made.scores.left_out == {"y": "no common range of sizes: b begins at 2,000, a ends at 1,000"}
+    assert made.left_out == {"y": "no common range of sizes: b begins at 2,000, a ends at 1,000"}
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
 
 
@@ -178,7 +177,7 @@ def test_rates_are_those_of_the_objects_that_count_and_need_sizes(ranked: Ranked
     steep = frame({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
     lone = frame({"a": {1000: 1.0, 8000: 1e-3}})
     made = ranked({"x": plain, "steep": steep, "lone": lone, "z": plain})
-    assert list(made.scores.left_out) == ["lone"]
+    assert list(made.left_out) == ["lone"]
     np.testing.assert_allclose(made.table["rate"], 2.0)
 
 
