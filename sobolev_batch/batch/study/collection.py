@@ -86,7 +86,7 @@ class StudyCollection:
         """
         path = Path(path)
         try:
-            return cls._of(read_toml(path), path.parent)
+            return cls.from_table(read_toml(path), folder=path.parent)
         except InputError as error:
             raise StudyError(f"{path}: {error}") from error
 
@@ -95,27 +95,13 @@ class StudyCollection:
         """Validate a collection given as nested tables, with the keys of the study file.
 
         Args:
-            table: Sections of a study, besides object (a list), or objects. A pandas.DataFrame may stand for the list
-                of meshes of objects.
+            table: Sections of the study file. A pandas.DataFrame may take the place of ``meshes`` of objects.
             folder: Folder in which relative paths start.
 
         Raises:
             StudyError: See `from_toml`.
         """
-        return cls._of(table, Path(folder))
-
-    def with_best_effort(self) -> Self:
-        """Return the collection with the key ``best_effort`` of its accuracy set.
-
-        Raises:
-            StudyError: It has a lattice instead of an accuracy.
-        """
-        studies = {name: study.with_best_effort() for name, study in self.studies.items()}
-        accuracy = {**self.table["accuracy"], "best_effort": True}
-        return replace(self, studies=studies, table={**self.table, "accuracy": accuracy})
-
-    @classmethod
-    def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
+        folder = Path(folder)
         values = plain_tables(table)
         # Objects and lists may bring references and families.
         document = StudyDocument.from_tables({"reference": None, "family": [], **values})
@@ -141,20 +127,28 @@ class StudyCollection:
                 studies[section.name] = Study.from_table(table_of_object, folder=folder)
             except StudyError as error:
                 raise StudyError(f"object {quoted(section.name)}: {error}") from error
-        methods = dict.fromkeys(family.name for study in studies.values() for family in study.families)
-        lacking: dict[str, tuple[str, ...]] = {}
-        for name, study in studies.items():
-            missing = methods.keys() - {family.name for family in study.families}
-            if missing:
-                lacking[name] = tuple(method for method in methods if method in missing)
+        own = {name: [family.name for family in study.families] for name, study in studies.items()}
+        methods = dict.fromkeys(method for names in own.values() for method in names)
+        lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
+        lacking = {name: missing for name, missing in lacking.items() if missing}
         title = document.study.title or document.study.name
         return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(values, default=str)))
+
+    def with_best_effort(self) -> Self:
+        """Return the collection with the key ``best_effort`` of its accuracy set.
+
+        Raises:
+            StudyError: It has a lattice instead of an accuracy.
+        """
+        studies = {name: study.with_best_effort() for name, study in self.studies.items()}
+        accuracy = {**self.table["accuracy"], "best_effort": True}
+        return replace(self, studies=studies, table={**self.table, "accuracy": accuracy})
 
 
 def is_collection(table: Mapping[str, Any]) -> bool:
     """Return True where the table of a study file has several objects."""
-    templates = table.get("reference"), table.get("family")
-    return "object" in table or "objects" in table or any(_holds(templates, name) for name in (OBJECT, METHOD))
+    templates = str([table.get("reference"), table.get("family")])
+    return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
 
 
 def read_study(path: str | Path) -> Study | StudyCollection:
@@ -311,15 +305,6 @@ def _files(folder: Path, text: str) -> list[Path]:
         return matching_files(folder, text)
     except StudyError:
         return []
-
-
-def _holds(value: Any, placeholder: str) -> bool:
-    """Return True where any text of nested tables has a placeholder."""
-    if isinstance(value, str):
-        return placeholder in value
-    if isinstance(value, Mapping):
-        return any(_holds(entry, placeholder) for entry in value.values())
-    return isinstance(value, list | tuple) and any(_holds(entry, placeholder) for entry in value)
 
 
 def _filled(value: Any, placeholder: str, name: str) -> Any:

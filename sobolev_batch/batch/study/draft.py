@@ -31,7 +31,7 @@ _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECAS
 # The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
 _SIZE = re.compile(r"(?P<separator>[\W_]*)\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
 _LONGEST_NAME = 100
-# More lines of one kind, or objects on a line, would hide what comes next.
+# More families, or objects on a line, would hide what comes next.
 _MOST_LINES, _MOST_OBJECTS = 10, 6
 # Lists of paths are broken into lines where they are longer.
 _LINE = 110
@@ -102,21 +102,15 @@ class StudyDraft:
     left_out: Mapping[str, str]
 
     def __str__(self) -> str:
-        first, *others = self.summary
-        left_out = [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
-        file = shlex.quote(str(self.path))
+        file, more = shlex.quote(str(self.path)), len(self.summary) - _MOST_LINES
+        families = [*self.summary[:_MOST_LINES], *([f"and {more} more"] if more > 0 else [])]
+        left_out = [f"{name}: {text}" for name, text in reasons("left out", self.left_out)]
         following = [f"next: sobolev-batch plan {file}", f"      sobolev-batch run {file}"]
-        lines = [f"{self.path}: {first}", *_cut(others, "and"), *_cut(left_out, "left out:"), *following]
-        return "\n".join(map(visible, lines))
+        return "\n".join(map(visible, [f"{self.path}: {families[0]}", *families[1:], *left_out, *following]))
 
     def _repr_html_(self) -> str:
-        rows = [("", line) for line in self.summary[: _MOST_LINES + 1]]
+        rows = [("", line) for line in self.summary[:_MOST_LINES]]
         return table_html(f"Study file {self.path}", [*rows, *reasons("left out", self.left_out)])
-
-
-def _cut(lines: Sequence[str], start: str) -> list[str]:
-    more = len(lines) - _MOST_LINES
-    return [*lines[:_MOST_LINES], *([f"{start} {more} more"] if more > 0 else [])]
 
 
 def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> StudyDraft:

@@ -92,14 +92,8 @@ class LatticeChoice:
 
     def to_table(self) -> dict[str, Any]:
         """Return the choice as a table, without the octaves."""
-        return {
-            "xi_max": self.lattice.xi_max,
-            "M": self.lattice.M,
-            "dtype": self.dtype,
-            "closest": list(self.closest),
-            "reasons": list(self.reasons),
-            "basis": self.basis,
-        }
+        others = {name: getattr(self, name) for name in ("dtype", "closest", "reasons", "basis")}
+        return {"xi_max": self.lattice.xi_max, "M": self.lattice.M, **others}
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], octaves: Mapping[str, Any] | None) -> Self:
@@ -175,12 +169,10 @@ def _finer_octaves(
     return (Lattice(lattice.xi_max, intervals), refined) if refined.size <= _MOST_SAMPLES else None
 
 
-def choice_basis(study: Study, similarity: Similarity, reference: Mapping[str, Any]) -> str:
+def choice_basis(study: Study, accuracy: Accuracy, similarity: Similarity, reference: Mapping[str, Any]) -> str:
     """Return a digest of the data that the choice for a study is made from, except families, which may gain meshes."""
-    if study.accuracy is None:
-        return ""
     data = {
-        "accuracy": [study.accuracy.rtol, float(study.accuracy.allowed_bytes), study.accuracy.best_effort],
+        "accuracy": [accuracy.rtol, float(accuracy.allowed_bytes), accuracy.best_effort],
         "orders": study.orders,
         "dtype": study.dtype,
         "similarity": [similarity.scale, *similarity.origin],
@@ -257,7 +249,7 @@ def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Su
 
 
 def choose_lattice(
-    study: Study, similarity: Similarity, reference: Surface, members: Members, basis: str
+    study: Study, accuracy: Accuracy, similarity: Similarity, reference: Surface, members: Members
 ) -> LatticeChoice:
     """Choose lattice, octaves and dtype for the accuracy that a study requests.
 
@@ -266,19 +258,16 @@ def choose_lattice(
     reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
 
     Args:
-        study: Study with an accuracy.
+        study: Study.
+        accuracy: Accuracy that it requests.
         similarity: Similarity transform of the study.
         reference: Reference in the study's unit.
         members: Other surfaces of the study.
-        basis: Digest from `choice_basis`.
 
     Raises:
         AccuracyError: A pilot shows that the accuracy cannot be met within the memory, and it is no best effort.
         StudyError: No pilot could be made.
     """
-    accuracy = study.accuracy
-    if accuracy is None:
-        raise ValueError("only a study that requests an accuracy leaves a choice")
     pilots, set_aside = choose_pilots(members, similarity, reference.extent)
     others = {label: member for label, member in members.items() if label not in {*pilots, *set_aside}}
     extents, unlike = look_at_extents(others, similarity, reference.extent)
@@ -309,7 +298,7 @@ def choose_lattice(
         choice, shortfalls = _best(problems, study.dtype)
         if choice is None or shortfalls:
             raise _worst(shortfalls)
-        return replace(choice, basis=basis)
+        return choice
     choice, short = _best_for_most(problems, study.dtype)
     notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
@@ -323,7 +312,7 @@ def choose_lattice(
         # The largest lattice that a pair may need and the memory permits.
         largest = _with_accuracy(problems, best_effort=True)
         choice = _one_lattice(largest, {label: run_pilot(problem) for label, problem in largest.items()}, study.dtype)
-    return replace(choice, basis=basis, reasons=(*choice.reasons, *notes))
+    return replace(choice, reasons=(*choice.reasons, *notes))
 
 
 # The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.

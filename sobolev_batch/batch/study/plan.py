@@ -47,7 +47,7 @@ class Row:
     family: str
     member: Member
     fingerprint: str
-    key: str
+    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,8 @@ class Plan:
     def with_choice(self, choice: LatticeChoice) -> Plan:
         """Return the plan of the same study on another lattice."""
         rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
-        return replace(self, rows=rows, choice=choice, blocks=_blocks(self.study, choice))
+        blocks = choice.lattice.split(self.study.largest_chunk_bytes // np.dtype(choice.dtype).itemsize)
+        return replace(self, rows=rows, choice=choice, blocks=blocks)
 
 
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
@@ -133,7 +134,10 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     """
     members = members_of(study)
     reference = _reference_label(study, members)
-    own = _load_reference(members[reference][1])
+    try:
+        own = members[reference][1].load()
+    except InputError as error:
+        raise MeshError(f"the reference cannot be made: {error}") from error
     similarity = study.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
@@ -144,24 +148,12 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
             f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
         )
-    rows = []
-    for label, (family, member) in members.items():
-        fingerprint = _fingerprint(label, member)
-        rows.append(Row(label, family, member, fingerprint, _key(study, similarity, choice, fingerprint)))
+    rows = (Row(label, family, member, _fingerprint(label, member)) for label, (family, member) in members.items())
     sample = None
     if study.accuracy is not None:
         sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
-    return Plan(
-        study,
-        similarity,
-        tuple(rows),
-        reference,
-        _blocks(study, choice),
-        choice,
-        surface.area,
-        surface.extent,
-        sample,
-    )
+    plan = Plan(study, similarity, tuple(rows), reference, (), choice, surface.area, surface.extent, sample)
+    return plan.with_choice(choice)
 
 
 def _lattice_choice(
@@ -175,15 +167,13 @@ def _lattice_choice(
     if study.lattice is not None:
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
         return LatticeChoice(study.lattice, study.transform.dtype, tail=tail)
-    basis = choice_basis(study, similarity, members[reference][1].fingerprint())
+    if study.accuracy is None:
+        raise ValueError("a study has a lattice or an accuracy")
+    basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
     if earlier is not None and earlier.basis == basis:
         return earlier
     others = {label: member for label, member in members.items() if label != reference}
-    return choose_lattice(study, similarity, surface, others, basis)
-
-
-def _blocks(study: Study, choice: LatticeChoice) -> tuple[Block, ...]:
-    return choice.lattice.split(study.largest_chunk_bytes // np.dtype(choice.dtype).itemsize)
+    return replace(choose_lattice(study, study.accuracy, similarity, surface, others), basis=basis)
 
 
 def members_of(study: Study) -> dict[str, tuple[str, Member]]:
@@ -202,7 +192,12 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
-            _require_free_names(family.name, member)
+            taken = next((name for name, _ in member.metadata if name in VARIABLES), None)
+            if taken is not None:
+                raise StudyError(
+                    f"family {family.name!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which "
+                    f"tables use themselves; rename it, for example to {family.name}_{taken}"
+                )
             members[label] = family.name, member
     if not isinstance(study.reference, FamilyReference):
         try:
@@ -210,15 +205,6 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
         except StudyError as error:
             raise StudyError(f"reference: {error}") from error
     return members
-
-
-def _require_free_names(family: str, member: Member) -> None:
-    taken = next((name for name, _ in member.metadata if name in VARIABLES), None)
-    if taken is not None:
-        raise StudyError(
-            f"family {family!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which tables use "
-            f"themselves; rename it, for example to {family}_{taken}"
-        )
 
 
 def _reference_label(study: Study, members: Members) -> str:
@@ -237,13 +223,6 @@ def _reference_label(study: Study, members: Members) -> str:
     if f"{family}/{name}" not in members:
         raise StudyError(f"reference: the family {family!r} has no member {quoted(name)}")
     return f"{family}/{name}"
-
-
-def _load_reference(member: Member) -> Surface:
-    try:
-        return member.load()
-    except InputError as error:
-        raise MeshError(f"the reference cannot be made: {error}") from error
 
 
 def _fingerprint(label: str, member: Member) -> str:

@@ -5,12 +5,11 @@ A refusal has a message for each key that is wrong, with what was found and what
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -56,8 +55,6 @@ MOST_OCTAVES = 24
 _LONGEST_NAME, _LONGEST_TITLE = 100, 1000
 # Larger study files are mistakes, or made to keep the parser busy.
 _LARGEST_FILE_BYTES = 4 << 20
-# The parser takes time that is quadratic in the number of dotted parts of a key.
-_LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?>[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*+\.[ \t]*+){100}""")
 # The range of TOML's integers.
 _LARGEST_INTEGER = (1 << 63) - 1
 # Most refusals of one study; longer keys are not compared with others.
@@ -98,11 +95,7 @@ def _title(text: str) -> str:
 
 def object_name(name: str) -> str:
     """Check the name of an object, which is that of a folder in the store."""
-    if (
-        any(character in RESERVED for character in _name(name))
-        or name.startswith((".", "__"))
-        or name.endswith(".json")
-    ):
+    if set(RESERVED) & set(_name(name)) or name.startswith((".", "__")) or name.endswith(".json"):
         raise ValueError(
             f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
             "begin with . or __, and does not end with .json"
@@ -110,27 +103,8 @@ def object_name(name: str) -> str:
     return name
 
 
-def _memory(value: Any) -> float:
-    try:
-        return float(byte_count(value))
-    except InputError as error:
-        raise ValueError(str(error)) from error
-
-
-def _orders(orders: tuple[float, ...]) -> tuple[float, ...]:
-    """Return valid orders, each once."""
-    try:
-        return tuple(dict.fromkeys(check_orders(orders)))
-    except InputError as error:
-        positive = next((s for s in orders if s > 0.5), None)
-        raise ValueError(f"{error}; did you mean {-positive:g}?" if positive else str(error)) from error
-
-
 Name = Annotated[str, AfterValidator(_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Orders = Annotated[
-    tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS), AfterValidator(_orders)
-]
 
 
 class Section(BaseModel):
@@ -168,17 +142,21 @@ class _LatticeSection(Section):
 
 class _AccuracySection(Section):
     rtol: Number
-    memory: Annotated[float | None, BeforeValidator(_memory)] = None
+    memory: float | str | None = None
     best_effort: bool = False
 
     def settings(self) -> Accuracy:
         accuracy = Accuracy(self.rtol, best_effort=self.best_effort)
-        return accuracy if self.memory is None else replace(accuracy, allowed_bytes=self.memory)
+        return accuracy if self.memory is None else replace(accuracy, allowed_bytes=float(byte_count(self.memory)))
 
 
 class _NormSection(Section):
-    orders: Orders
+    orders: Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)]
     pairs: Literal["all", "reference"] = "all"
+
+    def settings(self) -> tuple[float, ...]:
+        """Return the orders, each once."""
+        return tuple(dict.fromkeys(check_orders(self.orders)))
 
 
 class _TransformSection(Section):
@@ -209,23 +187,21 @@ class _ProximitySection(Section):
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
 
 
+class FamilyReference(Section):
+    """A reference that is a member of one of the study's families: its finest unless named."""
+
+    family: str
+    member: str | None = None
+
+
 def _source(table: object) -> Source:
+    """Return what a table with the key ``source`` describes."""
     if not isinstance(table, dict):
         raise PydanticKnownError("dict_type")
     try:
         return parse_source(table)
     except InputError as error:
         raise ValueError(str(error)) from error
-
-
-SourceTable = Annotated[SerializeAsAny[Source], BeforeValidator(_source)]
-
-
-class FamilyReference(Section):
-    """A reference that is a member of one of the study's families: its finest unless named."""
-
-    family: str
-    member: str | None = None
 
 
 class Family(Section):
@@ -239,7 +215,7 @@ class Family(Section):
     """
 
     name: Name
-    source: SourceTable
+    source: Annotated[SerializeAsAny[Source], BeforeValidator(_source)]
     order_by: Literal["triangles", "names"] | None = None
 
     @model_validator(mode="before")
@@ -293,7 +269,10 @@ class StudyDocument(Section):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise StudyError(_joined(_refusals(error, values))) from error
+            messages = _refusals(error, values)
+            more = len(messages) - _MOST_OFFENDERS
+            shown = [*messages[:_MOST_OFFENDERS], *([f"and {more} more"] if more > 0 else [])]
+            raise StudyError("; ".join(shown)) from error
 
     @model_validator(mode="after")
     def _lattice_or_accuracy(self) -> Self:
@@ -312,21 +291,14 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         with open_regular(path) as file:
-            length = os.fstat(file.fileno()).st_size
             data = file.read(_LARGEST_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
         raise StudyError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if len(data) > _LARGEST_FILE_BYTES:
-        raise StudyError(
-            f"a study file has at most {_LARGEST_FILE_BYTES} bytes, found {max(length, len(data))}; "
-            "globs name many meshes in few words"
-        )
-    if data.startswith(codecs.BOM_UTF8):
-        raise StudyError("not a TOML file: it begins with a byte order mark; save it as UTF-8 without one")
-    if _LONG_KEY.search(data):
-        raise StudyError("a key has 100 dotted parts or more; those of a study have two")
+        raise StudyError(f"a study file has at most {_LARGEST_FILE_BYTES} bytes; globs name many meshes in few words")
     try:
-        text = data.decode("utf-8")
+        # Some editors begin a file with a byte order mark.
+        text = data.decode("utf-8-sig")
         return tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise StudyError(f"not a TOML file: {error}; save it as UTF-8") from error
@@ -334,13 +306,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise StudyError("its tables and lists are nested too deeply") from error
     # Beyond TOML's own errors, numbers and dates that Python cannot hold.
     except ValueError as error:
-        raise StudyError(f"not a TOML file: {error}{_line_at(str(error), text)}") from error
-
-
-def _line_at(message: str, text: str) -> str:
-    """Return the line where the parser stopped."""
-    position = re.search(r"\(at line (\d+), ", message)
-    return f": {quoted(text.splitlines()[int(position[1]) - 1].strip())}" if position else ""
+        position = re.search(r"\(at line (\d+), ", str(error))
+        line = f": {quoted(text.splitlines()[int(position[1]) - 1].strip())}" if position else ""
+        raise StudyError(f"not a TOML file: {error}{line}") from error
 
 
 def plain_tables(table: object) -> dict[str, Any]:
@@ -351,8 +319,7 @@ def plain_tables(table: object) -> dict[str, Any]:
     """
     if not isinstance(table, Mapping):
         raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
-    plain = _plain(table, ())
-    return plain if isinstance(plain, dict) else {}
+    return {str(key): _plain(value, (key,)) for key, value in table.items()}
 
 
 def _plain(value: Any, key: tuple[object, ...]) -> Any:
@@ -417,13 +384,7 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
     return messages
 
 
-def _joined(messages: Sequence[str]) -> str:
-    """Return messages on one line; a long list is cut."""
-    more = len(messages) - _MOST_OFFENDERS
-    return "; ".join(messages[:_MOST_OFFENDERS]) + (f"; and {more} more" if more > 0 else "")
-
-
-def known_names(name: str, known: Sequence[str]) -> str:
+def known_names(name: str, known: Iterable[str]) -> str:
     """Return the name that an unknown one is probably meant to be, or else all that are known."""
     by_lower = {candidate.lower(): candidate for candidate in known}
     near = difflib.get_close_matches(name.lower(), by_lower, n=1) if len(name) <= _LONGEST_KEY else []
@@ -435,8 +396,8 @@ def shown_value(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else quoted(value)
 
 
-def _dotted(key: Sequence[object]) -> str:
-    return ".".join(_readable(str(part)) for part in key[:8]) or "study"
+def _dotted(key: tuple[object, ...]) -> str:
+    return ".".join(_readable(str(part)) for part in key[:8])
 
 
 def _readable(key: str) -> str:
@@ -476,18 +437,17 @@ def _value_at(values: Any, key: Key) -> Any:
     return values
 
 
-def _known_keys(values: Any, key: Key) -> tuple[str, ...]:
+def _known_keys(values: Mapping[str, Any], key: Key) -> Iterable[str]:
     """Return the keys that the table at a key may have."""
-    model: type[BaseModel] = StudyDocument
-    for depth, part in enumerate(key):
-        values = values[part]
-        if isinstance(values, Mapping) and "source" in values:
-            is_family = depth == 0 and values["source"] == "family"
-            model = FamilyReference if is_family else source_type_of(values["source"])
-        elif isinstance(part, str):
-            model = next(models_in(model.model_fields[part].annotation))
-    source = ("source",) if issubclass(model, Source | FamilyReference) else ()
-    return (*model.model_fields, *source, *(_KEYS_OF_FAMILY if key[:1] == ("family",) and len(key) <= 2 else ()))
+    table = _value_at(values, key)
+    if not key:
+        return StudyDocument.model_fields
+    if "source" not in table:
+        return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
+    if key == ("reference",) and table["source"] == "family":
+        return (*FamilyReference.model_fields, "source")
+    own = _KEYS_OF_FAMILY if key[0] == "family" and len(key) == len(("family", 0)) else ()
+    return (*source_type_of(table["source"]).model_fields, "source", *own)
 
 
 def models_in(annotation: Any) -> Iterator[type[BaseModel]]:

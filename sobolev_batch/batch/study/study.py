@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -104,29 +104,12 @@ class Study:
             path: Path of the file. docs/studies.md describes its sections.
 
         Raises:
-            StudyError: The file cannot be read, is not TOML, or has keys that are unknown, of the wrong type, or out
-                of range. The message lists every offender.
-
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> import sobolev_batch as sb
-        >>> text = '''
-        ... study.name = "spheres"
-        ... lattice = { xi_max = 4.0, M = 32 }
-        ... norm.orders = [-2.0, -3.0]
-        ... reference.source = "sphere"
-        ... family = [{ name = "ico", source = "icosphere", levels = [0, 1] }]
-        ... '''
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "study.toml"
-        ...     _ = path.write_text(text)
-        ...     study = sb.Study.from_toml(path)
-        >>> study.name, study.orders, study.lattice
-        ('spheres', (-2.0, -3.0), Lattice(xi_max=4.0, M=32))
+            StudyError: The file cannot be read, is no TOML, or has keys that are unknown, of the wrong type, or out of
+                range. The message lists every offender.
         """
         path = Path(path)
         try:
-            return cls._of(read_toml(path), path.parent)
+            return cls.from_table(read_toml(path), folder=path.parent)
         except InputError as error:
             raise StudyError(f"{path}: {error}") from error
 
@@ -135,53 +118,13 @@ class Study:
         """Validate a study given as nested tables, with the keys of the study file.
 
         Args:
-            table: Sections study, lattice or accuracy, norm, transform, reference, family (a list), scaling,
-                proximity.
+            table: Sections of the study file. A pandas.DataFrame may take the place of a list of tables, such as for
+                ``meshes`` of the source ``files``.
             folder: Folder in which relative paths start.
-
-        A pandas.DataFrame may stand where a list of tables does, such as for ``meshes`` of the source ``files``.
 
         Raises:
             StudyError: See `from_toml`.
-
-        >>> import sobolev_batch as sb
-        >>> study = sb.Study.from_table({
-        ...     "study": {"name": "spheres"},
-        ...     "accuracy": {"rtol": 1e-3, "memory": "4GB"},
-        ...     "norm": {"orders": [-2.0]},
-        ...     "reference": {"source": "sphere"},
-        ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
-        ... })
-        >>> [family.name for family in study.families], study.accuracy.rtol
-        (['ico'], 0.001)
         """
-        return cls._of(table, Path(folder))
-
-    def with_best_effort(self) -> Study:
-        """Return the study with the key ``best_effort`` of its accuracy set.
-
-        Raises:
-            StudyError: It has a lattice instead of an accuracy.
-
-        >>> import sobolev_batch as sb
-        >>> study = sb.Study.from_table({
-        ...     "study": {"name": "spheres"},
-        ...     "accuracy": {"rtol": 1e-3},
-        ...     "norm": {"orders": [-0.6]},
-        ...     "reference": {"source": "sphere"},
-        ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
-        ... })
-        >>> study.with_best_effort().accuracy.best_effort
-        True
-        """
-        if self.accuracy is None:
-            raise StudyError("a best effort is made for an [accuracy]; this study has a [lattice]")
-        return self.from_table(
-            {**self.table, "accuracy": {**self.table["accuracy"], "best_effort": True}}, folder=self.folder
-        )
-
-    @classmethod
-    def _of(cls, table: Mapping[str, Any], folder: Path) -> Self:
         values = plain_tables(table)
         document = StudyDocument.from_tables(values)
         if document.object is not None or document.objects:
@@ -191,13 +134,15 @@ class Study:
             raise StudyError("[[family]] must have at least 1 item, found []")
         if reference is None:
             raise StudyError("[reference] must be a table, found None")
-        _require_distinct([family.name for family in families])
-        if isinstance(reference, Source):
-            own = reference
-            families = [family.model_copy(update={"source": family.source.with_reference(own)}) for family in families]
-        elif reference.family not in (names := [family.name for family in families]):
-            name = reference.family
-            raise StudyError(f"[reference]: no family is named {quoted(name)}; {known_names(name, names)}")
+        names = [family.name for family in families]
+        _require_distinct(names)
+        if isinstance(reference, FamilyReference):
+            if reference.family not in names:
+                hint = known_names(reference.family, names)
+                raise StudyError(f"[reference]: no family is named {quoted(reference.family)}; {hint}")
+        else:
+            sources = [family.source.with_reference(reference) for family in families]
+            families = [one.model_copy(update={"source": s}) for one, s in zip(families, sources, strict=True)]
         return cls(
             name=document.study.name,
             title=document.study.title or document.study.name,
@@ -206,16 +151,27 @@ class Study:
             transform=document.transform.settings(),
             dtype=document.transform.dtype,
             backend=document.transform.backend,
-            orders=document.norm.orders,
+            orders=document.norm.settings(),
             pairs=document.norm.pairs,
             families=tuple(families),
             reference=reference,
             scaling=document.scaling.settings(),
             proximity=None if document.proximity is None else document.proximity.points,
-            folder=folder,
+            folder=Path(folder),
             octaves=document.lattice.octaves if document.lattice else 0,
             table=json.loads(json.dumps(values, default=str)),
         )
+
+    def with_best_effort(self) -> Study:
+        """Return the study with the key ``best_effort`` of its accuracy set.
+
+        Raises:
+            StudyError: It has a lattice instead of an accuracy.
+        """
+        if self.accuracy is None:
+            raise StudyError("a best effort is made for an [accuracy]; this study has a [lattice]")
+        table = {**self.table, "accuracy": {**self.table["accuracy"], "best_effort": True}}
+        return replace(self, accuracy=replace(self.accuracy, best_effort=True), table=table)
 
 
 def _require_distinct(families: Sequence[str]) -> None:

@@ -127,7 +127,7 @@ def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> N
         ({"object": [{"name": "cow", "colour": 1}]}, r"\[\[object\]\] 1 \(named 'cow'\): colour is unknown"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "cow"}]}}, "'a.ply' has no method"),
         ({"reference": {"source": "files", "paths": ["none/{object}.ply"]}}, "matches no file"),
-        ({"norm": {"orders": [0.0]}}, r"^\[norm\]: orders: "),
+        ({"norm": {"orders": [0.0]}}, r"^\[norm\]: the norm of a surface"),
         ({"object": [{"name": "cow", "scaling": {"mode": 1}}]}, r"^object 'cow': \[scaling\]: mode must be"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "a/b", "method": "m"}]}}, "object 'a/b': .*without / and"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "zarr.json", "method": "m"}]}}, r"not end with \.json"),
