@@ -1,18 +1,43 @@
-"""Opening a store for reading."""
+"""A store that is open for reading, and what it has: groups, orders, families and sizes of meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import DIGEST, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
+from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.surfaces.shapes.surface import placement_doubt
+from sobolev_batch.surfaces.sources.names import quoted
+
+Reals = NDArray[np.float64]
+# Names of families, or globs of names; None is all of them.
+Families = str | Sequence[str] | None
+
+# Of the columns of a table. The finer a mesh is, the smaller is the first, and the larger are the others.
+EDGE_LENGTH = "edge_length"
+_GROWING = ("triangles", "vertices", "seconds")
+_FROM_COARSE_TO_FINE = ("level", "triangles")
+
+_LABELS = {
+    EDGE_LENGTH: "mean edge length in the study's unit",
+    "triangles": "number of triangles",
+    "vertices": "number of vertices",
+    "seconds": "computing time of the mesh in seconds",
+}
+
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
@@ -131,3 +156,133 @@ def fields_read(store: AnyStore) -> Iterator[None]:
             "sobolev-batch verify names it, and run computes it again",
             "its bytes are not those that were stored",
         ) from error
+
+
+def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
+    """Return a table of an open store, in memory unless it may stay on disk.
+
+    Raises:
+        InputError: The store has no tables yet.
+    """
+    if name not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    dataset = tree[name].to_dataset()
+    return dataset.load() if load else dataset
+
+
+def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
+    """Return one order or several of a table as a list; all of them by default.
+
+    Raises:
+        InputError: The table lacks one of them.
+    """
+    stored: list[float] = dataset["order"].values.tolist()
+    if order is None:
+        return stored
+    chosen: list[float] = np.atleast_1d(np.asarray(order, dtype=np.float64)).tolist()
+    for s in chosen:
+        if s not in stored:
+            listed = ", ".join(f"{s:g}" for s in stored)
+            raise InputError(f"the store has no order {s:g}, only {listed}; add it to the study and run it again")
+    return chosen
+
+
+def chosen_order(tree: xr.DataTree, order: float | None) -> float:
+    """Return one of the orders of an open store; its first by default.
+
+    Raises:
+        InputError: The store has no tables yet, or lacks the order.
+    """
+    return chosen_orders(finished_group(tree, "convergence", load=False), order)[0]
+
+
+def has_proximity(tree: xr.DataTree) -> bool:
+    """Return True if the store has Hausdorff and Chamfer distances."""
+    return "proximity" in tree.children
+
+
+def reference_of(tree: xr.DataTree) -> str:
+    """Return the label of the study's reference."""
+    return str(finished_group(tree, "convergence", load=False).attrs["reference"])
+
+
+def families_of(tree: xr.DataTree) -> dict[str, str]:
+    """Return the family of each mesh by its label, in the order of the study."""
+    meshes = finished_group(tree, "meshes", load=False)
+    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
+
+
+def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
+    """Return the families that names or globs choose, in the order of the study; all of them by default.
+
+    Raises:
+        InputError: A name or glob fits no family.
+    """
+    known = list(dict.fromkeys(families_of(tree).values()))
+    if family is None:
+        return known
+    chosen: set[str] = set()
+    for pattern in [family] if isinstance(family, str) else family:
+        # A name may have characters that mean something else in a glob.
+        fitting = [pattern] if pattern in known else [name for name in known if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
+        chosen.update(fitting)
+    return [name for name in known if name in chosen]
+
+
+def has_times(tree: xr.DataTree) -> bool:
+    """Return True if any mesh of the store has a time."""
+    return "time" in finished_group(tree, "meshes", load=False).coords
+
+
+def metadata_of(tree: xr.DataTree) -> list[str]:
+    """Return the names of the metadata that the study gives its meshes."""
+    return list(finished_group(tree, "meshes", load=False).attrs.get("metadata", ()))
+
+
+def complete_meshes(tree: xr.DataTree) -> list[str]:
+    """Return the labels of all meshes that are computed, the reference among them."""
+    meshes = finished_group(tree, "meshes", load=False)
+    labels: list[str] = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
+    return labels
+
+
+def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
+    """Return why one doubts that a mesh can be compared with the reference, by the label of the mesh."""
+    complete, reference = complete_meshes(tree), reference_of(tree)
+    if reference not in complete:
+        return {}
+    texts = tree["fourier"]["quality"].sel(mesh=complete).load()
+    extents = {label: Quality.from_json(str(texts.sel(mesh=label).item())).extent for label in complete}
+    doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
+    return {label: doubt for label, doubt in doubts.items() if doubt is not None}
+
+
+def label_of(x: str) -> str:
+    """Return the label of an axis of sizes; one of the metadata has its name."""
+    return _LABELS.get(x, x)
+
+
+def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
+    """Return the sizes of the meshes of a table, NaN where they are not known.
+
+    Args:
+        frame: Rows of `table`.
+        x: Name of the size.
+
+    Raises:
+        InputError: The table has no such column of numbers.
+    """
+    if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
+        numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
+        given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+        raise InputError(f"no size of meshes is named {quoted(x)}; known are {', '.join([*numbers, *given])}")
+    sizes: Reals = frame[x].to_numpy(dtype=np.float64)
+    # A surface in closed form has none.
+    return np.where(sizes > 0, sizes, np.nan)
+
+
+def is_sequence(rows: pd.DataFrame) -> bool:
+    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
+    return bool(rows["ordered_by"].isin(_FROM_COARSE_TO_FINE).all())

@@ -1,20 +1,23 @@
-"""`tree.sobolev`: norms, distances and spectra of any order from everything that a store holds, octaves included."""
+"""`tree.sobolev`: norms, distances and spectra of any order from all that a store holds; its tables at any order."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
+from sobolev_batch.batch.analysis.datasets import DistancesToReference, convergence_dataset, distances_dataset
 from sobolev_batch.batch.analysis.reduce import StoredFields
 from sobolev_batch.batch.analysis.tiles import Reducer
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.results.open import location_of
+from sobolev_batch.results.open import finished_group, is_sequence, location_of, reference_of, require_unchanged
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import (
@@ -26,6 +29,7 @@ from sobolev_batch.spectral.metrics.datasets import (
     labelled,
     order_axis,
 )
+from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.metrics.spectrum import band_coordinates
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import squared_moduli
@@ -198,6 +202,108 @@ def stored_fields(tree: xr.DataTree, meshes: Collection[str] | None = None) -> S
             f"{store.path}: the field of {labels[i]} is damaged ({problem}); run the study again", problem, i
         )
     return StoredFields(store, records, lattice, tail, labels.index(study["reference"]))
+
+
+def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
+    """Return the convergence table of an open store at some orders, in memory.
+
+    Args:
+        tree: Open store.
+        order: One order s < -1/2, or several, of the store or not; default all of the store. The attribute
+            ``computed`` of the table lists those that were computed from the fields.
+
+    Raises:
+        InputError: The store has no tables yet; or other orders are requested, and the tree does not say where it was
+            opened.
+        OrderError: An order is not below -1/2.
+        DamageError: A field is not what was stored.
+    """
+    stored = finished_group(tree, "convergence")
+    chosen, others = _divided(stored, order)
+    if not others:
+        return stored.sel(order=chosen)
+    fields, meshes = stored_fields(tree), finished_group(tree, "meshes")
+    results = fields.results(others, meshes["row"].values.tolist(), every_pair=False)
+    require_unchanged(tree)
+    to_reference = DistancesToReference(
+        reference_of(tree),
+        NormEstimate(*results.to_reference),
+        Proportion(*results.proportions),
+        NormEstimate(*results.norms[..., results.places[fields.reference]]),
+    )
+    accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
+    sizes, families = meshes["edge_length_mean"].to_numpy(), _sequences(meshes)
+    return _joined(stored, convergence_dataset(meshes.coords, others, to_reference, sizes, families, accuracy), chosen)
+
+
+def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
+    """Return the distances of an open store's meshes at some orders, lazily if the store has them all.
+
+    Args:
+        tree: Open store.
+        order: See `convergence_at`.
+
+    Raises:
+        InputError, OrderError, DamageError: See `convergence_at`.
+    """
+    stored = finished_group(tree, "distances", load=False)
+    chosen, others = _divided(stored, order)
+    if not others:
+        return stored.sel(order=chosen)
+    fields, every_pair = stored_fields(tree), stored.sizes["other"] == stored.sizes["mesh"]
+    meshes = finished_group(tree, "meshes")
+    results = fields.results(others, meshes["row"].values.tolist(), every_pair=every_pair)
+    require_unchanged(tree)
+    estimate = NormEstimate(*results.distances)
+    return _joined(stored, distances_dataset(meshes.coords, stored["other"].values, others, estimate), chosen)
+
+
+def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
+    """Return the norm of an open store's reference at one order, with its error.
+
+    Raises:
+        InputError, OrderError, DamageError: See `convergence_at`.
+    """
+    stored, reference = finished_group(tree, "norms"), reference_of(tree)
+    if order in stored["order"].values:
+        return stored.sel(mesh=reference, order=order)
+    return StoreAccessor(tree).norm(reference, order)
+
+
+def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
+    """Return what orders that were computed from the fields rest on, as lines of a note of a table."""
+    fields = stored_fields(tree, meshes=())
+    frequencies = f"frequencies up to {fields.lattice.xi_max:g} on each axis"
+    if fields.tail is not None:
+        frequencies = f"{frequencies}, and samples in octaves up to {fields.tail.highest_frequency:.4g}"
+    return [
+        f"Not of the study, but computed now from its stored fields: order {', '.join(f'{s:g}' for s in orders)}.",
+        f"They hold {frequencies}.",
+        "What lies beyond is in the errors, which grow at orders nearer to -1/2.",
+    ]
+
+
+def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:
+    """Return the orders that are requested, and those of them that the store lacks."""
+    own: list[float] = stored["order"].values.tolist()
+    chosen = own if order is None else list(check_orders(order))
+    return chosen, tuple(dict.fromkeys(s for s in chosen if s not in own))
+
+
+def _joined(stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
+    """Return the chosen orders of two tables."""
+    both = xr.concat(
+        [stored.load(), computed], "order", data_vars="minimal", coords="minimal", compat="override",
+        join="exact", combine_attrs="override",
+    )  # fmt: skip
+    table = both.sel(order=chosen)
+    return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
+
+
+def _sequences(meshes: xr.Dataset) -> list[list[int]]:
+    """Return the places of the meshes of each family that goes from coarse to fine."""
+    frame = pd.DataFrame({name: meshes[name].values for name in ("family", "ordered_by")})
+    return [rows.index.tolist() for _, rows in frame.groupby("family", sort=False) if is_sequence(rows)]
 
 
 def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[str, Reals]) -> xr.Dataset:

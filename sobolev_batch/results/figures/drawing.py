@@ -29,9 +29,7 @@ from sobolev_batch.results.figures.style import (
     shortened,
     style_of,
 )
-from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.evolution import evolution
-from sobolev_batch.results.tables.groups import (
+from sobolev_batch.results.open import (
     complete_meshes,
     families_of,
     finished_group,
@@ -41,8 +39,10 @@ from sobolev_batch.results.tables.groups import (
     reference_of,
     sizes_of,
 )
+from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.league import League
-from sobolev_batch.results.tables.matrix import Matrix
+from sobolev_batch.results.tables.matrix import pairs_of
 
 _MOST_NAMED = 3
 # By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
@@ -288,26 +288,27 @@ def has_pairs(selection: Selection) -> bool:
     return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
 
 
-def _chosen(selection: Selection, order: float) -> tuple[Matrix, str]:
-    """Return the distances of the chosen meshes, and a note on those left out."""
+def _chosen(selection: Selection, order: float) -> tuple[Reals, list[str], str]:
+    """Return the distances of the chosen meshes, their labels, and a note on those left out."""
     tree, family_of = selection.tree, families_of(selection.tree)
     reference = reference_of(tree)
     meshes = [label for label in complete_meshes(tree) if family_of[label] in selection.families or label == reference]
-    matrix = Matrix.from_tree(tree, order, MOST_MESHES, meshes)
-    if matrix is None:
+    pairs = pairs_of(tree, order, MOST_MESHES, meshes)
+    if pairs is None:
         raise InputError(
             'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
         )
-    shown = len(matrix.labels)
-    return matrix, f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else ""
+    shown = pairs.sizes["mesh"]
+    omission = f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else ""
+    return pairs["distance"].values, pairs["mesh"].values.tolist(), omission
 
 
 def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the distances of all pairs as a heat map, with similar meshes beside each other."""
-    matrix, omission = _chosen(selection, order)
-    arrangement = clustered_order(matrix.values)
-    values = matrix.values[np.ix_(arrangement, arrangement)]
-    set_title(axes, f"Sobolev distance of order {matrix.order:g}", omission)
+    distances, meshes, omission = _chosen(selection, order)
+    arrangement = clustered_order(distances)
+    values = distances[np.ix_(arrangement, arrangement)]
+    set_title(axes, f"Sobolev distance of order {order:g}", omission)
     if not (values > 0).any():
         axes.text(0.5, 0.5, "no two meshes differ", ha="center")
         axes.set_axis_off()
@@ -316,7 +317,7 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
     image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=LogNorm(low, high), cmap="viridis", aspect="equal")
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit", extend=extend)
     bar.ax.tick_params(which="both", labelsize="small")
-    labels = [shortened(matrix.labels[i]) for i in arrangement]
+    labels = [shortened(meshes[i]) for i in arrangement]
     # Below the matrix, the longest label takes its part of the height.
     points = 0.9 * 72 * min(inches(axes)) / (len(labels) + _CHARACTER_WIDTH * max(map(len, labels)))
     if points >= _SMALLEST_FONT:
@@ -344,20 +345,20 @@ def _color_range(positive: Reals) -> tuple[float, float, str]:
 
 def draw_map(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the meshes as points of a plane whose distances approximate the Sobolev distances."""
-    (matrix, omission), reference = _chosen(selection, order), reference_of(selection.tree)
-    family_of = families_of(selection.tree)
-    points, share = embedded(matrix.values)
-    families = [family_of[label] for label in matrix.labels]
+    distances, labels, omission = _chosen(selection, order)
+    reference, family_of = reference_of(selection.tree), families_of(selection.tree)
+    points, share = embedded(distances)
+    families = [family_of[label] for label in labels]
     for name in dict.fromkeys(families):
-        chosen = [i for i, label in enumerate(matrix.labels) if families[i] == name and label != reference]
+        chosen = [i for i, label in enumerate(labels) if families[i] == name and label != reference]
         if chosen:
             look = {**selection.styles[name], "linestyle": "none", "markersize": 5, "alpha": 0.85}
             axes.plot(*points[chosen].T, label=shortened(name), **look)
-    center = matrix.labels.index(reference) if reference in matrix.labels else None
+    center = labels.index(reference) if reference in labels else None
     if center is not None:
         axes.plot(*points[center], "*", color="black", markersize=12, label=escaped(reference))
     explained = "" if np.isnan(share) else f", {share:.0%} of the variance"
-    set_title(axes, f"map at order {matrix.order:g}{explained}", omission)
+    set_title(axes, f"map at order {order:g}{explained}", omission)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.1)
     axes.grid(visible=True, alpha=0.3)

@@ -19,8 +19,7 @@ from plyfile import PlyData, PlyElement
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
-from sobolev_batch.results.open import AnyStore, as_tree, fields_read
-from sobolev_batch.results.tables.groups import finished_group, reference_of
+from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.spectral.shells import Orders, check_orders

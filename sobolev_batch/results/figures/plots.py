@@ -11,8 +11,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.drawing import LEAGUE, PLOTS, computed_members
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import PictureFormat, Size, drawing, notes_of, write_figures
-from sobolev_batch.results.open import AnyStore, fields_read
-from sobolev_batch.results.tables.groups import EDGE_LENGTH, Families
+from sobolev_batch.results.open import EDGE_LENGTH, AnyStore, Families, fields_read
 from sobolev_batch.results.tables.league import League
 
 

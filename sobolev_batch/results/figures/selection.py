@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.style import Style, style_of
-from sobolev_batch.results.open import AnyStore, as_tree, fields_read
-from sobolev_batch.results.store_accessor import StoreAccessor
-from sobolev_batch.results.tables.groups import (
+from sobolev_batch.results.open import (
     EDGE_LENGTH,
+    AnyStore,
     Families,
+    as_tree,
     chosen_families,
     chosen_orders,
     complete_meshes,
     families_of,
+    fields_read,
     finished_group,
     reference_of,
 )
+from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.spectral.metrics.spectrum import spectrum
 from sobolev_batch.spectral.shells import Orders
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, matching_labels, witness_at_vertices
+from sobolev_batch.results.open import Families, chosen_families, finished_group
 from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.groups import Families, chosen_families, finished_group
 from sobolev_batch.spectral.metrics.witness import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided

@@ -37,8 +37,7 @@ from sobolev_batch.results.figures.views import (
     make_views,
     render,
 )
-from sobolev_batch.results.open import AnyStore, as_tree, fields_read
-from sobolev_batch.results.tables.groups import chosen_order, finished_group
+from sobolev_batch.results.open import AnyStore, as_tree, chosen_order, fields_read, finished_group
 from sobolev_batch.surfaces.sources.names import file_stem
 
 _HEIGHT_INCHES = 5.0

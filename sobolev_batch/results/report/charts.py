@@ -20,9 +20,7 @@ from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import save
 from sobolev_batch.results.figures.views import MeshView, render
 from sobolev_batch.results.figures.witness_plots import MOST_ORDERS, witness_figure
-from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.results.tables.evolution import evolution
-from sobolev_batch.results.tables.groups import (
+from sobolev_batch.results.open import (
     complete_meshes,
     families_of,
     finished_group,
@@ -31,8 +29,10 @@ from sobolev_batch.results.tables.groups import (
     label_of,
     reference_of,
 )
+from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.league import League
-from sobolev_batch.results.tables.matrix import Matrix
+from sobolev_batch.results.tables.matrix import pairs_of
 from sobolev_batch.results.tables.text import minus
 
 # Orders that printed pictures show; more would make the page heavy.
@@ -164,10 +164,10 @@ def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
 def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
     """Return for each order the lower triangle of distances and errors, an order of similar meshes, and the map."""
     most = min(MOST_MESHES, int(math.sqrt(MOST_NUMBERS / len(orders))))
-    matrices = [matrix for order in orders if (matrix := Matrix.from_tree(tree, order, most)) is not None]
-    if not matrices or not matrices[0].labels:
+    matrices = [pairs for order in orders if (pairs := pairs_of(tree, order, most)) is not None]
+    if not matrices or not matrices[0].sizes["mesh"]:
         return None
-    family_of, labels = families_of(tree), matrices[0].labels
+    family_of, labels = families_of(tree), matrices[0]["mesh"].values.tolist()
     return {
         "labels": labels,
         "families": [family_of[label] for label in labels],
@@ -176,12 +176,13 @@ def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
     }
 
 
-def _matrix(matrix: Matrix) -> Json:
-    points, explained = embedded(matrix.values)
+def _matrix(pairs: xr.Dataset) -> Json:
+    distances = pairs["distance"].values
+    points, explained = embedded(distances)
     return {
-        "values": [_numbers(row[:i]) for i, row in enumerate(matrix.values)],
-        "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(matrix.errors)],
-        "clustered": clustered_order(matrix.values).tolist(),
+        "values": [_numbers(row[:i]) for i, row in enumerate(distances)],
+        "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
+        "clustered": clustered_order(distances).tolist(),
         "points": [_numbers(axis, digits=5) for axis in points.T],
         "explained": None if math.isnan(explained) else round(explained, 4),
     }

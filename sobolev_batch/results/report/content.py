@@ -12,9 +12,9 @@ import xarray as xr
 
 from sobolev_batch.batch.study.study import REFERENCE_LABEL
 from sobolev_batch.results.figures.selection import spread
+from sobolev_batch.results.open import finished_group, has_proximity, placement_doubts
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import nearest, page_columns, smallest_of, table, with_remarks
-from sobolev_batch.results.tables.groups import finished_group, has_proximity, placement_doubts
 from sobolev_batch.results.tables.text import Column, count, duration, minus, percent
 from sobolev_batch.spectral.lattice import Lattice
 

@@ -14,19 +14,19 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
-from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.groups import (
+from sobolev_batch.results.open import (
     EDGE_LENGTH,
-    convergence_at,
+    AnyStore,
+    as_tree,
     finished_group,
     has_proximity,
     is_sequence,
     metadata_of,
-    order_note,
     placement_doubts,
     sizes_of,
 )
+from sobolev_batch.results.store_accessor import convergence_at, order_note
+from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
     Column,
     column_table,

@@ -10,10 +10,9 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.open import AnyStore, as_tree
-from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.store_accessor import StoreAccessor, convergence_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.groups import complete_meshes, convergence_at, finished_group, reference_of
 from sobolev_batch.results.tables.text import concise, machine_table, printed_table, prose
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.spectral.shells import Orders, check_orders

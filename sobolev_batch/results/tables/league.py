@@ -16,10 +16,9 @@ import xarray as xr
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.convergence import table, tables_of
-from sobolev_batch.results.tables.groups import EDGE_LENGTH, finished_group, reference_of
 from sobolev_batch.results.tables.statistics import (
     SIGNIFICANCE,
     Curve,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -12,17 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.open import AnyStore, as_tree
+from sobolev_batch.results.open import AnyStore, as_tree, chosen_orders, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.store_accessor import distances_at, order_note, reference_norm_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.groups import (
-    chosen_orders,
-    complete_meshes,
-    distances_at,
-    finished_group,
-    order_note,
-    reference_norm_at,
-    reference_of,
-)
 from sobolev_batch.results.tables.text import LINE_LENGTH, concise, machine_table, middle_cut, printed_table, prose
 from sobolev_batch.spectral.budget import quotients
 from sobolev_batch.spectral.shells import check_orders
@@ -39,43 +30,29 @@ Digits in brackets are the error, meant as a bound, in units of the last digit:
 symmetric."""
 
 
-@dataclass(frozen=True)
-class Matrix:
-    """Distances of one order between all meshes that are computed.
+def pairs_of(
+    tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
+) -> xr.Dataset | None:
+    """Return the distances of one order between all meshes that are computed, and their errors.
 
-    Attributes:
-        order: Order s.
-        labels: Labels of the meshes, in the study's order.
-        values: Distances (meshes, meshes), symmetric.
-        errors: Errors of these.
+    Args:
+        tree: Open store.
+        order: One of its orders.
+        most: Number of meshes to keep: the first ones and the reference; default all.
+        among: Labels to keep beside the reference; default all.
+
+    Returns:
+        The variables `distance` and `error` over `mesh` and `other`, symmetric; None where the study requests
+        distances to the reference alone.
     """
-
-    order: float
-    labels: tuple[str, ...]
-    values: Reals
-    errors: Reals
-
-    @classmethod
-    def from_tree(
-        cls, tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
-    ) -> Matrix | None:
-        """Return the matrix of an open store; None where the study requests distances to the reference alone.
-
-        Args:
-            tree: Open store.
-            order: One of its orders.
-            most: Number of meshes to keep: the first ones and the reference; default all.
-            among: Labels to keep beside the reference; default all.
-        """
-        distances = finished_group(tree, "distances", load=False)
-        (order,) = chosen_orders(distances, order)
-        if distances.sizes["other"] != distances.sizes["mesh"]:
-            return None
-        reference, complete = reference_of(tree), complete_meshes(tree)
-        others = [label for label in complete if label != reference and (among is None or label in among)]
-        kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
-        chosen = distances.sel(order=order, mesh=kept, other=kept).load()
-        return cls(order, tuple(kept), chosen["distance"].values, chosen["error"].values)
+    distances = finished_group(tree, "distances", load=False)
+    (order,) = chosen_orders(distances, order)
+    if distances.sizes["other"] != distances.sizes["mesh"]:
+        return None
+    reference, complete = reference_of(tree), complete_meshes(tree)
+    others = [label for label in complete if label != reference and (among is None or label in among)]
+    kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
+    return distances[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
 
 
 def matrix(

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sobolev_batch.results.tables.groups import sizes_of
+from sobolev_batch.results.open import sizes_of
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 
 Reals = NDArray[np.float64]

@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import InputError, matrix
+from sobolev_batch.results.store_accessor import distances_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.groups import distances_at
-from sobolev_batch.results.tables.matrix import Matrix, format_matrix, matrix_frame
+from sobolev_batch.results.tables.matrix import format_matrix, matrix_frame, pairs_of
 
 ORDERS = [-4.0, -2.0]
 
@@ -120,18 +120,18 @@ def test_distances_to_the_reference_alone() -> None:
     assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
     text = format_matrix(tree, "text", [-4.0])
     assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)"]
-    assert Matrix.from_tree(tree, -4.0) is None
+    assert pairs_of(tree, -4.0) is None
 
 
 def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
-    whole = Matrix.from_tree(made(5), -4.0)
+    whole = pairs_of(made(5), -4.0)
     assert whole is not None
-    assert whole.labels == ("f/0", "f/2", "f/3", "f/4", "reference")
-    assert np.isfinite(whole.values).all()
-    cut = Matrix.from_tree(made(5), -4.0, most=3)
+    assert whole["mesh"].values.tolist() == ["f/0", "f/2", "f/3", "f/4", "reference"]
+    assert np.isfinite(whole["distance"]).all()
+    cut = pairs_of(made(5), -4.0, most=3)
     assert cut is not None
-    assert cut.labels == ("f/0", "f/2", "reference")
-    assert cut.values[0, 2] == 1.0
+    assert cut["mesh"].values.tolist() == ["f/0", "f/2", "reference"]
+    assert cut["distance"].values[0, 2] == 1.0
 
 
 def test_unknown_orders_and_unfinished_stores() -> None:
