@@ -29,9 +29,8 @@ The public names by subject:
 - Studies: `Study`, `StudyCollection`; `plan` and its `StudyPlan` or `CollectionPlan`, `run` and its `Summary`,
   `submit` and its `Submission`.
 - Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.
-- Results of a store: `table`, `matrix`, `evolution` (over time), `report`, `write_witness`; plots on Matplotlib axes:
-  `plot_convergence`, `plot_matrix`, `plot_map`, `plot_spectrum`, `plot_energy`, `plot_transform`, `plot_evolution`,
-  `plot_witness`.
+- Results of a store: `table`, `matrix`, `evolution` (over time), `report`, `write_witness`; on Matplotlib axes:
+  `plot`, `plot_league`, `plot_witness`.
 - Errors: all derive from `SobolevBatchError`.
 """
 

@@ -34,14 +34,8 @@ from .fitting.tensors import jax_function as jax_function
 from .fitting.tensors import torch_function as torch_function
 from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.meshes import write_witness as write_witness
-from .results.figures.plots import plot_convergence as plot_convergence
-from .results.figures.plots import plot_energy as plot_energy
-from .results.figures.plots import plot_evolution as plot_evolution
+from .results.figures.plots import plot as plot
 from .results.figures.plots import plot_league as plot_league
-from .results.figures.plots import plot_map as plot_map
-from .results.figures.plots import plot_matrix as plot_matrix
-from .results.figures.plots import plot_spectrum as plot_spectrum
-from .results.figures.plots import plot_transform as plot_transform
 from .results.figures.witness_plots import plot_witness as plot_witness
 from .results.open import open_store as open_store
 from .results.plan import CollectionPlan as CollectionPlan

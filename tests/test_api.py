@@ -14,7 +14,7 @@ import sobolev_batch as sb
 
 def test_names_are_sorted_and_unknown_ones_refused() -> None:
     assert sb.__all__ == sorted(set(sb.__all__))
-    assert {"Study", "plan", "run", "status", "table", "matrix", "report", "plot_convergence"} <= set(sb.__all__)
+    assert {"Study", "plan", "run", "status", "table", "matrix", "report", "plot"} <= set(sb.__all__)
     assert dir(sb) == sb.__all__
     with pytest.raises(AttributeError, match="nothing"):
         sb.nothing  # type: ignore[attr-defined]  # noqa: B018

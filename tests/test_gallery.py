@@ -46,7 +46,7 @@ def test_the_code_runs(client: Client, tmp_path: Path, monkeypatch: pytest.Monke
     original, twice = (len(results[name].triangles) for name in ("cow", "twice"))
     assert original < twice < 1.1 * original
     assert sb.read_mesh("twice.ply").area == pytest.approx(results["twice"].area)
-    assert {path.stem for path in tmp_path.glob("*.png")} == {"transform", "matrix", "spectrum"}
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"matrix", "spectrum"}
     (study,) = blocks(PAGE, "toml")
     (tmp_path / "study.toml").write_text(study)
     assert list(members_of(sb.Study.from_toml("study.toml"))) == [

@@ -249,7 +249,7 @@ def plot_command(
 ) -> None:
     """Draw the results of STORE as pictures.
 
-    They show convergence, transforms, distances and spectra, and some of the meshes. Those of a collection show its
+    They show convergence, distances and spectra, and some of the meshes. Those of a collection show its
     league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt

@@ -27,7 +27,7 @@ from sobolev_batch import (
     norm,
     open_store,
     plan,
-    plot_energy,
+    plot,
     report,
     run,
     verify,
@@ -105,7 +105,7 @@ def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> No
 
 
 def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave_store: Path) -> None:
-    axes = plot_energy(octave_store)
+    axes = plot(octave_store, "energy")
     (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["limit", "ico", "ball"]
     energies = np.asarray(axes.lines[-1].get_xydata())[:, 1]

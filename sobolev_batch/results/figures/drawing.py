@@ -14,10 +14,9 @@ from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.selection import Selection, spread
+from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import (
     EXTENDS,
-    LEGEND_BESIDE,
     Plot,
     Reals,
     draw_curve,
@@ -162,8 +161,6 @@ LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6, "Mean relative distance
 _SMALLEST_SHARE = 0.005
 # Points of the largest font of labels and of shares, and of the smallest that can be read.
 _LABEL_POINTS, _SHARE_POINTS, _SMALLEST_POINTS = 7.5, 7.0, 4.0
-# Meshes and families in pictures of transforms.
-_MOST_CURVES, _MOST_PANELS = 5, 8
 
 
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
@@ -227,49 +224,6 @@ def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
     axes.invert_xaxis()
     axes.set_xlabel("wavelength in the study's unit")
     axes.set_ylabel("energy over its limit")
-
-
-def computed_members(selection: Selection) -> dict[str, list[str]]:
-    """Return the computed meshes of each chosen family that has any besides the reference."""
-    tree, chosen = selection.tree, selection.families
-    reference, family_of = reference_of(tree), families_of(tree)
-    members: dict[str, list[str]] = {}
-    for label in complete_meshes(tree):
-        if label != reference and family_of[label] in chosen:
-            members.setdefault(family_of[label], []).append(label)
-    return members
-
-
-def transform_panels(selection: Selection) -> list[list[str]]:
-    """Return the families of each panel: one, for up to eight of them."""
-    return [[name] for name in spread(list(computed_members(selection)), _MOST_PANELS)]
-
-
-def draw_transform(selection: Selection, families: Sequence[str], axes: Axes) -> None:
-    """Draw the real part of some fields of families, and of the reference, along the positive ξ_x axis."""
-    tree, members = selection.tree, computed_members(selection)
-    labels = [label for name in families for label in members[name]]
-    fields = tree["fourier"]["fourier"].sel(xi_y=0, xi_z=0, method="nearest")
-    fields = fields.isel(xi_x=slice(fields.sizes["xi_x"] // 2, None))
-    shown, reference = spread(labels, _MOST_CURVES), reference_of(tree)
-    omission = f"{len(shown)} of {len(labels)} meshes" if len(shown) < len(labels) else ""
-    for i, label in enumerate(shown):
-        values = np.real(fields.sel(mesh=label).to_numpy())
-        axes.plot(fields["xi_x"], values, color=style_of(i)["color"], linewidth=1.0, label=shortened(label))
-    if reference in complete_meshes(tree):
-        values = np.real(fields.sel(mesh=reference).to_numpy())
-        axes.plot(fields["xi_x"], values, "k--", linewidth=1.2, label=shortened(reference))
-    panels = transform_panels(selection)
-    is_first = list(families) == panels[0] and len(panels) < len(members)
-    note = f"{len(panels)} of {len(members)} families" if is_first else ""
-    set_title(axes, shortened(", ".join(families), 60), note, omission)
-    # Panels have curves of their own, and legends beside them where there is room: axes take 3 / 4 of a figure.
-    is_wide = inches(axes)[0] >= 0.75 * LEGEND_BESIDE
-    beside = {"bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0, "frameon": False} if is_wide else {}
-    axes.legend(fontsize="small", loc="upper left" if is_wide else "best", **beside)
-    axes.set_xlabel("ξ_x in cycles per unit length (ξ_y = ξ_z = 0)")
-    axes.set_ylabel("Re of the transform")
-    axes.grid(visible=True, alpha=0.3)
 
 
 # In matrices and on maps.
@@ -423,13 +377,12 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
     return lambda selection: selection.orders if has(selection) else ()
 
 
-# By the names of their files. The panels show one order each, or one family.
+# By the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(
         draw_convergence, lambda selection: selection.orders, 3.6, "Relative distance over mean edge length"
     ),
     "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6, "Distance over time"),
-    "transform": Plot(draw_transform, transform_panels, 3.4, "Fourier fields along the first axis"),
     "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6, "Distances of all pairs", "compressed"),
     "map": Plot(draw_map, _orders_if(has_pairs), 4.4, "Map of the meshes"),
     "spectrum": Plot(

@@ -246,7 +246,6 @@ def study_pictures(selection: Selection, views: Sequence[MeshView]) -> Pictures:
             for item in plot.items(selection)[:MOST_PICTURED_ORDERS]
         ]
         for name, plot in PLOTS.items()
-        if name != "transform"
     }
     return {**pictures, "witness": _witness_pictures(views)}
 

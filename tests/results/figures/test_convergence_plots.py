@@ -15,9 +15,9 @@ from sobolev_batch.results.figures.style import notes_of
 
 
 def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTree) -> None:
-    axes = sb.plot_convergence(tree)
+    axes = sb.plot(tree)
     assert axes.get_title() == "order -10\nnot drawn: 1 not computed"
-    assert sb.plot_convergence(tree, -2.5).get_title().startswith("order -2.5\n")
+    assert sb.plot(tree, "convergence", -2.5).get_title().startswith("order -2.5\n")
     labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert labels == ["f_1", "slope 2"]
     data = axes.lines[0].get_xydata()
@@ -42,7 +42,7 @@ def test_other_horizontal_axes(
     label: str,
     slope: int | None,
 ) -> None:
-    axes = sb.plot_convergence(tree, x=x)
+    axes = sb.plot(tree, x=x)
     assert axes.get_xlabel() == label
     family, *others = axes.lines
     assert np.asarray(family.get_xdata()).tolist() == places
@@ -55,7 +55,7 @@ def test_other_horizontal_axes(
 def test_an_axis_that_the_store_does_not_know(tree: xr.DataTree) -> None:
     tree["meshes"] = xr.DataTree(tree["meshes"].to_dataset().drop_vars("vertices"))
     with pytest.raises(sb.InputError, match="no size of meshes is named 'vertices'; known are edge_length, triangles"):
-        sb.plot_convergence(tree, x="vertices")
+        sb.plot(tree, x="vertices")
 
 
 def changed(tree: xr.DataTree, **values: list[float]) -> xr.DataTree:
@@ -67,7 +67,7 @@ def changed(tree: xr.DataTree, **values: list[float]) -> xr.DataTree:
 
 def test_distances_below_their_errors_are_hollow_and_stretch_no_axis(tree: xr.DataTree) -> None:
     unsure = changed(tree, relative_error=[1e-3, 0.2, np.nan, 0.0], resolved=[1, 0, 0, 1])
-    axes = sb.plot_convergence(unsure)
+    axes = sb.plot(unsure)
     assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == ["f_1", "slope 2", "not above its error"]
     hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and np.size(line.get_xydata())]
     assert [np.asarray(line.get_xydata()).tolist() for line in hollow] == [[[0.1, 0.025]]]
@@ -79,5 +79,5 @@ def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
     figure = PLOTS["convergence"].figure(Selection.from_store(changed(tree, relative=[0.0, 0.0, np.nan, 0.0])))
     assert notes_of(figure) == ["not drawn: 1 not computed, 2 equal to the reference", "families not drawn: f_1"]
     assert [axes.get_title().split("\n")[0] for axes in figure.axes] == ["order -10", "order -2.5"]
-    nameless = sb.plot_convergence(tree, x="triangles", family="f?1")
+    nameless = sb.plot(tree, x="triangles", family="f?1")
     assert "families" not in nameless.get_title()

@@ -35,13 +35,13 @@ def store_of(points: np.ndarray) -> xr.DataTree:
 def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
     points = np.random.default_rng(6).normal(size=(40, 3))
     points[1] = points[2] + 1e-12
-    figure = sb.plot_matrix(store_of(points)).figure
+    figure = sb.plot(store_of(points), "matrix").figure
     image, bar = figure.axes[0].images[0], figure.axes[1]
     assert image.get_clim()[0] > 1e-3
     assert image.colorbar is not None
     assert image.colorbar.extend == "min"
     assert bar.get_ylabel() == "distance in the study's unit"
-    even = sb.plot_matrix(store_of(points[2:])).images[0]
+    even = sb.plot(store_of(points[2:]), "matrix").images[0]
     assert even.colorbar is not None
     assert even.colorbar.extend == "neither"
     assert even.get_clim()[1] == cdist(points[2:], points[2:]).max()

@@ -22,19 +22,6 @@ from sobolev_batch.results.figures.style import Plot, drawing, parse_size, set_l
 DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 
 
-def test_transform_picture_draws_the_positive_axis(tree: xr.DataTree) -> None:
-    axes = sb.plot_transform(tree)
-    legend = axes.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["f_1/0", "f_1/1", "reference"]
-    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
-    assert not legend.get_window_extent().overlaps(axes.bbox)
-    data = np.asarray(axes.lines[1].get_xydata())
-    assert np.array_equal(data[:, 0], [0.0, 1.0, 2.0])
-    # Row 1, xi_y = xi_z = 0: strides of 75, 15, 3 and 1.
-    assert np.array_equal(data[:, 1], 75 + 15 * np.array([2, 3, 4]) + 6)
-
-
 @pytest.fixture
 def pairs(tree: xr.DataTree) -> xr.DataTree:
     """The same with the distances of all pairs, and names that matplotlib would take for a formula, or for hidden."""
@@ -55,16 +42,16 @@ def pairs(tree: xr.DataTree) -> xr.DataTree:
 
 @pytest.mark.slow
 def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> None:
-    axes = sb.plot_matrix(pairs, -10.0)
+    axes = sb.plot(pairs, "matrix", -10.0)
     assert axes.get_title().startswith("Sobolev distance of order -10")
     shown = [text.get_text() for text in axes.get_yticklabels()]
     assert shown in ([r"\$^\$/0", r"\$^\$/1", "reference"], ["reference", r"\$^\$/1", r"\$^\$/0"])
-    places = np.concatenate([line.get_xydata() for line in sb.plot_map(pairs, -10.0).lines])
+    places = np.concatenate([line.get_xydata() for line in sb.plot(pairs, "map", -10.0).lines])
     assert np.ptp(places[:, 0]) == pytest.approx(0.4)
     assert np.allclose(places[:, 1], 0, atol=1e-7)
     paths, _ = write_plots(Selection.from_store(pairs), tmp_path)
-    assert [path.name for path in paths] == ["convergence.png", "transform.png", "matrix.png", "map.png"]
-    alone = sb.plot_matrix(pairs, -10.0, family="_*")
+    assert [path.name for path in paths] == ["convergence.png", "matrix.png", "map.png"]
+    alone = sb.plot(pairs, "matrix", -10.0, family="_*")
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
@@ -79,28 +66,26 @@ def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_pa
 
 @pytest.mark.process
 def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTree) -> None:
-    first, second = Figure().subplots(1, 2)
-    assert sb.plot_convergence(tree, ax=first) is first
-    assert sb.plot_transform(tree, "f_1", ax=second) is second
-    assert isinstance(sb.plot_convergence(tree), Axes)
-    code = "import sobolev_batch as sb, sys; sb.plot_map; assert 'matplotlib.pyplot' not in sys.modules"
+    axes = Figure().subplots()
+    assert sb.plot(tree, ax=axes) is axes
+    assert isinstance(sb.plot(tree), Axes)
+    code = "import sobolev_batch as sb, sys; sb.plot; assert 'matplotlib.pyplot' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
     with pytest.raises(sb.InputError, match="no order -3, only -10"):
-        sb.plot_convergence(tree, -3)
-    with pytest.raises(sb.InputError, match="no mesh of the family is computed, only of: f_1"):
-        sb.plot_transform(tree, "reference")
-    for plot in (sb.plot_convergence, sb.plot_transform, sb.plot_matrix, sb.plot_map):
-        with pytest.raises(sb.InputError, match="the study has no family 'g\\*', only f_1, reference"):
-            plot(tree, family="g*")
+        sb.plot(tree, order=-3)
+    with pytest.raises(sb.InputError, match=r"one of convergence, .*, energy, found 'transform'"):
+        sb.plot(tree, "transform")
+    with pytest.raises(sb.InputError, match="the study has no family 'g\\*', only f_1, reference"):
+        sb.plot(tree, family="g*")
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
     alone = xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest})
-    for plot in (sb.plot_matrix, sb.plot_map):
+    for kind in ("matrix", "map"):
         with pytest.raises(sb.InputError, match="distances to the reference alone; set pairs"):
-            plot(alone)
+            sb.plot(alone, kind)
 
 
 def lines(_subject: object, count: int, axes: Axes) -> None:

@@ -186,14 +186,14 @@ def test_the_command_and_the_picture(store: Path, tmp_path: Path) -> None:
 
 
 def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
-    axes = sb.plot_evolution(store, -4.0, truth="true")
+    axes = sb.plot(store, "over-time", -4.0, truth="true")
     (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
     assert axes.get_title() == "order -4"
-    late = sb.plot_evolution(store, -4.0, truth="true", family="l*")
+    late = sb.plot(store, "over-time", -4.0, truth="true", family="l*")
     assert [line.get_label() for line in late.lines][:1] == ["late"]
     with pytest.raises(sb.InputError, match="none of the chosen families moves, only coarse, late"):
-        sb.plot_evolution(store, -4.0, truth="true", family="still")
+        sb.plot(store, "over-time", -4.0, truth="true", family="still")
 
 
 def test_times_are_coordinates_of_all_tables(store: Path) -> None:
