@@ -36,7 +36,7 @@ from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.meshes import write_witness as write_witness
 from .results.figures.plots import plot as plot
 from .results.figures.plots import plot_league as plot_league
-from .results.figures.witness_plots import plot_witness as plot_witness
+from .results.figures.views import plot_witness as plot_witness
 from .results.open import open_store as open_store
 from .results.plan import CollectionPlan as CollectionPlan
 from .results.plan import StudyPlan as StudyPlan

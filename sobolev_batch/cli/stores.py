@@ -260,7 +260,7 @@ def plot_command(
     from sobolev_batch.results.figures.plots import write_plots
     from sobolev_batch.results.figures.selection import Selection
     from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
-    from sobolev_batch.results.figures.witness_plots import write_witness_plots
+    from sobolev_batch.results.figures.views import write_witness_plots
     from sobolev_batch.results.open import EDGE_LENGTH, fields_read
     from sobolev_batch.results.tables.league import league
 

@@ -55,7 +55,7 @@ _SCREEN_DPI, _PAPER_DPI = 150, 300
 _FONT_SIZE, _SMALL_FONT_SIZE = 10.0, 8.0
 # Journals ask for fonts embedded as TrueType. Without a salt, the ids in an SVG are random.
 _SAVING: dict[Any, Any] = {"pdf.fonttype": 42, "svg.hashsalt": "sobolev-batch"}
-_METADATA: Mapping[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+_METADATA: Mapping[str, dict[str, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 
 # Colour, marker and dashes of a family, by the names that Matplotlib has for them.
@@ -239,11 +239,11 @@ def write_figures(
     return tuple(paths)
 
 
-def save(figure: Figure, target: object, style: PictureFormat, dpi: int = _SCREEN_DPI) -> None:
+def save(figure: Figure, target: object, style: str, dpi: int = _SCREEN_DPI, **options: Any) -> None:
     """Write a figure without a date; characters that its font lacks become boxes."""
     with warnings.catch_warnings(), mpl.rc_context(_SAVING):
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(target, format=style, dpi=dpi, metadata=_METADATA[style])  # type: ignore[arg-type]
+        figure.savefig(target, format=style, dpi=dpi, metadata=_METADATA.get(style), **options)  # type: ignore[arg-type]
 
 
 def parse_size(text: str) -> Size:

@@ -18,8 +18,7 @@ from sobolev_batch import InputError, icosphere, open_store
 from sobolev_batch.cli import cli
 from sobolev_batch.results.figures import views as rendering
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.views import MeshView, make_views, render
-from sobolev_batch.results.figures.witness_plots import write_witness_plots
+from sobolev_batch.results.figures.views import MeshView, make_views, render, write_witness_plots
 from tests.support.drawing import obstacle
 from tests.support.spheres import LABELS, RIGHT
 

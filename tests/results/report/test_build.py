@@ -25,7 +25,7 @@ from sobolev_batch.cli import cli
 from sobolev_batch.results.figures import selection
 from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.figures.views import make_views
-from sobolev_batch.results.report import build, charts, content
+from sobolev_batch.results.report import build, content
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.status import Status
 from tests.support.browser import Browser, browser
@@ -291,8 +291,8 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
     for module, name, most in (
         (content, "MOST_CONVERGENCE_ROWS", 6),
         (content, "MOST_MESH_ROWS", 2),
-        (charts, "MOST_MESHES", 3),
-        (charts, "MOST_POINTS", 6),
+        (build, "MOST_MESHES", 3),
+        (build, "MOST_POINTS", 6),
         (selection, "MOST_SPECTRA", 2),
     ):
         monkeypatch.setattr(module, name, most)
@@ -324,7 +324,7 @@ def test_a_page_without_rendered_pictures_says_why(
     def nothing(*_: object) -> None:
         raise InputError("meshes cannot be drawn here: no <OpenGL>")
 
-    monkeypatch.setattr(charts, "render", nothing)
+    monkeypatch.setattr(build, "render", nothing)
     text, omissions = make_report(store, folder=folder)
     assert text.count(note) == 1
     assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in omissions
