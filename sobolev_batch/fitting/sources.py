@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, field_validator
+from pydantic import Field
 
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
@@ -20,16 +20,15 @@ from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import (
-    MOST_ENTRIES,
     ExpectedSize,
     Fingerprint,
     Member,
     NestedSource,
+    OtherSource,
+    Several,
     Source,
-    at_most,
     installed_version,
     load_mesh,
-    parse_nested,
     single_member,
 )
 
@@ -56,16 +55,11 @@ class TargetSource(NestedSource, ABC):
         keep_boundary: True if vertices of open boundaries stay where they are.
     """
 
-    target: SerializeAsAny[Source] | None = None
+    target: OtherSource | None = None
     order: Annotated[float, Field(lt=-0.5, ge=-100.0, strict=False)] = DEFAULT_ORDER
     steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
     smoothing: Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=False)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
-
-    @field_validator("target", mode="before")
-    @classmethod
-    def _parse_target(cls, table: object) -> object:
-        return parse_nested(table)
 
     def with_reference(self, reference: Source) -> Self:
         """Return the source with the study's reference as its target, unless it has one of its own."""
@@ -112,11 +106,7 @@ class RefineSource(TargetSource):
         triangles: Numbers of triangles to reach.
     """
 
-    triangles: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=MOST_TRIANGLES)], ...],
-        Field(min_length=1, strict=False),
-        at_most(MOST_ENTRIES),
-    ]
+    triangles: Several[Annotated[int, Field(ge=1, le=MOST_TRIANGLES)]]
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per triangle count, coarse to fine."""

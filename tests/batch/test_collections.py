@@ -34,7 +34,7 @@ GONE = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"
 def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:
     families = [
         {"name": "ico", "source": "icosphere", "levels": [1, 2]},
-        {"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
+        {"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
     ]
     return sb.StudyCollection.from_table(small_table(study={"name": name}, object=objects, family=families))
 
@@ -229,8 +229,8 @@ def test_a_study_against_another_finds_what_became_farther(tmp_path: Path, clien
     radii = {f"o{i}": 1 + i / 100 for i in range(7)}
     new, old = tmp_path / "new.zarr", tmp_path / "old.zarr"
     studies = {
-        new: [{"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.7], "levels": [2]}],
-        old: [{"name": "egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [2]}],
+        new: [{"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.7], "levels": [2]}],
+        old: [{"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [2]}],
     }
     for path, family in studies.items():
         lattice = {"xi_max": 4.0, "M": 32}

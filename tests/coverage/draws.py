@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, Similarity, Sphere
+from sobolev_batch.surfaces.sources.derived import decimated
 from sobolev_batch.surfaces.sources.files import FileSource
-from sobolev_batch.surfaces.sources.reduced import decimated
 from sobolev_batch.surfaces.sources.registry import load_mesh
 from tests.support.shapes import CENTRED_BOX as BOX
 

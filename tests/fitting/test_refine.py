@@ -110,7 +110,7 @@ def test_goals_that_cannot_be_reached_are_refused(goal: Any, message: str) -> No
 def test_a_member_is_the_refinement_in_the_unit_ball_of_its_target() -> None:
     table: dict[str, Any] = {
         "source": "refine",
-        "mesh": {"source": "ellipsoid-levels", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1]},
+        "mesh": {"source": "ellipsoid", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1]},
         "target": {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]},
         "steps": 5,
         "triangles": [200, 120],

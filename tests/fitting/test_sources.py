@@ -19,7 +19,7 @@ from tests.support.members import loaded, members
 from tests.support.repository import blocks
 
 SPHERE: dict[str, Any] = {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]}
-STARTS: dict[str, Any] = {"source": "ellipsoid-levels", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1, 2]}
+STARTS: dict[str, Any] = {"source": "ellipsoid", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1, 2]}
 FIT: dict[str, Any] = {"source": "fit", "mesh": STARTS, "steps": 15}
 
 

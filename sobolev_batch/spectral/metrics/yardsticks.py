@@ -23,8 +23,7 @@ from sobolev_batch.spectral.shells import Orders, Reals, check_orders
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.sources.displaced import with_noise
-from sobolev_batch.surfaces.sources.reduced import decimated
+from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
 # Error of the values of changed meshes, as a fraction of the distance.
 _VALUES_ACCURACY = 1e-2

@@ -1,7 +1,4 @@
-"""Sources of closed-form surfaces, and of triangulations that converge to them.
-
-`sphere`, `ellipsoid` and `torus` are closed forms; `icosphere`, `ellipsoid-levels` and `torus-grid` triangulate them.
-"""
+"""The sources `sphere`, `ellipsoid` and `torus`: closed forms, and with levels triangulations of them; `icosphere`."""
 
 from __future__ import annotations
 
@@ -19,13 +16,12 @@ from sobolev_batch.surfaces.shapes.closed_forms import MOST_TRIANGLES, Ellipsoid
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
 from sobolev_batch.surfaces.sources.registry import (
-    MOST_ENTRIES,
     Fingerprint,
     MadeMember,
     Member,
+    Several,
     Source,
     SurfaceMember,
-    at_most,
 )
 
 # Measured peak of the subdivision, for each triangle that it makes.
@@ -39,7 +35,7 @@ Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 Cells = Annotated[int, Field(ge=3, le=MOST_TRIANGLES)]
 Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
-Levels = Annotated[tuple[Level, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
+Levels = Several[Level]
 
 
 class ClosedFormSource(Source, ABC):
@@ -85,31 +81,48 @@ class SphereSource(ClosedFormSource):
 
 
 class EllipsoidSource(ClosedFormSource):
-    """An ellipsoid as a smooth surface.
+    """An ellipsoid as a smooth surface, or icospheres with their vertices moved onto it.
 
     Attributes:
         axes: Semi-axes along x, y and z, in units of length.
         center: Centre, in units of length.
+        levels: Levels of the icospheres; None for the ellipsoid itself.
     """
 
     label = "ellipsoid"
 
     axes: Lengths
     center: Triple = (0.0, 0.0, 0.0)
+    levels: Levels | None = None
 
     @property
     def shape(self) -> Ellipsoid:
         """The ellipsoid."""
         return Ellipsoid(self.axes, self.center)
 
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return the ellipsoid, or one member per level, coarse to fine."""
+        if self.levels is None:
+            return super().members(folder)
+        identity = {"ellipsoid": _parameters(self.shape)}
+        return tuple(
+            _triangulation(
+                level, Ellipsoid.mesh, (self.shape, level), {"ellipsoid level": level, **identity}, 20 << 2 * level
+            )
+            for level in sorted(set(self.levels))
+        )
+
 
 class TorusSource(ClosedFormSource):
-    """A torus as a smooth surface, its axis along z.
+    """A torus as a smooth surface, its axis along z, or grids of points on it, each cell cut into two triangles.
 
     Attributes:
         R: Distance from the centre to the middle of the tube, in units of length.
         r: Radius of the tube, less than R.
         center: Centre, in units of length.
+        levels: Levels N of grids, each with twice as many cells each way as the one before; None for the torus itself.
+        around: Number of cells around the axis at level 0.
+        across: Number of cells around the tube at level 0.
     """
 
     label = "torus"
@@ -117,11 +130,36 @@ class TorusSource(ClosedFormSource):
     R: Length
     r: Length
     center: Triple = (0.0, 0.0, 0.0)
+    levels: Levels | None = None
+    around: Cells = 12
+    across: Cells = 6
+
+    @model_validator(mode="after")
+    def _check_size(self) -> Self:
+        finest = max(self.levels or (0,))
+        triangles = 2 * self.around * self.across * 4**finest
+        if triangles > MOST_TRIANGLES:
+            raise ValueError(
+                f"level {finest} of {self.around} x {self.across} cells has {triangles} triangles, at most "
+                f"{MOST_TRIANGLES} are allowed"
+            )
+        return self
 
     @property
     def shape(self) -> Torus:
         """The torus."""
         return Torus(self.R, self.r, self.center)
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return the torus, or one member per level, coarse to fine."""
+        if self.levels is None:
+            return super().members(folder)
+        members = []
+        for level in sorted(set(self.levels)):
+            cells = self.around << level, self.across << level
+            identity = {"torus grid": list(cells), "torus": _parameters(self.shape)}
+            members.append(_triangulation(level, Torus.mesh, (self.shape, *cells), identity, 2 * cells[0] * cells[1]))
+        return tuple(members)
 
 
 class IcosphereSource(Source):
@@ -141,79 +179,12 @@ class IcosphereSource(Source):
         )
 
 
-class EllipsoidLevelsSource(EllipsoidSource):
-    """Icospheres with their vertices moved onto an ellipsoid.
-
-    Attributes:
-        levels: Levels of the icospheres.
-    """
-
-    levels: Levels
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member per level, coarse to fine."""
-        shape = self.shape
-        return tuple(
-            _triangulation(
-                level,
-                Ellipsoid.mesh,
-                (shape, level),
-                {"ellipsoid level": level, "ellipsoid": _parameters(shape)},
-                20 << 2 * level,
-            )
-            for level in sorted(set(self.levels))
-        )
-
-
-class TorusGridSource(TorusSource):
-    """Grids of points on a torus, each cell cut into two triangles.
-
-    Attributes:
-        levels: Levels N, each with twice as many cells each way as the one before.
-        around: Number of cells around the axis at level 0.
-        across: Number of cells around the tube at level 0.
-    """
-
-    levels: Levels
-    around: Cells = 12
-    across: Cells = 6
-
-    @model_validator(mode="after")
-    def _check_size(self) -> Self:
-        triangles = 2 * self.around * self.across * 4 ** max(self.levels)
-        if triangles > MOST_TRIANGLES:
-            raise ValueError(
-                f"level {max(self.levels)} of {self.around} x {self.across} cells has {triangles} triangles, "
-                f"at most {MOST_TRIANGLES} are allowed"
-            )
-        return self
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member per level, coarse to fine."""
-        shape, members = self.shape, []
-        for level in sorted(set(self.levels)):
-            around, across = self.around << level, self.across << level
-            identity = {"torus grid": [around, across], "torus": _parameters(shape)}
-            members.append(_triangulation(level, Torus.mesh, (shape, around, across), identity, 2 * around * across))
-        return tuple(members)
-
-
 def _triangulation(
-    level: int,
-    make: Callable[..., Mesh],
-    arguments: tuple[Any, ...],
-    identity: Fingerprint,
-    triangles: int,
+    level: int, make: Callable[..., Mesh], arguments: tuple[Any, ...], identity: Fingerprint, triangles: int
 ) -> Member:
     """Return the member of a level, whose number of triangles is known before it is made."""
     return MadeMember(
-        str(level),
-        level,
-        make,
-        identity,
-        arguments,
-        triangles=triangles,
-        triangle_bytes=_SUBDIVISION_BYTES,
+        str(level), level, make, identity, arguments, triangles=triangles, triangle_bytes=_SUBDIVISION_BYTES
     )
 
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -34,21 +34,19 @@ _GROUP = "sobolev_batch.sources"
 _HERE = "sobolev_batch.surfaces.sources"
 # The package's own sources, by name.
 _OWN = {
-    "decimate": f"{_HERE}.reduced:DecimateSource",
+    "decimate": f"{_HERE}.derived:DecimateSource",
     "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
-    "ellipsoid-levels": f"{_HERE}.generated:EllipsoidLevelsSource",
     "files": f"{_HERE}.files:FileSource",
     "fit": "sobolev_batch.fitting.sources:FitSource",
-    "flow": f"{_HERE}.displaced:FlowSource",
+    "flow": f"{_HERE}.derived:FlowSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
-    "moved": f"{_HERE}.displaced:MovedSource",
-    "noisy": f"{_HERE}.displaced:NoisySource",
+    "moved": f"{_HERE}.derived:MovedSource",
+    "noisy": f"{_HERE}.derived:NoisySource",
     "refine": "sobolev_batch.fitting.sources:RefineSource",
-    "remesh": f"{_HERE}.reduced:RemeshSource",
+    "remesh": f"{_HERE}.derived:RemeshSource",
     "sphere": f"{_HERE}.generated:SphereSource",
-    "spherical-levels": f"{_HERE}.reduced:SphericalLevelsSource",
+    "spherical-levels": f"{_HERE}.derived:SphericalLevelsSource",
     "torus": f"{_HERE}.generated:TorusSource",
-    "torus-grid": f"{_HERE}.generated:TorusGridSource",
 }
 
 Fingerprint = Mapping[str, Any]
@@ -229,14 +227,14 @@ class SurfaceMember(Member):
 
 @dataclass(frozen=True)
 class MadeMember(Member):
-    """A mesh that a function makes, from the surfaces of other members or from numbers alone.
+    """A mesh that a function makes, from the meshes of other members or from numbers alone.
 
     Attributes:
-        make: Function of a module; it takes the originals, then the arguments.
+        make: Function of a module; it takes the meshes of the originals, then the arguments.
         identity: What the fingerprint holds besides the originals and the libraries: the name of the formula, its
             parameters and its version.
         arguments: Numbers that the function takes.
-        originals: Members that the function takes, by their keys in the fingerprint.
+        originals: Members whose meshes the function takes, by their keys in the fingerprint.
         libraries: Distributions whose versions are part of the fingerprint.
         triangles: Number of triangles of the mesh; None for as many as the first original has.
         triangle_bytes: Measured peak of the memory that making takes, for each triangle of the first original, or of
@@ -253,7 +251,7 @@ class MadeMember(Member):
 
     def load(self) -> Mesh:
         """Make the mesh."""
-        return self.make(*self.originals.values(), *self.arguments)
+        return self.make(*map(load_mesh, self.originals.values()), *self.arguments)
 
     def fingerprint(self) -> Fingerprint:
         """Return the identity, the fingerprints of the originals and the versions of the libraries."""
@@ -283,6 +281,11 @@ def at_most(count: int) -> BeforeValidator:
         return value
 
     return BeforeValidator(check)
+
+
+_Entry = TypeVar("_Entry")
+# One or several numbers that each make a surface.
+Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
 
 
 def checked_times(value: object, most: int = MOST_ENTRIES) -> tuple[float, ...]:
@@ -325,6 +328,19 @@ def parse_source(table: Mapping[str, Any]) -> Source:
     return source_type.model_validate({key: value for key, value in table.items() if key != "source"})
 
 
+def _parse_nested(table: object) -> Source:
+    if not isinstance(table, dict):
+        raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
+    try:
+        return parse_source(table)
+    except StudyError as error:
+        raise StudyError(f"the table {quoted(table)}: {error}") from error
+
+
+# A source within the table of another one.
+OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
+
+
 class NestedSource(Source):
     """A source that works on the surfaces of others; each field that holds one is handed what it is handed.
 
@@ -332,7 +348,7 @@ class NestedSource(Source):
         mesh: Table of the other source.
     """
 
-    mesh: SerializeAsAny[Source]
+    mesh: OtherSource
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -347,26 +363,6 @@ class NestedSource(Source):
 
     def _nested(self) -> dict[str, Source]:
         return {name: value for name, value in self if isinstance(value, Source)}
-
-    @field_validator("mesh", mode="before")
-    @classmethod
-    def _parse_mesh(cls, table: object) -> object:
-        return parse_nested(table)
-
-
-def parse_nested(table: object) -> Source:
-    """Return the source that a table within the table of another source names.
-
-    Raises:
-        ValueError: It is no table.
-        StudyError: See `parse_source`.
-    """
-    if not isinstance(table, dict):
-        raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
-    try:
-        return parse_source(table)
-    except StudyError as error:
-        raise StudyError(f"the table {quoted(table)}: {error}") from error
 
 
 def source_type_of(name: object) -> type[Source]:

@@ -46,14 +46,14 @@ def torus_table(**changes: Any) -> dict[str, Any]:
         "lattice": {"xi_max": 3.0, "M": 20},
         "norm": {"orders": [-3.0, -5.0]},
         "reference": {"source": "torus", **RING},
-        "family": [{"name": "grid", "source": "torus-grid", **RING, "levels": [0, 1, 2, 3]}],
+        "family": [{"name": "grid", "source": "torus", **RING, "levels": [0, 1, 2, 3]}],
     }
     return {**table, **changes}
 
 
 def egg_table(**changes: Any) -> dict[str, Any]:
     """Stretched icospheres against the ellipsoid."""
-    family = {"name": "ico", "source": "ellipsoid-levels", **EGG, "levels": [0, 1, 2, 3, 4]}
+    family = {"name": "ico", "source": "ellipsoid", **EGG, "levels": [0, 1, 2, 3, 4]}
     return torus_table(reference={"source": "ellipsoid", **EGG}, family=[family], **changes)
 
 
@@ -99,7 +99,7 @@ def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path
 def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]
-    family = [{"name": "grid", "source": "torus-grid", **RING, "levels": [1, 2]}]
+    family = [{"name": "grid", "source": "torus", **RING, "levels": [1, 2]}]
     summary = run(Study.from_table({**table, "family": family}), store_path, threads)
     assert not summary.failed
     found = open_store(store_path)["convergence"].to_dataset().isel(order=0)
@@ -110,7 +110,7 @@ def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
 
 @pytest.mark.slow
 def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_path: Path) -> None:
-    family = [{"name": "grid", "source": "torus-grid", **RING, "levels": [1]}]
+    family = [{"name": "grid", "source": "torus", **RING, "levels": [1]}]
     study = Study.from_table(torus_table(family=family))
     run(study, tmp_path / "whole.zarr", threads)
     study = replace(study, largest_chunk_bytes=20_000)

@@ -30,7 +30,7 @@ def store() -> str:
     ]
     families = [
         {"name": "ico", "source": "icosphere", "levels": [1, 2]},
-        {"name": "=egg", "source": "ellipsoid-levels", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
+        {"name": "=egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
     ]
     gone = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"]}}
     study = {"name": "balls", "title": f"Balls {SCRIPT}"}

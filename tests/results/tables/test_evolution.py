@@ -21,7 +21,7 @@ from tests.support.members import loaded, members
 from tests.support.mesh_files import off
 from tests.support.studies import variable
 
-SHAPE: dict[str, Any] = {"source": "ellipsoid-levels", "axes": [1.0, 0.8, 0.6]}
+SHAPE: dict[str, Any] = {"source": "ellipsoid", "axes": [1.0, 0.8, 0.6]}
 LATTICE = sb.Lattice(3.0, 40)
 
 

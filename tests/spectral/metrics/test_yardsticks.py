@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, distance, icosphere, yardsticks
-from sobolev_batch.surfaces.sources.displaced import with_noise
-from sobolev_batch.surfaces.sources.reduced import decimated
+from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
 LATTICE = Lattice(3.0, 32)
 ORDERS = [-3.0, -5.0]

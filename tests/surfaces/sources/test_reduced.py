@@ -66,7 +66,7 @@ def test_a_reduction_gives_the_same_mesh_every_time(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_reduction_needs_one_mesh_of_more_triangles(kind: str) -> None:
     for mesh, error, message in (
-        ({"source": "icosphere", "levels": [1]}, MeshError, "1 has 80 triangles and cannot be reduced to 80"),
+        ({"source": "icosphere", "levels": [1]}, MeshError, "the mesh has 80 triangles and cannot be reduced to 80"),
         ({"source": "sphere"}, MeshError, "sphere is no mesh; its triangles are needed"),
         ({"source": "icosphere", "levels": [2, 3]}, StudyError, "the source makes 2: 2, 3"),
     ):
@@ -176,7 +176,7 @@ def test_levels_need_a_map_to_a_convex_surface(tmp_path: Path) -> None:
         "levels": [1],
     }
     (member,) = members(table, tmp_path)
-    with pytest.raises(MeshError, match="the first 42 vertices of dented are not in convex position"):
+    with pytest.raises(MeshError, match="the first 42 vertices of the map to the sphere are not in convex position"):
         member.load()
 
 

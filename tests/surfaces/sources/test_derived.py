@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
 from sobolev_batch import Mesh, icosphere
-from sobolev_batch.surfaces.sources.displaced import carried, with_noise
+from sobolev_batch.surfaces.sources.derived import carried, with_noise
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import BALL, listed, loaded, members
 
@@ -30,7 +30,7 @@ def test_every_vertex_moves_by_a_fraction_of_the_radius() -> None:
     for distance, moves in zip((0.1, 0.3), displacements(MOVED), strict=True):
         np.testing.assert_allclose(moves, np.broadcast_to([0, 0.6 * distance, 0.8 * distance], moves.shape), atol=1e-12)
     # A torus of radius 5, whose tube has corners at 60 degrees.
-    torus = {"source": "torus-grid", "R": 4, "r": 1, "levels": [0]}
+    torus = {"source": "torus", "R": 4, "r": 1, "levels": [0]}
     (member,) = members({**MOVED, "mesh": torus, "distances": [0.1]})
     assert loaded(member).extent.box[1][2] == pytest.approx(3**0.5 / 2 + 0.8 * 0.5)
 
@@ -85,7 +85,7 @@ def test_vertices_follow_the_velocity(time: float, strength: float, period: floa
 
 
 def test_vertices_stay_on_their_sphere_and_come_back() -> None:
-    mesh = {"source": "ellipsoid-levels", "axes": [3.0, 2.0, 1.0], "levels": [2]}
+    mesh = {"source": "ellipsoid", "axes": [3.0, 2.0, 1.0], "levels": [2]}
     start, half, end = (positions(time, mesh=mesh) for time in (0.0, 2.5, 5.0))
     np.testing.assert_allclose(np.linalg.norm(half, axis=1), np.linalg.norm(start, axis=1), rtol=1e-14)
     assert np.abs(half - start).max() > 0.5
