@@ -260,7 +260,7 @@ def test_octaves_are_the_same_in_a_task_of_their_own(client: Client, tmp_path: P
     assert verify(tmp_path / "blocks.zarr").is_sound
 
 
-def test_a_plan_shows_octaves_and_their_bytes(octave_store: Path) -> None:
+def test_a_plan_and_a_report_show_octaves(octave_store: Path, tmp_path: Path) -> None:
     found = plan(Study.from_table(asking()), octave_store)
     text = str(found)
     samples = open_store(octave_store)["octaves"].sizes["sample"]
@@ -270,6 +270,8 @@ def test_a_plan_shows_octaves_and_their_bytes(octave_store: Path) -> None:
     assert "nothing is missing" in text
     assert found.field_bytes == found.lattice.half.size * 8 + samples * 8 or found.dtype == "complex128"
     assert len(found.stored) == 4
+    page = report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"{found.octaves} beyond the lattice, at random frequencies" in page
 
 
 def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> None:
@@ -306,10 +308,3 @@ def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> 
     assert pair["squared"].sum().item() == pytest.approx(
         tree.sobolev.distance("ico/1", "reference", -2.0)["distance"].item() ** 2, rel=0.02
     )
-
-
-@pytest.mark.all
-def test_a_report_shows_octaves(octave_store: Path, tmp_path: Path) -> None:
-    text = report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
-    count = len(open_store(octave_store).attrs["study"]["octaves"]["octaves"])
-    assert f"{count} beyond the lattice, at random frequencies" in text

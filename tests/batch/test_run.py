@@ -24,7 +24,6 @@ from sobolev_batch import (
 )
 from sobolev_batch.batch.analysis import reduce
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.store.store import Store
 from tests.support.mesh_files import off
 from tests.support.studies import SMALL_LATTICE, small_table, variable
 
@@ -89,17 +88,30 @@ def test_mesh_facts_are_recorded(finished_store: Path) -> None:
     assert meshes["level"].values.tolist() == [0, 1, 2, 3, -1]
 
 
-def test_a_second_run_computes_nothing(client: Client, study: Study, store_path: Path) -> None:
-    first = run(study, store_path, client)
+def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study: Study, store_path: Path) -> None:
+    def stamps() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
+
+    steps: list[Progress] = []
+    first = run(study, store_path, client, on_progress=steps.append)
     assert len(first.computed) == 5
     assert first.reused == ()
-    stamps = {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
-    steps: list[Progress] = []
+    assert steps[0].stage == "cluster"
+    fields = [step for step in steps if step.stage == "fields"]
+    assert [step.done for step in fields] == list(range(6))
+    assert {step.label for step in fields[1:]} == set(first.computed)
+    reduction = [step for step in steps if step.stage == "reduction"]
+    assert reduction[-1].done == reduction[-1].total > 0
+    before = stamps()
+    steps.clear()
     second = run(study, store_path, client, on_progress=steps.append)
     assert second.computed == ()
     assert second.reused == first.computed
     assert steps == []
-    assert stamps == {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
+    assert stamps() == before
+    with pytest.raises(StoreError, match="another study"):
+        run(Study.from_table(small_table(study={"name": "other"})), store_path, client)
+    assert stamps() == before
 
 
 def test_tables_of_an_older_version_are_made_anew(
@@ -109,8 +121,7 @@ def test_tables_of_an_older_version_are_made_anew(
         patch.setattr(reduce, "TABLES_VERSION", reduce.TABLES_VERSION - 1)
         run(study, store_path, client)
     steps: list[Progress] = []
-    again = run(study, store_path, client, on_progress=steps.append)
-    assert again.computed == ()
+    assert run(study, store_path, client, on_progress=steps.append).computed == ()
     assert {step.stage for step in steps} >= {"reduction"}
     steps.clear()
     run(study, store_path, client, on_progress=steps.append)
@@ -189,23 +200,3 @@ def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path
     wide = Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)
     expected = 1e-3 * distance(mesh, wide, -3.0, lattice=lattice)["distance"].item()
     assert found == pytest.approx(expected, rel=1e-3)
-
-
-def test_progress_counts_every_mesh(client: Client, study: Study, store_path: Path) -> None:
-    steps: list[Progress] = []
-    run(study, store_path, client, on_progress=steps.append)
-    assert steps[0].stage == "cluster"
-    fields = [step for step in steps if step.stage == "fields"]
-    assert [step.done for step in fields] == list(range(6))
-    assert {step.label for step in fields[1:]} == {"ico/0", "ico/1", "ico/2", "ico/3", "reference"}
-    reduction = [step for step in steps if step.stage == "reduction"]
-    assert reduction[-1].done == reduction[-1].total > 0
-    assert len({step.total for step in reduction}) == 1
-
-
-def test_a_store_of_another_study_stays_as_it_is(client: Client, study: Study, store_path: Path) -> None:
-    run(study, store_path, client)
-    before = Store.open(store_path).attributes()
-    with pytest.raises(StoreError, match="another study"):
-        run(Study.from_table(small_table(study={"name": "other"})), store_path, client)
-    assert Store.open(store_path).attributes() == before

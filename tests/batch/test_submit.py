@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import tomli_w
 from distributed import Client
 
 from sobolev_batch import ClusterError, Study, StudyCollection, StudyError, submit
@@ -67,30 +68,6 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
         assert call("status", store, "--follow").returncode == 0
 
 
-@pytest.mark.all
-def test_the_objects_of_a_collection_are_handed_over_one_after_another(study_path: Path, tmp_path: Path) -> None:
-    text = study_path.read_text(encoding="utf-8").replace('[reference]\nsource = "sphere"\n', "")
-    objects = {"ball": '{ source = "sphere" }', "gone": '{ source = "files", paths = ["no.ply"] }'}
-    sections = [f'[[object]]\nname = "{name}"\nreference = {reference}\n' for name, reference in objects.items()]
-    study_path.write_text("\n".join([text, *sections]), encoding="utf-8")
-    store = tmp_path / "all.zarr"
-    with tcp_cluster([]) as (address, _):
-        submitted = command("submit", study_path, "--scheduler", address, "--store", store)
-        assert submitted.returncode == 3, submitted.stderr
-        assert submitted.stdout.splitlines() == [
-            "ball:",
-            f"6 of 6 surfaces to be computed by the cluster at {address}",
-            "gone:",
-            f"follow it by: sobolev-batch status --follow {store}",
-        ]
-        assert "not submitted: the reference cannot be made" in submitted.stderr
-        followed = call("status", store, "--follow")
-    assert followed.returncode == 3, followed.stdout
-    assert "gone: it has no results; run the study again to see why" in followed.stdout
-    league = call("league", store, "--method", "ico")
-    assert "League at order -3, over 1 object" in league.stdout, league.stderr
-
-
 @pytest.mark.process
 def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -> None:
     objects = [
@@ -98,11 +75,23 @@ def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -
         {"name": "gone", "reference": {"source": "files", "paths": ["no.ply"]}},
     ]
     collection = StudyCollection.from_table(small_table(object=objects), folder=tmp_path)
-    submission = submit(collection, tmp_path / "all.zarr", client)
+    store, address = tmp_path / "all.zarr", client.scheduler.address
+    submission = submit(collection, store, client)
     assert (submission.surfaces, submission.missing) == (5, 5)
-    assert submission.objects["ball"].store == str(tmp_path / "all.zarr" / "ball")
+    assert submission.objects["ball"].store == str(store / "ball")
     assert list(submission.refused) == ["gone"]
-    assert call("status", tmp_path / "all.zarr", "--follow").returncode == 3
+    assert call("status", store, "--follow").returncode == 3
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(collection.table))
+    submitted = call("submit", tmp_path / "study.toml", "--scheduler", address, "--store", store)
+    assert submitted.returncode == 3, submitted.stderr
+    assert submitted.stdout.splitlines() == [
+        "ball:",
+        f"0 of 5 surfaces to be computed by the cluster at {address}",
+        "gone:",
+        f"follow it by: sobolev-batch status --follow {store}",
+    ]
+    assert "not submitted: the reference cannot be made" in submitted.stderr
+    assert "gone: it has no results; run the study again to see why" in call("status", store, "--follow").stdout
 
 
 def test_what_is_wrong_is_said_before_anything_is_handed_over(

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from glob import has_magic
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self
 
 from sobolev_batch.batch.study.schema import (
-    MOST_OBJECTS,
     ObjectSection,
     StudyDocument,
-    object_name,
     plain_tables,
     read_toml,
 )
@@ -102,12 +102,16 @@ class StudyCollection:
             StudyError: See `from_toml`.
         """
         folder = Path(folder)
-        values = plain_tables(table)
         # Objects and lists may bring references and families.
-        document = StudyDocument.from_tables({"reference": None, "family": [], **values})
+        written = plain_tables(table)
+        values = {"reference": None, "family": [], **written}
+        document = StudyDocument.from_tables(values)
         listed = _listed_meshes(document.objects.get("meshes", ()), folder)
         listed_names = list(dict.fromkeys(name for name, _ in listed))
-        objects = document.object or _unwritten_objects(listed_names or _names_in_reference(values, folder))
+        if document.object is None:
+            found = [{"name": name} for name in listed_names or _names_in_reference(values, folder)]
+            document = StudyDocument.from_tables({**values, "object": found})
+        objects = document.object or []
         names = [section.name for section in objects]
         unnamed = [name for name in listed_names if name not in names]
         if unnamed:
@@ -118,7 +122,7 @@ class StudyCollection:
         same = duplicate_names(names)
         if same:
             raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
-        families = [_families(family, names, folder) for family in values.get("family", ())]
+        families = [_families(family, names, folder) for family in values["family"]]
         studies: dict[str, Study] = {}
         for section in objects:
             made = [entry for entries in families for entry in entries[section.name]]
@@ -132,7 +136,7 @@ class StudyCollection:
         lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
         lacking = {name: missing for name, missing in lacking.items() if missing}
         title = document.study.title or document.study.name
-        return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(values, default=str)))
+        return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(written, default=str)))
 
     def with_best_effort(self) -> Self:
         """Return the collection with the key ``best_effort`` of its accuracy set.
@@ -185,7 +189,7 @@ def _listed_meshes(given: str | Sequence[ListedMesh], folder: Path) -> _Listed:
 
 def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the objects that the files of the reference name, in their natural order."""
-    paths = (values.get("reference") or {}).get("paths")
+    paths = (values["reference"] or {}).get("paths")
     templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
     if not templates:
         raise StudyError(
@@ -196,7 +200,7 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     for template in templates:
         match = re.compile(_pattern(template)).fullmatch
         found = {
-            matched["object"] for path in expand(folder, _glob(template)) if (matched := match(_text(path, folder)))
+            matched["object"] for path in expand(folder, _glob(template)) if (matched := match(_text(folder, path)))
         }
         if not found:
             raise StudyError(
@@ -204,18 +208,6 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
             )
         names |= found
     return sorted(names, key=natural_key)
-
-
-def _unwritten_objects(names: Sequence[str]) -> list[ObjectSection]:
-    """Return the objects that a list or the files of the reference name."""
-    if len(names) > MOST_OBJECTS:
-        raise StudyError(f"object: at most {MOST_OBJECTS} objects are allowed, found {len(names)}")
-    for name in names:
-        try:
-            object_name(name)
-        except ValueError as error:
-            raise StudyError(f"object {quoted(name)}: {error}") from error
-    return [ObjectSection(name=name) for name in names]
 
 
 def _table_of_object(
@@ -243,68 +235,42 @@ def _table_of_object(
 
 
 def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return the families of each object that a section gives: one, or one for each method among its files."""
-    made = {name: [_filled(family, OBJECT, name)] for name in names}
+    """Return the families that a section gives for each object: one, or one for each method among its files."""
     paths = family.get("paths")
-    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        return made
-    files = {template: _files_of_objects(template, names, folder) for template in paths}
-    for name, (plain,) in made.items():
-        if METHOD not in family["name"]:
-            plain["paths"] = [file for path in paths for file in _paths(path, name, files[path][name], folder)]
-            continue
-        methods: dict[str, list[str]] = {}
-        for template in paths:
-            for method, own in files[template][name].items() if METHOD in template else ():
-                methods.setdefault(method, []).extend(own)
-        made[name] = [
-            {**_filled(plain, METHOD, method), "paths": methods[method]} for method in sorted(methods, key=natural_key)
+    templates = paths if isinstance(paths, list) and all(isinstance(path, str) for path in paths) else []
+    if not any(OBJECT in template or METHOD in template for template in templates):
+        return {name: [_filled(family, OBJECT, name)] for name in names}
+    methods: dict[str, dict[str, list[str]]] = {name: {} for name in names}
+    for template in templates:
+        for name, method, path in _files(template, names, folder):
+            methods[name].setdefault(method if METHOD in family["name"] else "", []).append(path)
+    if not any(methods.values()):
+        raise StudyError(f"family {quoted(family['name'])}: no file that it names is of an object; correct its paths")
+    return {
+        name: [
+            {**_filled(_filled(family, OBJECT, name), METHOD, method), "paths": own[method]}
+            for method in sorted(own, key=natural_key)
         ]
-    return made
+        for name, own in methods.items()
+    }
 
 
-def _files_of_objects(template: str, names: Sequence[str], folder: Path) -> dict[str, dict[str, list[str]]]:
-    """Return the files that match a template, by object and method.
+def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield object, method and path of the files that match a template.
 
     A file is of the object with the longest name that fits, and the method is as long as it can be.
     """
-    found: dict[str, dict[str, list[str]]] = {name: {} for name in names}
-    has_object = OBJECT in template
-    patterns = {name: re.compile(_pattern(template.replace(OBJECT, name))) for name in names}
-    longest_first = sorted(names, key=len, reverse=True)
-    for path in _files(folder, _glob(template)):
-        text = _text(path, folder)
-        for name in longest_first:
-            if has_object and name not in text:
-                continue
-            matched = patterns[name].fullmatch(text)
-            if matched is not None:
-                found[name].setdefault(matched.groupdict().get("method", ""), []).append(text)
-                if has_object:
-                    break
-    return found
-
-
-def _paths(template: str, name: str, own: Mapping[str, list[str]], folder: Path) -> list[str]:
-    """Return the files of an object; its path or glob where there are none yet, or where it holds for all objects."""
-    text = template.replace(OBJECT, name)
-    if OBJECT not in template or not has_magic(text):
-        return [text]
-    others = [] if own else _files(folder, text)
-    if others:
-        raise StudyError(
-            f"object {quoted(name)}: {quoted(text)} matches files of other objects alone, such as "
-            f"{quoted(str(others[0]))}; put files of {quoted(name)} there, or correct it"
-        )
-    return [file for files in own.values() for file in files] or [text]
-
-
-def _files(folder: Path, text: str) -> list[Path]:
-    """Return the files that match a path or glob; none where no file does."""
-    try:
-        return matching_files(folder, text)
-    except StudyError:
-        return []
+    texts = {name: template.replace(OBJECT, name) for name in sorted(names, key=len, reverse=True)}
+    if not has_magic(_glob(template.replace(OBJECT, ""))):
+        # The files need not exist yet.
+        yield from ((name, "", text) for name, text in texts.items())
+        return
+    patterns = {name: re.compile(_pattern(text)).fullmatch for name, text in texts.items()}
+    for path in map(partial(_text, folder), matching_files(folder, _glob(template))):
+        candidates = (name for name in patterns if name in path or OBJECT not in template)
+        found = ((name, match) for name in candidates if (match := patterns[name](path)) is not None)
+        for name, match in found if OBJECT not in template else islice(found, 1):
+            yield name, match.groupdict().get("method", ""), path
 
 
 def _filled(value: Any, placeholder: str, name: str) -> Any:
@@ -320,7 +286,7 @@ def _glob(template: str) -> str:
     return template.replace(OBJECT, "*").replace(METHOD, "*")
 
 
-def _text(path: Path, folder: Path) -> str:
+def _text(folder: Path, path: Path) -> str:
     """Return a path as a template of the study would have it."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
 

@@ -260,8 +260,8 @@ def choose_lattice(
     Args:
         study: Study.
         accuracy: Accuracy that it requests.
-        similarity: Similarity transform of the study.
-        reference: Reference in the study's unit.
+        similarity: Similarity transform to the study's unit.
+        reference: Reference in this unit.
         members: Other surfaces of the study.
 
     Raises:
@@ -310,8 +310,9 @@ def choose_lattice(
             choice, notes = aimed, [f"all miss rtol {accuracy.rtol:g}; this is for {rtol:g}"]
     if choice is None:
         # The largest lattice that a pair may need and the memory permits.
-        largest = _with_accuracy(problems, best_effort=True)
-        choice = _one_lattice(largest, {label: run_pilot(problem) for label, problem in largest.items()}, study.dtype)
+        choice, shortfalls = _on_one_lattice(_with_accuracy(problems, best_effort=True), study.dtype)
+    if choice is None:
+        raise _worst(shortfalls)
     return replace(choice, reasons=(*choice.reasons, *notes))
 
 
@@ -366,13 +367,7 @@ def _best_for_most(problems: _Problems, dtype: ComplexDtype | None) -> tuple[Lat
 
 
 def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapping[str, Reals]) -> _Outcome:
-    """Choose a small lattice and the octaves beyond it, from the pairs that are closest to each other.
-
-    Args:
-        problems: All pairs.
-        dtype: Dtype that was requested, if any.
-        distances: Estimated distance of each pair for each order (orders,), near-duplicates left out.
-    """
+    """Choose a small lattice and the octaves beyond it, from the pairs with the smallest distances (orders,)."""
     first = next(iter(problems.values()))
     closest = ESTIMATE_CAUTION * np.min(list(distances.values()), axis=0)
     demanding = dict.fromkeys(
@@ -401,7 +396,8 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
     target = error_target(closest, first.orders, first.accuracy, first.area)
     singles = (problem.dtype(lattice, target) == "complex64" for problem in problems.values())
     reasons = [
-        f"xi_max {lattice.xi_max:.4g}, spacing {lattice.spacing:.4g} for the innermost frequencies: {_reach(first)}"
+        f"xi_max {lattice.xi_max:.4g}, spacing {lattice.spacing:.4g} for the innermost frequencies: the surfaces "
+        f"reach over {first.support.widths.max():.4g} units of length"
     ]
     if tail.octaves:
         reasons.append(
@@ -420,25 +416,19 @@ def _on_one_lattice(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome
             pilots[label] = run_pilot(problem)
         except AccuracyError as error:
             shortfalls[label] = error
-    return None if shortfalls else _one_lattice(problems, pilots, dtype), shortfalls
-
-
-def _one_lattice(problems: _Problems, pilots: Mapping[str, Pilot], dtype: ComplexDtype | None) -> LatticeChoice:
+    if shortfalls:
+        return None, shortfalls
     first = next(iter(problems.values()))
     highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)
-    finest = max(pilots, key=lambda label: 1 / pilots[label].lattice.spacing)
-    xi_max, period = pilots[highest].lattice.xi_max, 1 / pilots[finest].lattice.spacing
-    lattice = lattice_of(xi_max, period, first.accuracy.largest_intervals)
+    period = max(1 / pilot.lattice.spacing for pilot in pilots.values())
+    lattice = lattice_of(pilots[highest].lattice.xi_max, period, first.accuracy.largest_intervals)
     closest = np.min([pilot.values for pilot in pilots.values()], axis=0)
     reasons = (
         f"xi_max {lattice.xi_max:.4g} for truncation, which {highest} needs most of {len(pilots)} pilot pairs",
-        f"spacing {lattice.spacing:.4g} for aliasing: {_reach(first)}",
+        f"spacing {lattice.spacing:.4g} for aliasing: the surfaces reach over {first.support.widths.max():.4g} units "
+        "of length",
     )
-    return _choice(lattice, dtype, (pilot.single for pilot in pilots.values()), closest, reasons, first, None)
-
-
-def _reach(problem: Problem) -> str:
-    return f"the surfaces reach over {problem.support.widths.max():.4g} units of length"
+    return _choice(lattice, dtype, (pilot.single for pilot in pilots.values()), closest, reasons, first, None), {}
 
 
 def _choice(

@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,6 @@ class Plan:
         similarity: Similarity transform of all surfaces.
         rows: All surfaces, the reference among them, in the order of the study.
         reference: Label of the reference's row.
-        blocks: Blocks of the lattice, one chunk of the store each.
         choice: Lattice and dtype of all fields.
         reference_area: Area of the reference, in squared units of length.
         reference_extent: Extent of the reference, in units of length.
@@ -70,7 +70,6 @@ class Plan:
     similarity: Similarity
     rows: tuple[Row, ...]
     reference: str
-    blocks: tuple[Block, ...]
     choice: LatticeChoice
     reference_area: float
     reference_extent: Extent
@@ -86,6 +85,11 @@ class Plan:
         """Settings of the transforms. If an accuracy is requested, eps and tolerance are chosen for each field."""
         given = self.study.transform
         return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of the lattice, one chunk of the store each."""
+        return self.lattice.split(self.study.largest_chunk_bytes // self.item_bytes)
 
     @property
     def item_bytes(self) -> int:
@@ -112,8 +116,7 @@ class Plan:
     def with_choice(self, choice: LatticeChoice) -> Plan:
         """Return the plan of the same study on another lattice."""
         rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
-        blocks = choice.lattice.split(self.study.largest_chunk_bytes // np.dtype(choice.dtype).itemsize)
-        return replace(self, rows=rows, choice=choice, blocks=blocks)
+        return replace(self, rows=rows, choice=choice)
 
 
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
@@ -152,7 +155,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     sample = None
     if study.accuracy is not None:
         sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
-    plan = Plan(study, similarity, tuple(rows), reference, (), choice, surface.area, surface.extent, sample)
+    plan = Plan(study, similarity, tuple(rows), reference, choice, surface.area, surface.extent, sample)
     return plan.with_choice(choice)
 
 

@@ -50,9 +50,8 @@ Backends = Literal["auto", "cpu", "gpu"]
 # Deeper tables and longer texts are mistakes, or made to keep the validation busy.
 _DEEPEST = 20
 _LONGEST_TEXT = 10_000
-_MOST_ORDERS, MOST_OBJECTS = 100, 1000
+_MOST_ORDERS, _MOST_OBJECTS = 100, 1000
 MOST_OCTAVES = 24
-_LONGEST_NAME, _LONGEST_TITLE = 100, 1000
 # Larger study files are mistakes, or made to keep the parser busy.
 _LARGEST_FILE_BYTES = 4 << 20
 # The range of TOML's integers.
@@ -76,26 +75,23 @@ _WORDS = {
 RESERVED = "*?[]{}/\\"
 
 
-def _name(text: str) -> str:
-    """Check a name. Names become labels in the store, and never paths or keys."""
-    problem = name_problem(text, _LONGEST_NAME, "/\\")
-    if problem is not None:
-        raise ValueError(
-            f"a name is 1 to {_LONGEST_NAME} visible characters, blanks only between them, without / and \\; {problem}"
-        )
-    return text
+def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
+    """Return a validator of names and titles. Names become labels in the store, and never paths or keys."""
+    without = f", without {' and '.join(forbidden)}" if forbidden else ""
+
+    def check(text: str) -> str:
+        problem = name_problem(text, longest, forbidden)
+        if problem is not None:
+            raise ValueError(
+                f"1 to {longest} visible characters are needed, blanks only between them{without}; {problem}"
+            )
+        return text
+
+    return AfterValidator(check)
 
 
-def _title(text: str) -> str:
-    problem = name_problem(text, _LONGEST_TITLE) if text else None
-    if problem is not None:
-        raise ValueError(f"a title is one line of up to {_LONGEST_TITLE} visible characters and blanks; {problem}")
-    return text
-
-
-def object_name(name: str) -> str:
-    """Check the name of an object, which is that of a folder in the store."""
-    if set(RESERVED) & set(_name(name)) or name.startswith((".", "__")) or name.endswith(".json"):
+def _object_name(name: str) -> str:
+    if set(RESERVED) & set(name) or name.startswith((".", "__")) or name.endswith(".json"):
         raise ValueError(
             f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
             "begin with . or __, and does not end with .json"
@@ -103,7 +99,7 @@ def object_name(name: str) -> str:
     return name
 
 
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, _line_of_text(100, "/\\")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -128,7 +124,7 @@ class Section(BaseModel):
 
 class _Header(Section):
     name: Name
-    title: Annotated[str, AfterValidator(_title)] = ""
+    title: Annotated[str, _line_of_text(1000)] | None = None
 
 
 class _LatticeSection(Section):
@@ -239,7 +235,7 @@ def _reference(table: object) -> object:
 class ObjectSection(Section):
     """One of the objects of a study that has several."""
 
-    name: Annotated[Name, AfterValidator(object_name)]
+    name: Annotated[Name, AfterValidator(_object_name)]
     reference: dict[str, Any] | None = None
     scaling: dict[str, Any] | None = None
 
@@ -256,7 +252,7 @@ class StudyDocument(Section):
     family: list[Family]
     scaling: _ScalingSection = _ScalingSection()
     proximity: _ProximitySection | None = None
-    object: Annotated[list[ObjectSection], Field(min_length=1, max_length=MOST_OBJECTS)] | None = None
+    object: Annotated[list[ObjectSection], Field(min_length=1, max_length=_MOST_OBJECTS)] | None = None
     objects: dict[Literal["meshes"], Annotated[str | tuple[ListedMesh, ...], BeforeValidator(checked_list)]] = {}
 
     @classmethod

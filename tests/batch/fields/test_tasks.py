@@ -62,9 +62,9 @@ def test_a_mesh_is_one_task_that_adds_up_batches_as_large_as_the_memory_allows(
 
 def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lattice = {"xi_max": 3.0, "M": 16, "octaves": 1}
-    plan = make_plan(Study.from_table(small_table(lattice=lattice, norm={"orders": [-2.0]})))
-    blocks = plan.lattice.split(1000)
-    plan = replace(plan, blocks=blocks)
+    study = Study.from_table(small_table(lattice=lattice, norm={"orders": [-2.0]}))
+    plan = make_plan(replace(study, largest_chunk_bytes=16_000))
+    blocks = plan.blocks
     job = job_of(plan, store_path, "ico/1")
     parts = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
     record = finish_mesh(job, parts)

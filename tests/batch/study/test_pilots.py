@@ -49,7 +49,10 @@ def test_pilots_are_the_coarsest_and_the_finest_that_can_be_compared(folder: Pat
 def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice(folder: Path) -> None:
     ball = sb.icosphere(1)
     sb.write_mesh(sb.Mesh(1.5 * ball.vertices, ball.triangles), folder / "large.off")
-    assert sb.plan(study(folder), folder / "s.zarr").lattice.half_period > 1.5
+    plan = sb.plan(study(folder), folder / "s.zarr")
+    assert plan.lattice.half_period > 1.5
+    assert set(plan.doubtful) == {"f/broken", "f/inches"}
+    assert "doubtful:      f/inches: its extent is 25.4 times that" in str(plan)
 
 
 def test_wrong_meshes_fail_by_their_own_names_and_the_others_have_their_accuracy(client: Client, folder: Path) -> None:
@@ -61,13 +64,6 @@ def test_wrong_meshes_fail_by_their_own_names_and_the_others_have_their_accuracy
     exact = [sb.distance(sb.icosphere(level), sb.Sphere(), -4.0, rtol=1e-3)["distance"].item() for level in range(3)]
     for name, value in zip("zxy", exact, strict=True):
         assert abs(table["distance"][f"f/{name}"] - value) <= 1.01 * table["error"][f"f/{name}"] + 1e-3 * value
-
-
-@pytest.mark.slow
-def test_a_plan_tells_what_is_doubtful(folder: Path) -> None:
-    plan = sb.plan(study(folder), folder / "s.zarr")
-    assert set(plan.doubtful) == {"f/broken", "f/inches"}
-    assert "doubtful:      f/inches: its extent is 25.4 times that" in str(plan)
 
 
 def test_only_wrong_meshes_are_refused_with_a_reason(folder: Path) -> None:

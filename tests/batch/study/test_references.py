@@ -12,16 +12,7 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import (
-    Interval,
-    LatticeError,
-    ParametrisedSurface,
-    Study,
-    Torus,
-    fourier_transform,
-    open_store,
-    run,
-)
+from sobolev_batch import Ellipsoid, Interval, ParametrisedSurface, Study, Torus, fourier_transform, open_store, run
 from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
@@ -58,14 +49,24 @@ def egg_table(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("table", "levels"), [(torus_table(), 4), (egg_table(), 5)], ids=["torus", "ellipsoid"])
+@pytest.mark.parametrize(
+    ("table", "levels", "unit"),
+    # The reference's bounding sphere becomes the unit sphere at the origin.
+    [(torus_table(), 4, Torus(2.0 / 2.8, 0.8 / 2.8)), (egg_table(), 5, Ellipsoid((1.0, 0.7, 0.4)))],
+    ids=["torus", "ellipsoid"],
+)
 def test_refinements_converge_with_second_order(
-    threads: Client, store_path: Path, table: dict[str, Any], levels: int
+    threads: Client, store_path: Path, table: dict[str, Any], levels: int, unit: Torus | Ellipsoid
 ) -> None:
-    summary = run(Study.from_table(table), store_path, threads)
+    study = Study.from_table(table)
+    summary = run(study, store_path, threads)
     assert len(summary.computed) == levels + 1
     assert not summary.failed
     tree = open_store(store_path)
+    stored = variable(tree, "fourier", "fourier").sel(mesh="reference")
+    assert study.lattice is not None
+    expected = fourier_transform(unit, study.lattice, threads=1, order=study.orders)
+    assert np.abs(stored.values - expected.values).max() < 1e-8 * unit.area
     convergence = tree["convergence"].to_dataset()
     for order in (-3.0, -5.0):
         found = convergence.sel(order=order)
@@ -78,21 +79,7 @@ def test_refinements_converge_with_second_order(
     assert rows["status"].item() == "complete"
     assert rows["triangles"].item() == 0
     assert rows["points"].item() > 500
-    assert rows["backend"].item() == "finufft"
-
-
-@pytest.mark.slow
-def test_the_stored_reference_is_the_library_s_field(threads: Client, store_path: Path) -> None:
-    study = Study.from_table(torus_table())
-    run(study, store_path, threads)
-    stored = variable(open_store(store_path), "fourier", "fourier").sel(mesh="reference")
-    # The reference's bounding sphere becomes the unit sphere at the origin.
-    unit = Torus(2.0 / 2.8, 0.8 / 2.8)
-    assert study.lattice is not None
-    expected = fourier_transform(unit, study.lattice, threads=1, order=study.orders)
-    assert np.abs(stored.values - expected.values).max() < 1e-8 * unit.area
-    area = open_store(store_path)["meshes"].to_dataset()["area"].sel(mesh="reference").item()
-    assert area == pytest.approx(unit.area, rel=1e-12)
+    assert rows["area"].item() == pytest.approx(unit.area, rel=1e-12)
 
 
 @pytest.mark.slow
@@ -117,8 +104,6 @@ def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_pat
     assert len(make_plan(study).blocks) > 3
     run(study, tmp_path / "blocks.zarr", threads)
     whole, blocks = (open_store(tmp_path / f"{name}.zarr") for name in ("whole", "blocks"))
-    for tree in (whole, blocks):
-        assert len(variable(tree, "fourier", "quality").sel(mesh="reference").item()) > 100
     first, second = (variable(tree, "fourier", "fourier").sel(mesh="reference").values for tree in (whole, blocks))
     assert np.abs(first - second).max() < 1e-8 * Torus(2.0, 0.8).area
     errors = [tree["norms"].to_dataset()["discretisation"].sel(mesh="reference").values for tree in (whole, blocks)]
@@ -139,12 +124,6 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     summary = run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
-
-
-def test_a_reference_beyond_the_period_is_refused_before_anything_is_computed() -> None:
-    table = torus_table(scaling={"mode": "none"}, reference={"source": "torus", "R": 5.0, "r": 0.4})
-    with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 5.4"):
-        make_plan(Study.from_table(table))
 
 
 def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:

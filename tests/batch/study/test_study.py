@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
             assert f"`{key}`" in rows[name], (name, key)
 
 
-def test_its_example_is_valid(tmp_path: Path) -> None:
+def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
     study, lattice, listed, besides = blocks("docs/studies.md", "toml")
     (tmp_path / "study.toml").write_text(study)
     assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
@@ -99,11 +98,8 @@ def test_its_example_is_valid(tmp_path: Path) -> None:
     (tmp_path / "remeshed.csv").write_text(blocks("docs/studies.md", "csv")[0])
     coarse, fine = Study.from_toml(tmp_path / "study.toml").families[1].source.members(tmp_path)
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
-
-
-@pytest.mark.parametrize("name", ["icosphere", "cortex", "torus"])
-def test_the_workflows_are_valid(name: str) -> None:
-    assert Study.from_toml(WORKFLOWS / f"{name}.toml").name == name
+    for name in ("icosphere", "cortex", "torus"):
+        assert Study.from_toml(WORKFLOWS / f"{name}.toml").name == name
 
 
 def test_python_may_give_arrays_and_paths() -> None:
@@ -128,15 +124,11 @@ def test_names_may_be_of_any_script(name: str) -> None:
     assert (study.name, study.families[0].name) == (name, name)
 
 
-def asking(**accuracy: Any) -> Study:
-    table = small_table(accuracy=accuracy)
-    del table["lattice"]
-    return Study.from_table(table)
-
-
 @pytest.mark.parametrize("memory", ["4GB", 4_000_000_000, 4e9])
 def test_memory_is_a_size(memory: str | float) -> None:
-    study = asking(rtol=0.1, memory=memory)
+    table = small_table(accuracy={"rtol": 0.1, "memory": memory})
+    del table["lattice"]
+    study = Study.from_table(table)
     assert study.accuracy is not None
     assert study.accuracy.allowed_bytes == 4e9
 
