@@ -54,12 +54,12 @@ from .results.tables.league import league as league
 from .results.tables.matrix import matrix as matrix
 from .spectral.fields import fourier_transform as fourier_transform
 from .spectral.lattice import Lattice as Lattice
+from .spectral.metrics.causes import proportion as proportion
+from .spectral.metrics.causes import spectrum as spectrum
+from .spectral.metrics.causes import witness as witness
 from .spectral.metrics.norms import distance as distance
 from .spectral.metrics.norms import inner_product as inner_product
 from .spectral.metrics.norms import norm as norm
-from .spectral.metrics.norms import proportion as proportion
-from .spectral.metrics.spectrum import spectrum as spectrum
-from .spectral.metrics.witness import witness as witness
 from .spectral.metrics.yardsticks import yardsticks as yardsticks
 from .surfaces.formats.readers import as_mesh as as_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh

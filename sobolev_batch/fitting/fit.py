@@ -13,8 +13,8 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.descent import End, Smoothing, descend, smallest_angle
 from sobolev_batch.fitting.problem import FitProblem, FitSettings, OrderWeights
+from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.metrics.norms import distance
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh

@@ -14,19 +14,19 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh
 from sobolev_batch.spectral.backends import Complexes, backend_named
 from sobolev_batch.spectral.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
-from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
-from sobolev_batch.spectral.metrics.inputs import (
+from sobolev_batch.spectral.fields import (
     Operand,
     OperandLike,
+    Quality,
     as_operand,
     common_lattice,
     field_of,
     field_values,
+    fourier_transform,
     quality_of,
 )
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums, single_order
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh

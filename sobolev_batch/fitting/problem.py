@@ -19,11 +19,18 @@ from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, latt
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import Complexes
 from sobolev_batch.spectral.budget import Support
-from sobolev_batch.spectral.fields import USUAL_DEGREE, field_for
+from sobolev_batch.spectral.fields import (
+    USUAL_DEGREE,
+    Operand,
+    Quality,
+    common_lattice,
+    field_for,
+    field_of,
+    field_values,
+    quality_of,
+)
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, common_lattice, field_of, field_values, quality_of
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh

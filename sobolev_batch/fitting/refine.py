@@ -14,8 +14,8 @@ from sobolev_batch.fitting.descent import End
 from sobolev_batch.fitting.fit import Fit, FitProgress, FitRun, conclude, start_quality
 from sobolev_batch.fitting.problem import FitProblem, FitSettings, welded
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.inputs import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.transform.settings import Execution, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh

@@ -8,11 +8,10 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral.fields import OperandLike, pair_of
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.metrics.inputs import OperandLike, pair_of
-from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm, proportion
-from sobolev_batch.spectral.metrics.spectrum import spectrum
-from sobolev_batch.spectral.metrics.witness import witness
+from sobolev_batch.spectral.metrics.causes import proportion, spectrum, witness
+from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.surface import Similarity
 

@@ -20,6 +20,7 @@ from sobolev_batch.results.open import finished_group, is_sequence, location_of,
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.metrics.causes import band_coordinates
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
     KERNEL,
@@ -29,8 +30,6 @@ from sobolev_batch.spectral.metrics.datasets import (
     labelled,
     order_axis,
 )
-from sobolev_batch.spectral.metrics.norms import Proportion
-from sobolev_batch.spectral.metrics.spectrum import band_coordinates
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import squared_moduli
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
@@ -228,7 +227,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     to_reference = DistancesToReference(
         reference_of(tree),
         NormEstimate(*results.to_reference),
-        Proportion(*results.proportions),
+        results.proportions,
         NormEstimate(*results.norms[..., results.places[fields.reference]]),
     )
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None

@@ -1,21 +1,24 @@
-"""Fourier fields of surfaces on the half lattice, each with an estimate of its error."""
+"""Fourier fields of surfaces on the half lattice, each with an estimate of its error; fields as operands of metrics."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Self
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike, NDArray
 
+from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_named
-from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, probe_block
+from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.octaves.remainder import Remainder
+from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, norms_of_checks, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
-from sobolev_batch.spectral.quality import Quality
-from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.transform.settings import (
     ON_CPU,
     ErrorTarget,
@@ -26,13 +29,89 @@ from sobolev_batch.spectral.transform.settings import (
 )
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Surface
+
+Operand = Surface | xr.DataArray
+# What people pass as an operand: see `as_mesh`.
+OperandLike = SurfaceLike | xr.DataArray
+
+# Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
+BLOCK_SAMPLES = 1 << 22
 
 # The orders that a field is probed for if none are named.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
 # The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
 _ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class TailQuality:
+    """Properties of a surface's values in octaves that errors follow from.
+
+    Attributes:
+        radii: |ξ| at which values were compared with exact ones.
+        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order.
+        own: What lies beyond the octaves in the surface's own norm.
+        difference: The same in its distance from the study's reference; None if unknown.
+    """
+
+    radii: tuple[float, ...]
+    squares: tuple[float, ...]
+    own: Remainder
+    difference: Remainder | None = None
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the quality as a table, from which `from_table` makes it again."""
+        return asdict(self)
+
+    @classmethod
+    def from_table(cls, table: dict[str, Any]) -> Self:
+        """Return the quality that a table holds."""
+        own, difference = (part and Remainder.from_table(part) for part in (table["own"], table["difference"]))
+        return cls(tuple(table["radii"]), tuple(table["squares"]), own, difference)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Properties of a field that the errors of norms and distances follow from.
+
+    Attributes:
+        area: Area of the surface, in squared units of length.
+        extent: Extent of the surface.
+        probe: Measured error of the field itself; empty for a closed form.
+        tail: Quality of the values in octaves; None without octaves.
+    """
+
+    area: float
+    extent: Extent
+    probe: Probe
+    tail: TailQuality | None = None
+
+    @classmethod
+    def from_surface(cls, surface: Surface, probe: Probe) -> Self:
+        """Return the quality of the field of a surface."""
+        return cls(surface.area, surface.extent, probe)
+
+    def error_norms(self, weights: SobolevWeights) -> NDArray[np.float64]:
+        """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
+        norms = self.probe.norms(weights)
+        if self.tail is None or not self.tail.radii:
+            return norms
+        tails = norms_of_checks(np.array(self.tail.radii), np.array(self.tail.squares), weights.orders)
+        return np.asarray(np.hypot(norms, tails))
+
+    def to_json(self) -> str:
+        """Return the quality as one line of JSON."""
+        parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
+        return json.dumps(parts if self.tail is None else [*parts, self.tail.to_table()])
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read a quality from a line of `to_json`."""
+        area, lowest, highest, shells, sums, *tail = json.loads(text)
+        extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
+        return cls(area, extent, probe, TailQuality.from_table(*tail) if tail else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,3 +269,128 @@ def field_for(
             break
         target = target.tightened(2 * excess)
     return field
+
+
+def as_operand(a: OperandLike) -> Operand:
+    """Return a field as it is, and anything else as a surface.
+
+    Raises:
+        InputError: It is neither; or see `as_mesh`.
+    """
+    return a if isinstance(a, xr.DataArray) else as_surface(a)
+
+
+def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
+    """Return a field as it is, or transform a surface on a lattice.
+
+    Raises:
+        LatticeError: The field has other dimensions, or the surface does not fit into the lattice.
+        InputError: The argument is neither a field nor a surface, a field is not complex, or a surface comes without a
+            lattice.
+    """
+    if isinstance(a, xr.DataArray):
+        if a.dtype.kind != "c":
+            raise InputError(f"a Fourier field has complex values, found {a.dtype}")
+        if set(a.dims) != set(AXES):
+            raise LatticeError(
+                f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
+            )
+        return a
+    surface = as_surface(a)
+    if lattice is None:
+        raise InputError(
+            f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
+            "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
+        )
+    return fourier_transform(surface, lattice, order=orders)
+
+
+def field_values(field: xr.DataArray) -> Complexes:
+    """Return all samples of a field, complex128 on the half lattice.
+
+    Raises:
+        InputError: Some are not finite.
+    """
+    values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
+    if not np.isfinite(values).all():
+        raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
+    return values
+
+
+def pair_of(
+    a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
+) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return both as fields on one lattice; a surface beside a field is transformed on the field's lattice.
+
+    Raises:
+        LatticeError: As for `field_of`, or the fields lie on different lattices.
+        InputError: As for `field_of`.
+    """
+    common = common_lattice((a, b), lattice)
+    return field_of(a, common, orders), field_of(b, common, orders)
+
+
+def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> Lattice | None:
+    """Return the lattice of the fields among some operands, or the given one; None if there is neither.
+
+    Raises:
+        LatticeError: They differ.
+    """
+    lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
+    if lattice is not None:
+        lattices.append(lattice)
+    for other in lattices[1:]:
+        if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
+            raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")
+    return lattices[0] if lattices else None
+
+
+def point_array(values: ArrayLike, name: str) -> Reals:
+    """Return values as float64 (n, 3); they may be infinite or NaN.
+
+    Raises:
+        InputError: The values are not real, or not of that shape; the message calls them ``name``.
+    """
+    try:
+        points = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be real numbers (n, 3): {error}") from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name} must have the shape (n, 3), found {points.shape}")
+    return points
+
+
+def quality_of(field: xr.DataArray) -> Quality | None:
+    """Return the quality of a field: an attribute of computed fields, a coordinate of stored ones."""
+    text = field.coords["quality"].item() if "quality" in field.coords else field.attrs.get("quality")
+    return Quality.from_json(text) if text else None
+
+
+def read_blocks(
+    lattice: Lattice, *fields: xr.DataArray, largest: int = BLOCK_SAMPLES
+) -> Iterator[tuple[Block, list[Complexes]]]:
+    """Read fields block by block of their half lattice, so that they need not fit into memory."""
+    for block in lattice.split(largest):
+        places = dict(zip(AXES, lattice.place(block), strict=True))
+        yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
+
+
+def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> Reals:
+    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, lattice.shell_count)."""
+    sums = np.zeros((3, lattice.shell_count))
+    for block, (values, others) in read_blocks(lattice, a, b):
+        difference = values - others
+        sums += [
+            shell_sums(difference, None, lattice, block),
+            shell_sums(difference, others, lattice, block),
+            shell_sums(others, None, lattice, block),
+        ]
+    return sums
+
+
+def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
+    """Return the shell sums of |a|², or of |a - b|²."""
+    sums = np.zeros(lattice.shell_count)
+    for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
+        sums += shell_sums(values - others[0] if others else values, None, lattice, block)
+    return sums

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.probe import Probe
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]

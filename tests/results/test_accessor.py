@@ -15,7 +15,7 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.accessor import SobolevAccessor
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.fields import Quality
 from tests.support.studies import SMALL_LATTICE, variable
 
 ORDERS = [-1.5, -7.0]

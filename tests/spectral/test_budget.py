@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, truncated
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product
 from sobolev_batch.surfaces.shapes.surface import Surface

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.quality import Quality
+from sobolev_batch.spectral.fields import Quality
 
 
 def test_field_coordinates_and_attributes() -> None:

@@ -21,7 +21,6 @@ from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
-from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.surfaces.sources.names import natural_key
 
 Reals = NDArray[np.float64]
@@ -126,13 +125,13 @@ class DistancesToReference:
     Attributes:
         reference: Label of the reference.
         distances: Distances over (orders, meshes), NaN where missing.
-        proportion: Decomposition of these distances.
+        proportion: Parts of these distances: see `area_and_shape`.
         norms: Norms of the reference over (orders,).
     """
 
     reference: str
     distances: NormEstimate
-    proportion: Proportion
+    proportion: Reals
     norms: NormEstimate
 
 
@@ -171,8 +170,8 @@ def convergence_dataset(
         **to_reference.distances.named("distance"),
         "relative": relative,
         "relative_error": relative_errors,
-        "area_part": proportion.area,
-        "shape_part": proportion.shape,
+        "area_part": proportion[0],
+        "shape_part": proportion[1],
         "rate": rates,
         "rate_error": rate_errors,
         "resolved": errors < distances,

@@ -28,10 +28,9 @@ from sobolev_batch.batch.store.tables import hide_tables, table_attributes, writ
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
@@ -105,13 +104,13 @@ class Results:
         shapes = (5, orders, count), (5, orders, count), (3, orders, count), (5, orders, count, others)
         return cls({row: place for place, row in enumerate(rows)}, *(np.full(shape, np.nan) for shape in shapes))
 
-    def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Proportion], rows: Sequence[int]) -> None:
+    def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Reals], rows: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.norms` for some rows."""
         norms, to_reference, proportions = outcome
         places = [self.places[row] for row in rows]
         self.norms[..., places] = np.stack(list(norms))
         self.to_reference[..., places] = np.stack(list(to_reference))
-        self.proportions[..., places] = np.stack(list(proportions))
+        self.proportions[..., places] = proportions
 
     def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
@@ -220,7 +219,7 @@ def _write_tables(workspace: Workspace, order: TableOrder, results: Results) -> 
     to_reference = DistancesToReference(
         plan.reference,
         NormEstimate(*results.to_reference),
-        Proportion(*results.proportions),
+        results.proportions,
         NormEstimate(*results.norms[..., results.places[reference]]),
     )
     sizes, families = meshes["edge_length_mean"].to_numpy(), order.families_with_rates(workspace.rows)

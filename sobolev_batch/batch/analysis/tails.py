@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.spectral.fields import TailQuality
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sums import OctaveSums, squared_moduli
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling, TailWeights
-from sobolev_batch.spectral.quality import TailQuality
 
 Reals = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from sobolev_batch.spectral.budget import (
     sums_of_shells,
 )
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.metrics.causes import area_and_shape
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
-from sobolev_batch.spectral.metrics.norms import Proportion
 from sobolev_batch.spectral.octaves.tail import Tail
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 
@@ -129,7 +129,7 @@ class Reducer:
     def _read_at_once(self) -> int:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
-    def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Proportion]:
+    def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals]:
         """Return norms of rows, distances to the reference and their decomposition, each over (orders, rows).
 
         Without the reference's field, all but the norms are NaN.
@@ -140,7 +140,7 @@ class Reducer:
         own = self._estimate(lattice.own, None if tail is None else tail.own, self.areas[rows], self.errors[:, rows])
         if self.reference is None:
             unknown = np.full_like(own.values, np.nan)
-            return own, NormEstimate(*[unknown] * 5), Proportion(*[unknown] * 3)
+            return own, NormEstimate(*[unknown] * 5), np.stack([unknown] * 3)
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
@@ -153,7 +153,7 @@ class Reducer:
             beyond = tail.own.beyond - tail.reference.beyond - tail.difference.beyond * apart
             product = product + tail.product + beyond / 2 * apart
             reference = reference + tail.reference.squares
-        return own, distances, Proportion.of_totals(distances.values**2, product, reference[:, 0])
+        return own, distances, area_and_shape(distances.values**2, product, reference[:, 0])
 
     def _lattice_part(self, rows: Sequence[int]) -> Parts[Sums]:
         """Return the sums over the lattice; zero without the reference."""

@@ -21,7 +21,7 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.metrics.witness import witness
+from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity

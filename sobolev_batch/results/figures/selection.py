@@ -27,7 +27,7 @@ from sobolev_batch.results.open import (
     reference_of,
 )
 from sobolev_batch.results.store_accessor import StoreAccessor
-from sobolev_batch.spectral.metrics.spectrum import spectrum
+from sobolev_batch.spectral.metrics.causes import spectrum
 from sobolev_batch.spectral.shells import Orders
 
 Item = TypeVar("Item")

@@ -47,7 +47,7 @@ from sobolev_batch.results.open import (
     finished_group,
 )
 from sobolev_batch.results.tables.convergence import table
-from sobolev_batch.spectral.metrics.witness import witness
+from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
 from sobolev_batch.surfaces.sources.names import file_stem

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, proportion
-from sobolev_batch.spectral.metrics import inputs as operands
+from sobolev_batch.spectral import fields as operands
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.spheres import sphere_inner_product
@@ -149,7 +149,7 @@ def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = proportion(a, b, ORDERS)
     read = operands.read_blocks
     monkeypatch.setattr(
-        "sobolev_batch.spectral.metrics.inputs.read_blocks",
+        "sobolev_batch.spectral.fields.read_blocks",
         lambda lattice, *fields: read(lattice, *fields, largest=200),
     )
     in_blocks = proportion(a, b, ORDERS)

@@ -84,7 +84,7 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     a, b = random_pair(3)
     points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))
     whole = witness(as_field(a), as_field(b), -2.0, points, eps=1e-13).values
-    monkeypatch.setattr("sobolev_batch.spectral.metrics.witness.BLOCK_SAMPLES", 100)
+    monkeypatch.setattr("sobolev_batch.spectral.metrics.causes.BLOCK_SAMPLES", 100)
     assert len(LATTICE.split(100)) > 10
     in_blocks = witness(as_field(a), as_field(b), -2.0, points, eps=1e-13).values
     assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())

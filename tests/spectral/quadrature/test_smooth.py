@@ -26,10 +26,10 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.backends import CPU
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import Resolution, direct_transform, exact_values, resolution_of
-from sobolev_batch.spectral.quality import Quality
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
