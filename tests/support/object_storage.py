@@ -18,6 +18,8 @@ from typing import Any, Literal
 import fsspec
 import pytest
 
+from sobolev_batch.batch.storage.location import _remote_store
+
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
 # Fewer attempts of the driver, for processes in which all of them fail.
@@ -247,6 +249,7 @@ def _handler() -> Any:
 def forget_drivers() -> None:
     """Make the drivers read their environment again."""
     fsspec.get_filesystem_class("s3").clear_instance_cache()
+    _remote_store.cache_clear()
 
 
 @contextmanager

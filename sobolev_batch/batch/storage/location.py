@@ -1,24 +1,51 @@
-"""Locations of stores: a local folder, or a URL of object storage.
+"""Locations of stores: a local folder, or a URL of object storage, through the stores of zarr.
 
-A location holds no credentials, so it can be stored, logged and sent to a worker.
+A location holds no credentials, so it can be stored, logged and sent to a worker. The drivers of object storage take
+them from the environment of each process.
+
+A store may come from somebody else. A link in it may lead to a device that never ends, or make a run write outside of
+the store. So no link below its folder is followed: checksums would reveal a wrong chunk only after it was read.
 """
 
 from __future__ import annotations
 
+import asyncio
+import inspect
+import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+import stat
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
 from fsspec import available_protocols
-from zarr.abc.store import Store as ZarrStore
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.core.common import AccessModeLiteral
+from zarr.core.sync import sync
+from zarr.storage import FsspecStore, LocalStore
 
-from sobolev_batch.batch.storage.stores import BUCKET_SCHEMES, PARTIAL_FILE, Folder, ObjectStorage
-from sobolev_batch.errors import SobolevBatchError, StoreError
+from sobolev_batch.errors import DamageError, SobolevBatchError, StoreError
+
+T = TypeVar("T")
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
+_BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
+_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+# Names that zarr gives to files until they are complete.
+_PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
+# A run that cannot go on should say so within a minute.
+_ANSWER_SECONDS = 30.0
+_SLOWEST_BYTES_PER_SECOND = 500_000
+# s3fs requests the size of every key first, to read ranges of 50 MB of larger ones at once.
+_RANGE_BYTES = 50 << 20
+# Another attempt would not change these answers.
+_ABSENT = (FileNotFoundError, NotADirectoryError)
+_FINAL = (PermissionError, *_ABSENT)
 
 
 @dataclass(frozen=True)
@@ -53,7 +80,7 @@ class Location:
         if scheme in _FOLDER_SCHEMES:
             return cls(str(Path(rest)))
         _require_no_credentials(scheme, rest)
-        if scheme in BUCKET_SCHEMES and not all(rest.rstrip("/").partition("/")):
+        if scheme in _BUCKET_SCHEMES and not all(rest.rstrip("/").partition("/")):
             raise StoreError(f"{store}: names no place in a bucket; a store lies at {scheme}://bucket/name.zarr")
         return cls(f"{scheme}://{rest.rstrip('/')}")
 
@@ -83,7 +110,7 @@ class Location:
         """Return the location of a name below this one."""
         return Location(f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
 
-    def zarr_store(self, largest_bytes: int = 0) -> ZarrStore:
+    def zarr_store(self, largest_bytes: int = 0) -> FolderStore | RemoteStore:
         """Return the store that zarr and xarray take to read and write here.
 
         Args:
@@ -92,7 +119,7 @@ class Location:
         Raises:
             StoreError: The scheme is unknown, or its driver is not installed.
         """
-        return self._storage.zarr_store(largest_bytes)
+        return _remote_store(self.name, self.scheme, largest_bytes) if self.scheme else FolderStore(self.name)
 
     def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """Return the bytes of a key, or None if it does not exist.
@@ -104,30 +131,39 @@ class Location:
         Raises:
             StoreError: The location cannot be read, does not answer within seconds, or the key is too large.
         """
-        with self.access("read"), self._absence_ignored():
-            return self._storage.read(key, most_bytes)
-        return None
+        with self.access("read"):
+            if most_bytes is not None and not self.scheme:
+                self._require_size(key, most_bytes)
+            content = sync(self.zarr_store().get(key, default_buffer_prototype()))
+            return None if content is None else content.to_bytes()
 
     def write(self, documents: Mapping[str, bytes]) -> None:
         """Write small documents by their keys, in any order. Each is replaced as a whole."""
+        store = self.zarr_store()
+
+        async def write_all() -> None:
+            writes = (store.set(key, _buffer(document)) for key, document in documents.items())
+            # All are awaited, since asyncio logs failures that nobody retrieved.
+            for outcome in await asyncio.gather(*writes, return_exceptions=True):
+                if isinstance(outcome, BaseException):
+                    raise outcome
+
         with self.access("written"):
-            self._storage.write(documents)
+            sync(write_all())
 
     def create(self, key: str, document: bytes) -> bool:
-        """Write a small document unless its key exists, and return whether it was written.
+        """Write a small document that nobody else writes unless its key exists, and return whether it is there.
 
         Of several processes that try, one succeeds. Storage without conditional writes lets the last one win:
         read the key again later.
 
         Raises:
-            StoreError: The location cannot be written, or the folder that should hold it does not exist.
+            StoreError: The location cannot be written.
         """
         with self.access("written"):
-            try:
-                self._storage.create(key, document)
-            except FileExistsError:
-                return False
-        return True
+            sync(self.zarr_store().set_if_not_exists(key, _buffer(document)))
+        # After a request whose answer was lost, a driver is told that its own key exists.
+        return self.read(key) == document
 
     def is_folder(self) -> bool:
         """Return whether the location is a local folder that exists."""
@@ -135,13 +171,14 @@ class Location:
 
     def discard(self, key: str) -> None:
         """Remove a key if it exists."""
-        with self.access("written"), self._absence_ignored():
-            self._storage.delete(key)
+        with self.access("written"), suppress(NotADirectoryError):
+            sync(self.zarr_store().delete(key))
 
     def remove(self, prefix: str) -> None:
         """Remove all keys below a prefix."""
-        with self.access("written"), self._absence_ignored():
-            self._storage.delete_all(prefix)
+        store = self.zarr_store()
+        with self.access("written"), suppress(NotADirectoryError):
+            sync(store.delete(prefix) if isinstance(store, FolderStore) else store.delete_dir(prefix))
 
     def remove_empty_folder(self) -> None:
         """Remove the local folder if nothing is in it."""
@@ -152,18 +189,20 @@ class Location:
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
         with self.access("written"):
-            if isinstance(self._storage, Folder):
-                self._storage.delete_partial_files()
+            for folder, _, names in os.walk(self.name):
+                for name in filter(_PARTIAL_FILE.search, names):
+                    # It may have got its final name since, from a task that outlived its run.
+                    (Path(folder) / name).unlink(missing_ok=True)
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """Return the number of bytes of every key below a prefix."""
         with self.access("read"):
-            return self._storage.sizes(prefix)
+            return sync(self.zarr_store().sizes(prefix))
 
-    def names(self) -> set[str]:
+    def names(self) -> frozenset[str]:
         """Return the names at the first level."""
         with self.access("read"):
-            return self._storage.names()
+            return sync(self.zarr_store().names())
 
     def require_free(self, besides: Collection[str] = ()) -> None:
         """Check that a store may be created here, without writing.
@@ -174,10 +213,15 @@ class Location:
         Raises:
             StoreError: The location holds something else, cannot be read, or has no parent folder.
         """
-        if isinstance(self._storage, Folder):
-            self._storage.require_usable()
+        if not self.scheme:
+            path = Path(self.name)
+            if path.exists() and not path.is_dir():
+                raise StoreError(f"{path}: it is a file; name a folder that is new or holds a store")
+            parent = path.absolute().parent
+            if not parent.is_dir():
+                raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
         # A driver that was killed while it wrote the first key leaves a partial file.
-        if any(name not in besides and not PARTIAL_FILE.search(name) for name in self.names()):
+        if any(name not in besides and not _PARTIAL_FILE.search(name) for name in self.names()):
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
 
     @contextmanager
@@ -196,25 +240,32 @@ class Location:
             yield
         except SobolevBatchError:
             raise
-        except self._storage.failures as error:
+        except Exception as error:
+            if not self.scheme and not isinstance(error, OSError):
+                raise  # a defect
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
-            if isinstance(self._storage, ObjectStorage):
+            if self.scheme:
                 # The address of a server may contain a password.
-                text = self._storage.explain(error, re.sub(r"//[^/\s]*@", "//", text))
+                text = self._explain(error, re.sub(r"//[^/\s]*@", "//", text))
             raise StoreError(f"{self}: the store cannot be {verb}: {text}") from error
 
-    @contextmanager
-    def _absence_ignored(self) -> Iterator[None]:
-        try:
-            yield
-        except (FileNotFoundError, NotADirectoryError) as error:
-            # A missing file is always a missing key.
-            if isinstance(self._storage, ObjectStorage) and not self._storage.is_absent(error):
-                raise
+    def _explain(self, error: Exception, text: str) -> str:
+        """Return the reason of a failure of object storage, and its remedy."""
+        if _lacks_bucket(error) or (self.scheme in _BUCKET_SCHEMES and isinstance(error, FileNotFoundError)):
+            return f"there is no bucket {self.name.split('/')[2]!r} ({text})"
+        if isinstance(error, TimeoutError):
+            return f"nothing answers there within {_ANSWER_SECONDS:g} s"
+        if "Credentials" in type(error).__name__:
+            return f"no credentials ({text}); set those of {self.scheme}:// in the environment of every process"
+        if isinstance(error, PermissionError):
+            return f"access is denied ({text}); check the credentials in the environment and what they allow"
+        return text
 
-    @property
-    def _storage(self) -> Folder | ObjectStorage:
-        return ObjectStorage(self.name, self.scheme) if self.scheme else Folder(self.name)
+    def _require_size(self, key: str, most_bytes: int) -> None:
+        with suppress(*_ABSENT):
+            if path_in(self.name, key).stat().st_size > most_bytes:
+                problem = f"{key} has more than {most_bytes} bytes"
+                raise DamageError(f"{self}: {problem}", problem)
 
 
 def _folder_name(store: str | Path) -> str:
@@ -239,5 +290,194 @@ def _require_no_credentials(scheme: str, rest: str) -> None:
         raise StoreError(f"a {scheme}:// URL of a store with a query in it; {advice}")
     # A secret may hold slashes, so all of it is searched. An Azure URL has an @, but no colon before it.
     before, at, _ = rest.partition("@")
-    if at and (":" in before or (scheme in BUCKET_SCHEMES and "/" not in before)):
+    if at and (":" in before or (scheme in _BUCKET_SCHEMES and "/" not in before)):
         raise StoreError(f"a {scheme}:// URL of a store with credentials in it; {advice}")
+
+
+def path_in(root: str | Path, key: str) -> Path:
+    """Return the path of a key of a store in a folder. The folder itself may be reached by a link.
+
+    Raises:
+        StoreError: The key leads out of the folder, or its path holds a link or a special file.
+    """
+    if key.startswith("/") or ".." in key.split("/"):
+        raise StoreError(f"{root}: {key} leads out of the store")
+    path = os.fspath(root)
+    # One by one, since resolving a whole path takes ten times as long, and each record is a key.
+    for name in filter(None, key.split("/")):
+        path = f"{path}/{name}"
+        try:
+            mode = os.lstat(path).st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            break
+        if stat.S_ISLNK(mode):
+            raise StoreError(f"{path}: a link, which may lead out of the store; put what it leads to in its place")
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise StoreError(f"{path}: neither a file nor a folder, in a store; remove it")
+    return Path(root) / key
+
+
+class FolderStore(LocalStore):
+    """zarr's store in a folder, which follows no link in it."""
+
+    async def _open(self, *, mode: AccessModeLiteral | None = None) -> None:
+        # zarr's makes the folder, also of a store that is only read.
+        self._is_open = True
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        """Return the bytes of ranges of keys."""
+        ranges = list(key_ranges)
+        for key, _ in ranges:
+            path_in(self.root, key)
+        return await super().get_partial_values(prototype, ranges)
+
+    async def names(self) -> frozenset[str]:
+        """Return the names of files and folders."""
+        return frozenset([name async for name in self.list_dir("")])
+
+    async def sizes(self, prefix: str) -> dict[str, int]:
+        """Return the sizes of all files below a prefix."""
+        sizes = {}
+        for folder, _, names in os.walk(path_in(self.root, prefix)):
+            for name in names:
+                path = os.path.join(folder, name)
+                with suppress(FileNotFoundError):  # removed since
+                    status = os.lstat(path)
+                    if stat.S_ISREG(status.st_mode):
+                        sizes[os.path.relpath(path, self.root).replace(os.sep, "/")] = status.st_size
+        return sizes
+
+
+def _checked(method: Callable[..., Any]) -> Callable[..., Any]:
+    def call(self: FolderStore, *arguments: Any, **options: Any) -> Any:
+        path_in(self.root, arguments[0] if arguments else options.get("key", options.get("prefix", "")))
+        return method(self, *arguments, **options)
+
+    return call
+
+
+# By their arguments, since newer versions of zarr add some.
+for _name, _method in inspect.getmembers(LocalStore, inspect.isfunction):
+    if not _name.startswith("_") and list(inspect.signature(_method).parameters)[1:2] in (["key"], ["prefix"]):
+        setattr(FolderStore, _name, _checked(_method))
+
+
+async def _twice(attempt: Callable[[], Awaitable[T]], size_bytes: int = 0, final: Any = _FINAL) -> T:
+    """Make a request of the driver, and once more if it fails; then, or after a while, raise the first failure.
+
+    The drivers repeat most requests several times, but not a range whose transfer breaks off, nor an upload whose last
+    answer was lost. Keys are written whole, so writing one again is safe.
+    """
+    failure: Exception = TimeoutError()
+    try:
+        async with asyncio.timeout(_ANSWER_SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND):
+            try:
+                return await attempt()
+            except final:
+                raise
+            except Exception as error:
+                failure = error
+                return await attempt()
+    except TimeoutError:
+        raise failure from None
+
+
+class RemoteStore(FsspecStore):
+    """zarr's store behind a driver of fsspec."""
+
+    largest_bytes = 0
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Return the bytes of a key or of a range of it, or None if it does not exist."""
+        with _absence_ignored():
+            return await _twice(partial(super().get, key, prototype, byte_range), self.largest_bytes)
+        return None
+
+    async def set(self, key: str, value: Buffer, byte_range: tuple[int, int] | None = None) -> None:
+        """Replace a key."""
+        await _twice(partial(super().set, key, value, byte_range), len(value), PermissionError)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write a key by a conditional request."""
+        with suppress(FileExistsError):
+            async with asyncio.timeout(_ANSWER_SECONDS):
+                await self.fs._pipe_file(f"{self.path}/{key}", value.to_bytes(), mode="create")
+
+    async def delete(self, key: str) -> None:
+        """Remove a key if it exists."""
+        with _absence_ignored():
+            async with asyncio.timeout(_ANSWER_SECONDS):
+                await self.fs._rm_file(f"{self.path}/{key}")
+
+    async def delete_dir(self, prefix: str) -> None:
+        """Remove all keys below a prefix."""
+        path = f"{self.path}/{prefix}"
+
+        async def remove() -> None:
+            await self.fs._rm(path, recursive=True)
+            # A server may remove some of them only; s3fs does not check.
+            if remaining := await self.fs._find(path):
+                raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
+
+        with _absence_ignored():
+            await _twice(remove)
+
+    async def names(self) -> frozenset[str]:
+        """Return the names of keys at the first level."""
+        async with asyncio.timeout(_ANSWER_SECONDS):
+            # The name alone may stand for a folder that was emptied; only existing keys are listed.
+            paths = await self.fs._ls(self.path, detail=False) if await self.fs._exists(self.path) else ()
+        return frozenset(path.rstrip("/").rpartition("/")[2] for path in paths)
+
+    async def sizes(self, prefix: str) -> dict[str, int]:
+        """Return the sizes of all keys below a prefix."""
+        async with asyncio.timeout(_ANSWER_SECONDS):
+            entries = await self.fs._find(f"{self.path}/{prefix}", detail=True)
+        return {path.removeprefix(f"{self.path}/"): entry["size"] for path, entry in entries.items()}
+
+
+@cache
+def _remote_store(url: str, scheme: str, largest_bytes: int) -> RemoteStore:
+    """Return the store at a URL, whose connections all threads share: fsspec would open others for each of them."""
+    # fsspec remembers listings, but other processes write to the same store.
+    options: dict[str, Any] = {"use_listings_cache": False}
+    if scheme in ("s3", "s3a") and largest_bytes <= _RANGE_BYTES:
+        options["max_concurrency"] = 1
+    try:
+        store = RemoteStore.from_url(url, options, allowed_exceptions=())
+    except ImportError as error:
+        extra = _EXTRAS.get(scheme)
+        remedy = f"pip install 'sobolev-batch[{extra}]'" if extra else "install it"
+        raise StoreError(f"{url}: the driver of {scheme}:// is missing here ({error}): {remedy}") from error
+    except ValueError as error:
+        raise StoreError(f"{url}: no store can lie there ({error}); name a folder or an s3:// URL") from error
+    remote = cast(RemoteStore, store)
+    remote.largest_bytes = largest_bytes
+    return remote
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # The child has no thread that would answer.
+    os.register_at_fork(after_in_child=_remote_store.cache_clear)
+
+
+@contextmanager
+def _absence_ignored() -> Iterator[None]:
+    """Ignore that a key is missing, but not that its bucket is."""
+    try:
+        yield
+    except _ABSENT as error:
+        if _lacks_bucket(error):
+            raise
+
+
+def _lacks_bucket(error: Exception) -> bool:
+    """Return whether the bucket is missing, for drivers that report a missing key in the same way."""
+    response: Any = getattr(error.__cause__, "response", None)
+    return isinstance(response, dict) and response.get("Error", {}).get("Code") == "NoSuchBucket"
+
+
+def _buffer(document: bytes) -> Buffer:
+    return default_buffer_prototype().buffer.from_bytes(document)

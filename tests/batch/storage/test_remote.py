@@ -18,7 +18,7 @@ from zarr.core.sync import sync
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.storage import stores
+from sobolev_batch.batch.storage import location as locations
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
@@ -148,8 +148,7 @@ def test_an_outage_ends_in_one_line(storage: Server, location: Location, kind: K
 
 
 def test_storage_that_never_answers_is_given_up(location: Location, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stores, "LONGEST_SECONDS", 0.1)
-    monkeypatch.setattr(stores, "_ANSWER_SECONDS", 0.1)
+    monkeypatch.setattr(locations, "_ANSWER_SECONDS", 0.1)
     with (
         socket.create_server(("127.0.0.1", 0)) as deaf,
         taken_for_s3({"AWS_ENDPOINT_URL": f"http://127.0.0.1:{deaf.getsockname()[1]}"}),

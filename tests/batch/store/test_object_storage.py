@@ -227,7 +227,7 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
         (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
-        (("run", "study.toml", "--store", there), {"AWS_ENDPOINT_URL": deaf}, "nothing answers there within 20 s"),
+        (("run", "study.toml", "--store", there), {"AWS_ENDPOINT_URL": deaf}, "nothing answers there within 30 s"),
         (("table", there), unknown, "no credentials (Unable to locate credentials); set those of s3://"),
     ]
     for arguments, environment, message in cases:
