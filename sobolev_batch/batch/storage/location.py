@@ -152,7 +152,7 @@ class Location:
             sync(write_all())
 
     def create(self, key: str, document: bytes) -> bool:
-        """Write a small document that nobody else writes unless its key exists, and return whether it is there.
+        """Write a small document that nobody else writes unless its key exists, and return whether it was written.
 
         Of several processes that try, one succeeds. Storage without conditional writes lets the last one win:
         read the key again later.
