@@ -21,6 +21,7 @@ from sobolev_batch.batch.study.schema import (
     StudyDocument,
     plain_tables,
     read_toml,
+    with_named_meshes,
 )
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, StudyError
@@ -151,7 +152,7 @@ class StudyCollection:
 
 def is_collection(table: Mapping[str, Any]) -> bool:
     """Return True where the table of a study file has several objects."""
-    templates = str([table.get("reference"), table.get("family")])
+    templates = str([table.get(key) for key in ("mesh", "reference", "family")])
     return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
 
 
@@ -189,7 +190,7 @@ def _listed_meshes(given: str | Sequence[ListedMesh], folder: Path) -> _Listed:
 
 def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the objects that the files of the reference name, in their natural order."""
-    paths = (values["reference"] or {}).get("paths")
+    paths = (with_named_meshes(values["reference"], values.get("mesh", {})) or {}).get("paths")
     templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
     if not templates:
         raise StudyError(

@@ -25,6 +25,7 @@ from pydantic import (
     Field,
     SerializeAsAny,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 from pydantic_core import ErrorDetails, PydanticKnownError
@@ -190,11 +191,44 @@ class FamilyReference(Section):
     member: str | None = None
 
 
-def _source(table: object) -> Source:
-    """Return what a table with the key ``source`` describes."""
+def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, ...] = ()) -> Any:
+    """Return the table of a source with the tables of named meshes in place of their names.
+
+    Args:
+        table: Table, or the name of a mesh.
+        meshes: Table of each named mesh; it may name others.
+        above: Meshes that are made from this one.
+
+    Raises:
+        ValueError: A name is unknown, or a mesh is made from itself.
+    """
+    if isinstance(table, str):
+        if table in above:
+            raise ValueError(f"the mesh {quoted(table)} is made from itself")
+        if table not in meshes:
+            known = known_names(table, meshes) if meshes else "the study has no section [mesh.NAME]"
+            raise ValueError(f"no mesh is named {quoted(table)}; {known}")
+        return with_named_meshes(meshes[table], meshes, (*above, table))
     if not isinstance(table, dict):
-        raise PydanticKnownError("dict_type")
+        return table
+    if "source" not in table and isinstance(table.get("mesh"), str):
+        named = with_named_meshes(table["mesh"], meshes, above)
+        return {**named, **{key: value for key, value in table.items() if key != "mesh"}}
     try:
+        fields = source_type_of(table.get("source")).model_fields
+    except StudyError:
+        # Whoever parses the table says so.
+        return table
+    nested = {name for name, field in fields.items() if any(issubclass(m, Source) for m in models_in(field.annotation))}
+    return {key: with_named_meshes(value, meshes, above) if key in nested else value for key, value in table.items()}
+
+
+def _source(table: object, info: ValidationInfo) -> Source:
+    """Return what the table of a source, or the name of a mesh, describes."""
+    try:
+        table = with_named_meshes(table, info.context or {})
+        if not isinstance(table, dict):
+            raise PydanticKnownError("dict_type")
         return parse_source(table)
     except InputError as error:
         raise ValueError(str(error)) from error
@@ -226,17 +260,17 @@ class Family(Section):
 _KEYS_OF_FAMILY = ("name", "order_by")
 
 
-def _reference(table: object) -> object:
+def _reference(table: object, info: ValidationInfo) -> object:
     if isinstance(table, dict) and table.get("source") == "family":
         return FamilyReference.model_validate({key: value for key, value in table.items() if key != "source"})
-    return None if table is None else _source(table)
+    return None if table is None else _source(table, info)
 
 
 class ObjectSection(Section):
     """One of the objects of a study that has several."""
 
     name: Annotated[Name, AfterValidator(_object_name)]
-    reference: dict[str, Any] | None = None
+    reference: dict[str, Any] | str | None = None
     scaling: dict[str, Any] | None = None
 
 
@@ -244,6 +278,7 @@ class StudyDocument(Section):
     """All sections of a study file, of one object or of several."""
 
     study: _Header
+    mesh: dict[Name, Annotated[SerializeAsAny[Source], BeforeValidator(_source)]] = {}
     lattice: _LatticeSection | None = None
     accuracy: _AccuracySection | None = None
     norm: _NormSection
@@ -262,8 +297,9 @@ class StudyDocument(Section):
         Raises:
             StudyError: A message for each key that is wrong.
         """
+        meshes = values.get("mesh")
         try:
-            return cls.model_validate(values)
+            return cls.model_validate(values, context=meshes if isinstance(meshes, dict) else {})
         except ValidationError as error:
             messages = _refusals(error, values)
             more = len(messages) - _MOST_OFFENDERS
@@ -360,7 +396,9 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
     """Return what is wrong in the tables of a study, a message for each key."""
     messages: list[str] = []
     allowed: dict[Key, list[str]] = {}
-    for item in error.errors(include_url=False):
+    items = error.errors(include_url=False)
+    # What is wrong with a named mesh is wrong wherever it is named.
+    for item in [item for item in items if item["loc"][:1] == ("mesh",)] or items:
         kind, key = item["type"], _key_in(values, item)
         name = _named(key, values)
         if kind == "extra_forbidden":
@@ -468,6 +506,8 @@ def _named(key: Key, values: Mapping[str, Any]) -> str:
         place += f" {int(key[1]) + 1}"
         if isinstance(entry, Mapping) and isinstance(entry.get("name"), str):
             place += f" (named {quoted(entry['name'])})"
+    if section == "mesh" and rest:
+        place, rest = f"[mesh.{_readable(str(rest[0]))}]", rest[1:]
     name = ".".join(_readable(part) for part in rest if isinstance(part, str))
     numbers = ", ".join(str(part + 1) for part in rest if isinstance(part, int))
     if numbers:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.collection import read_study
+from sobolev_batch.batch.study.collection import is_collection, read_study
 from tests.support.studies import small_table
 
 
@@ -99,6 +99,19 @@ def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder:
     found = sb.StudyCollection.from_table(table(object=objects, family=ICO), folder=folder)
     assert [study.scaling for study in found.studies.values()] == [None, sb.Similarity()]
     assert [study.name for study in found.studies.values()] == ["small cow", "small ball"]
+
+
+def test_named_meshes_give_objects_too(folder: Path) -> None:
+    changes = {
+        "mesh": {"original": {"source": "files", "paths": ["objects/{object}.ply"]}},
+        "reference": {"mesh": "original"},
+        "family": [{"name": "d", "source": "decimate", "mesh": "original", "triangles": [10]}],
+    }
+    found = sb.StudyCollection.from_table(table(**changes), folder=folder)
+    assert methods(found) == {name: ["d"] for name in ("bee9", "bee10", "cow", "cow_2")}
+    (member,) = found.studies["cow"].reference.members(folder)  # type: ignore[union-attr]
+    assert member.name == "cow"
+    assert is_collection(found.table)
 
 
 def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> None:

@@ -62,6 +62,29 @@ def test_the_reference_may_be_a_member_of_a_family(box_file: Path) -> None:
         plan_of(family=family, reference={"source": "family", "family": "f"}, folder=box_file.parent)
 
 
+def test_a_named_mesh_is_the_source_that_it_names(box_file: Path) -> None:
+    box, fine = {"source": "files", "paths": ["box.off"]}, {"source": "icosphere", "levels": [3]}
+    names = {"box": box, "fine": fine, "coarse": {"source": "decimate", "mesh": "fine", "triangles": [100]}}
+    moved = {"name": "m", "source": "moved", "distances": [0.1]}
+    fitted = {"name": "f", "source": "fit", "steps": 1}
+    named = plan_of(
+        mesh=names,
+        reference={"mesh": "box"},
+        family=[{**moved, "mesh": "coarse"}, {**fitted, "mesh": "fine", "target": "box"}, {"name": "b", "mesh": "box"}],
+        folder=box_file.parent,
+    )
+    coarse = {"source": "decimate", "mesh": fine, "triangles": [100]}
+    written = plan_of(
+        reference=box,
+        family=[{**moved, "mesh": coarse}, {**fitted, "mesh": fine, "target": box}, {"name": "b", **box}],
+        folder=box_file.parent,
+    )
+    assert [(row.label, row.key) for row in named.rows] == [(row.label, row.key) for row in written.rows]
+    # By their fingerprints the store of one is that of the other; the study remembers how it was written.
+    assert named.study.table["reference"] == {"mesh": "box"}
+    assert plan_of(mesh=names, reference="box", folder=box_file.parent).rows[-1].key == named.rows[-1].key
+
+
 def test_keys_follow_what_a_field_depends_on(box_file: Path) -> None:
     def key(**changes: Any) -> str:
         family = {"name": "f", "source": "files", "paths": ["box.off"]}

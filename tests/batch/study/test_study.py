@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from sobolev_batch import Lattice, OrderError, Similarity, Study
 from sobolev_batch.batch.study.schema import StudyDocument, models_in
+from sobolev_batch.surfaces.sources.files import FileSource
 from sobolev_batch.surfaces.sources.registry import Source, source_type_of
 from tests.support.members import KINDS
 from tests.support.repository import blocks
@@ -86,7 +87,12 @@ def test_the_reference_of_study_files_names_every_key_and_source() -> None:
 
 
 def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
-    study, lattice, listed, besides = blocks("docs/studies.md", "toml")
+    study, lattice, named, listed, besides = blocks("docs/studies.md", "toml")
+    rest = 'study.name = "x"\nlattice = { xi_max = 3.0, M = 16 }\nnorm.orders = [-2.0]\n'
+    (tmp_path / "study.toml").write_text(rest + named)
+    reference = Study.from_toml(tmp_path / "study.toml").reference
+    assert isinstance(reference, FileSource)
+    assert reference.paths == ("bunny.ply",)
     (tmp_path / "study.toml").write_text(study)
     assert Study.from_toml(tmp_path / "study.toml").title == "Scans of a statue, decimated"
     (tmp_path / "study.toml").write_text(study.replace("[accuracy]\nrtol = 1e-3\n", lattice))
