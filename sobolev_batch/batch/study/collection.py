@@ -26,7 +26,7 @@ from sobolev_batch.batch.study.schema import (
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.surfaces.sources.files import (
-    ListedMesh,
+    MeshTable,
     expand,
     matching_files,
     number_as_text,
@@ -168,23 +168,21 @@ def read_study(path: str | Path) -> Study | StudyCollection:
     return Study.from_toml(path)
 
 
-def _listed_meshes(given: str | Sequence[ListedMesh], folder: Path) -> _Listed:
+def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
     """Return the meshes of the section [objects]."""
     base = Path()
     if isinstance(given, str):
         base, given = Path(given).parent, read_mesh_list(folder / given)
     meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for mesh in given:
-        known: dict[str, Any] = dict(mesh.metadata)
+        known = dict(mesh)
         names: list[str] = []
         for column in ("object", "method"):
             if column not in known:
-                raise StudyError(f"[objects]: meshes: {quoted(mesh.path)} has no {column}; each mesh needs both")
+                raise StudyError(f"[objects]: meshes: {quoted(mesh['path'])} has no {column}; each mesh needs both")
             name = known.pop(column)
             names.append(number_as_text(name) if isinstance(name, float) else str(name))
-        own = {"path": (base / mesh.path).as_posix(), "name": mesh.name, "time": mesh.time, **known}
-        entry = {key: value for key, value in own.items() if value is not None}
-        meshes.setdefault((names[0], names[1]), []).append(entry)
+        meshes.setdefault((names[0], names[1]), []).append({**known, "path": (base / known["path"]).as_posix()})
     return meshes
 
 

@@ -41,7 +41,7 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity
-from sobolev_batch.surfaces.sources.files import ListedMesh, checked_list
+from sobolev_batch.surfaces.sources.files import MeshTable, checked_list
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_source, source_type_of
 
@@ -288,7 +288,7 @@ class StudyDocument(Section):
     scaling: _ScalingSection = _ScalingSection()
     proximity: _ProximitySection | None = None
     object: Annotated[list[ObjectSection], Field(min_length=1, max_length=_MOST_OBJECTS)] | None = None
-    objects: dict[Literal["meshes"], Annotated[str | tuple[ListedMesh, ...], BeforeValidator(checked_list)]] = {}
+    objects: dict[Literal["meshes"], Annotated[str | tuple[MeshTable, ...], BeforeValidator(checked_list)]] = {}
 
     @classmethod
     def from_tables(cls, values: Mapping[str, Any]) -> Self:

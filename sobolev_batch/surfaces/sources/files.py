@@ -11,9 +11,8 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import translate
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from numbers import Real
@@ -40,7 +39,6 @@ from sobolev_batch.surfaces.sources.registry import (
     ExpectedSize,
     Fingerprint,
     Member,
-    Metadata,
     Source,
     at_most,
     checked_times,
@@ -50,52 +48,14 @@ MOST_MESHES = 100_000
 _MOST_COLUMNS = 100
 _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
+# What a list says of a mesh: its path, and perhaps a name, a time and metadata.
+MeshTable = dict[str, Any]
 # Columns of names, which may look like numbers.
 _TEXTS = ("path", "name", "object", "method")
 _EXAMPLE = '{ path = "a.ply", method_seconds = 3.5 }'
 
 
-@dataclass(frozen=True)
-class ListedMesh:
-    """A mesh file in a list.
-
-    Attributes:
-        path: Path of the file.
-        name: Name of the mesh; None for the stem of the file.
-        time: Time of the mesh, if it has one.
-        metadata: All else that the list says of it.
-    """
-
-    path: str
-    name: str | None = None
-    time: float | None = None
-    metadata: Metadata = ()
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> ListedMesh:
-        """Return the mesh that a table describes; empty texts and NaN say nothing.
-
-        Raises:
-            ValueError: The table has no path, or a value of another type than it should be.
-        """
-        known = {key: value for key, value in table.items() if not _is_nothing(value)}
-        path, name, time = known.pop("path", None), known.pop("name", None), known.pop("time", None)
-        if not isinstance(path, str):
-            raise ValueError(f"each mesh needs a path, as in {_EXAMPLE}; found {quoted(dict(table))}")
-        if "\0" in path:
-            raise ValueError(f"no file can have the name {quoted(path)}, which holds the character NUL")
-        if name is not None:
-            name = number_as_text(name) if is_finite_number(name) else name
-            problem = label_problem(name) if isinstance(name, str) else "it is no text"
-            if problem is not None:
-                raise ValueError(f"{quoted(path)} has the name {quoted(name)}, which is no label: {problem}")
-        if time is not None and not is_finite_number(time):
-            raise ValueError(f"{quoted(path)} has the time {quoted(time)}; a time is a number")
-        metadata = tuple((_checked_key(key), _checked_value(path, key, value)) for key, value in known.items())
-        return cls(path, name, None if time is None else float(time), metadata)
-
-
-def checked_list(value: object) -> str | tuple[ListedMesh, ...] | None:
+def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
     """Return the key ``meshes`` of a study: the path of a CSV file, or a list of meshes.
 
     Raises:
@@ -110,7 +70,7 @@ def checked_list(value: object) -> str | tuple[ListedMesh, ...] | None:
     return _listed(value)
 
 
-def read_mesh_list(path: Path) -> tuple[ListedMesh, ...]:
+def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
     """Return the meshes that a CSV file lists. Its first line has the names of the columns.
 
     Raises:
@@ -159,13 +119,34 @@ def number_as_text(number: float) -> str:
     return str(int(number)) if number == int(number) else repr(float(number))
 
 
-def _listed(tables: Any) -> tuple[ListedMesh, ...]:
+def _listed(tables: Any) -> tuple[MeshTable, ...]:
     if len(tables) > MOST_MESHES:
         raise ValueError(f"at most {MOST_MESHES} meshes are allowed, found {len(tables)}")
     widest = max(map(len, tables))
     if widest > _MOST_COLUMNS:
         raise ValueError(f"at most {_MOST_COLUMNS} columns are allowed, found {widest}")
-    return tuple(map(ListedMesh.from_table, tables))
+    return tuple(map(_checked_table, tables))
+
+
+def _checked_table(table: Mapping[str, Any]) -> MeshTable:
+    """Return the table of a mesh without what says nothing: empty texts and NaN."""
+    known = {key: value for key, value in table.items() if not _is_nothing(value)}
+    path, name, time = known.pop("path", None), known.pop("name", None), known.pop("time", None)
+    if not isinstance(path, str):
+        raise ValueError(f"each mesh needs a path, as in {_EXAMPLE}; found {quoted(dict(table))}")
+    if "\0" in path:
+        raise ValueError(f"no file can have the name {quoted(path)}, which holds the character NUL")
+    checked: MeshTable = {"path": path}
+    if name is not None:
+        checked["name"] = number_as_text(name) if is_finite_number(name) else name
+        problem = label_problem(checked["name"]) if isinstance(checked["name"], str) else "it is no text"
+        if problem is not None:
+            raise ValueError(f"{quoted(path)} has the name {quoted(name)}, which is no label: {problem}")
+    if time is not None:
+        if not is_finite_number(time):
+            raise ValueError(f"{quoted(path)} has the time {quoted(time)}; a time is a number")
+        checked["time"] = float(time)
+    return checked | {_checked_key(key): _checked_value(path, key, value) for key, value in known.items()}
 
 
 def _checked_key(key: object) -> str:
@@ -217,7 +198,7 @@ class FileSource(Source):
         ]
         | None
     ) = None
-    meshes: Annotated[str | tuple[ListedMesh, ...] | None, BeforeValidator(checked_list)] = None
+    meshes: Annotated[str | tuple[MeshTable, ...] | None, BeforeValidator(checked_list)] = None
     distribution: Annotated[str, Field(min_length=1)] | None = None
     times: Annotated[tuple[float, ...] | Literal["names"] | None, BeforeValidator(_checked_times)] = None
 
@@ -270,19 +251,25 @@ class FileMember(Member):
         return ExpectedSize(*expected_size(self.path))
 
 
-def _listed_members(meshes: str | tuple[ListedMesh, ...], folder: Path) -> tuple[Member, ...]:
+def _listed_members(meshes: str | tuple[MeshTable, ...], folder: Path) -> tuple[Member, ...]:
     """Return one member for each mesh of a list, by the name that it gives or the stem of its file."""
     if isinstance(meshes, str):
         folder, meshes = (folder / meshes).parent, read_mesh_list(folder / meshes)
-    paths = [folder / mesh.path for mesh in meshes]
-    unnamed = list(dict.fromkeys(path for path, mesh in zip(paths, meshes, strict=True) if mesh.name is None))
+    paths = [folder / mesh["path"] for mesh in meshes]
+    unnamed = list(dict.fromkeys(path for path, mesh in zip(paths, meshes, strict=True) if "name" not in mesh))
     stems = dict(zip(unnamed, names_of_files(unnamed), strict=True))
-    names = [stems[path] if mesh.name is None else mesh.name for path, mesh in zip(paths, meshes, strict=True)]
+    names = [mesh.get("name") or stems[path] for path, mesh in zip(paths, meshes, strict=True)]
     repeated = duplicate_names(names)
     if repeated:
         raise StudyError(f"meshes: several are named {quoted(repeated[0][0])}; give each a name of its own")
     return tuple(
-        FileMember(name, -1, path.absolute(), time=mesh.time, metadata=mesh.metadata)
+        FileMember(
+            name,
+            -1,
+            path.absolute(),
+            time=mesh.get("time"),
+            metadata=tuple((key, value) for key, value in mesh.items() if key not in ("path", "name", "time")),
+        )
         for name, path, mesh in zip(names, paths, meshes, strict=True)
     )
 
@@ -381,7 +368,7 @@ def expand(folder: Path, pattern: str) -> list[Path]:
 
     The part of the pattern before its first wildcard names a folder. Files outside of that folder are
     refused, since nobody would notice them: ``..`` after a wildcard, and links that lead out. Hidden files
-    match only a part that begins with a dot; ``**`` follows no links to folders.
+    match only where a part begins with a dot; ``**`` follows no links to folders.
 
     Args:
         folder: Folder where relative patterns start.
@@ -396,12 +383,17 @@ def expand(folder: Path, pattern: str) -> list[Path]:
     glob = f"the glob {quoted(pattern, 300)}"
     if ".." in rest:
         raise StudyError(f"{glob} goes back up behind a wildcard; name the folder to search")
-    paths = [base]
-    for part in rest:
-        # Without duplicates, or some patterns would take for ever.
-        paths = list(dict.fromkeys(match for path in paths for match in _matches(path, part)))
+    # Two of ** in a row are one, or some patterns would take for ever.
+    rest = tuple(part for part, before in zip(rest, ("", *rest), strict=False) if not part == before == "**")
+    plain = "/".join(part if part == "**" else re.sub(r"\*+", "*", part) for part in rest)
     inside = Path(os.path.realpath(base))
-    files = [path for path in paths if os.path.isfile(path)]
+    found = base.glob(f"{plain}/*" if rest[-1] == "**" else plain)
+    shows_hidden = any(part.startswith(".") for part in rest)
+    files = [
+        path
+        for path in dict.fromkeys(found)
+        if path.is_file() and (shows_hidden or not any(part.startswith(".") for part in path.relative_to(base).parts))
+    ]
     if not files:
         raise StudyError(f"{glob} matches no file below {inside}; correct it, or put files there")
     for path in files:
@@ -411,30 +403,3 @@ def expand(folder: Path, pattern: str) -> list[Path]:
                 f"{glob} matches {str(path)!r}, a link out of {inside} to {target}; name such files by their paths"
             )
     return files
-
-
-def _matches(folder: Path, part: str) -> Iterator[Path]:
-    """Yield the paths in a folder that match one part of a pattern."""
-    if part == "**":
-        # Any number of folders; as the last part it stands for their files.
-        yield folder
-        for parent, folders, files in os.walk(folder):
-            folders[:] = [
-                name for name in folders if not name.startswith(".") and not os.path.islink(os.path.join(parent, name))
-            ]
-            for name in (*folders, *files):
-                if not name.startswith("."):
-                    yield Path(parent, name)
-    elif not has_magic(part):
-        if os.path.lexists(folder / part):
-            yield folder / part
-    else:
-        matches = re.compile(translate(part)).match
-        try:
-            names = os.listdir(folder)
-        except OSError:
-            # A file, or a folder that may not be listed, matches nothing, as in a shell.
-            return
-        for name in names:
-            if matches(name) and (part.startswith(".") or not name.startswith(".")):
-                yield folder / name
