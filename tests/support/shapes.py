@@ -8,7 +8,6 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
-from sobolev_batch.surfaces.shapes.mesh import MeshCounts
 
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -31,7 +30,18 @@ BOX_AREA = 28.0
 # The same box with coordinates that need all digits of double precision.
 AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
 
-CLOSED = MeshCounts(zero_area=0, duplicate=0, boundary_edges=0, nonmanifold_edges=0)
+
+def mesh_counts(zero_area: int, duplicate: int, boundary: int, nonmanifold: int) -> dict[str, int]:
+    """Return counts as `Mesh.counts` gives them."""
+    return {
+        "zero_area_triangles": zero_area,
+        "duplicate_triangles": duplicate,
+        "boundary_edges": boundary,
+        "nonmanifold_edges": nonmanifold,
+    }
+
+
+CLOSED = mesh_counts(0, 0, 0, 0)
 
 TETRAHEDRON_VERTICES: Reals = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=np.float64)
 TETRAHEDRON_TRIANGLES: list[list[int]] = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]

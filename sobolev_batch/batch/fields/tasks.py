@@ -301,19 +301,16 @@ def _facts_of(surface: Surface, points: int) -> Facts:
     """Return what is recorded of a surface and its quadrature points."""
     if not isinstance(surface, Mesh):
         return Facts(area=surface.area, points=points)
-    (mean_length, longest), counts = surface.edge_length_range, surface.counts
+    mean_length, longest = surface.edge_length_range
     return Facts(
         vertices=len(surface.vertices),
         triangles=len(surface.triangles),
         area=surface.area,
         edge_length_mean=mean_length,
         edge_length_max=longest,
-        zero_area_triangles=counts.zero_area,
-        duplicate_triangles=counts.duplicate,
-        boundary_edges=counts.boundary_edges,
-        nonmanifold_edges=counts.nonmanifold_edges,
         digest=surface.digest,
         points=points,
+        **surface.counts,
     )
 
 

@@ -36,7 +36,7 @@ class Facts:
         vertices, triangles: Counts; zero for a surface that is no mesh.
         area: Total area in the study's unit of length, squared.
         edge_length_mean, edge_length_max: Lengths of triangle sides, in the study's unit; NaN without triangles.
-        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: See `MeshCounts`.
+        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: See `Mesh.counts`.
         digest: SHA-256 of vertices and triangles in the study's unit; empty without triangles.
         points: Number of quadrature points; zero for a closed form.
     """

@@ -43,15 +43,15 @@ def parse_gltf(data: bytes, path: Path) -> Raw:
     required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
     if required:
         raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
-    buffers = _Buffers(tree, binary, path)
+    buffers = _loaded_buffers(tree, binary, path)
+    most = unpacked_limit(len(data) + sum(map(len, {id(buffer): buffer for buffer in buffers}.values())))
     placed: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
     total = 0
     for matrix, mesh in _placed_meshes(tree):
-        for vertices, triangles in _primitives(tree["meshes"][mesh], buffers):
+        for vertices, triangles in _primitives(tree, buffers, tree["meshes"][mesh]):
             placed.append((vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
             total += vertices.nbytes + triangles.nbytes
             # Any number of nodes may place one mesh, and any number of primitives use one array.
-            most = unpacked_limit(len(data) + buffers.loaded_bytes)
             if total > most:
                 raise MeshError(f"its scene repeats parts until they take more than {most} bytes; export it unfolded")
     if not placed:
@@ -72,71 +72,54 @@ def buffer_paths(data: bytes, path: Path) -> list[Path]:
     return [_beside(path, uri) for uri in uris if uri is not None and not uri.startswith("data:")]
 
 
-class _Buffers:
-    """The accessors of a document, read from buffers that are loaded when first needed."""
-
-    def __init__(self, tree: dict[str, Any], binary: bytes | None, path: Path) -> None:
-        self._tree, self._binary, self._path = tree, binary, path
-        self._loaded: dict[int, bytes] = {}
-        # By path, since several buffers may be one file under different names.
-        self._files: dict[Path, bytes] = {}
-
-    @property
-    def loaded_bytes(self) -> int:
-        """Size of the files that were read."""
-        return sum(map(len, self._files.values()))
-
-    def array(self, index: int, kind: str) -> NDArray[Any]:
-        """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
-        accessor = self._tree["accessors"][index]
-        if accessor["type"] != kind:
-            raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
-        if "sparse" in accessor or accessor.get("normalized") or "bufferView" not in accessor:
-            raise MeshError(f"accessor {index} is sparse, normalized or without data: not supported, export it plainly")
-        view = self._tree["bufferViews"][accessor["bufferView"]]
-        dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
-        stride = view.get("byteStride", dtype.itemsize * width)
-        offset = accessor.get("byteOffset", 0)
-        end = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
-        if stride < dtype.itemsize * width:
-            raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
-        if min(offset, count) < 0 or end > view["byteLength"]:
-            raise MeshError(
-                f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold"
-            )
-        start = view.get("byteOffset", 0)
-        buffer = self._bytes(view["buffer"])
-        if start < 0 or start + view["byteLength"] > len(buffer):
-            raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
-        values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
-        return values[:, 0] if kind == "SCALAR" else values
-
-    def _bytes(self, index: int) -> bytes:
-        if index not in self._loaded:
-            uri = self._tree["buffers"][index].get("uri")
-            announced = self._tree["buffers"][index]["byteLength"]
-            buffer = self._load(index, uri)
-            if len(buffer) < announced:
-                raise MeshError(f"buffer {index} announces {announced} bytes, found {len(buffer)}")
-            self._loaded[index] = buffer
-        return self._loaded[index]
-
-    def _load(self, index: int, uri: str | None) -> bytes:
+def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, path: Path) -> list[bytes]:
+    """Return the bytes of each buffer of a document."""
+    buffers: list[bytes] = []
+    # By path, since several buffers may be one file under different names.
+    files: dict[Path, bytes] = {}
+    for index, buffer in enumerate(tree.get("buffers", [])):
+        uri = buffer.get("uri")
         if uri is None:
-            if index != 0 or self._binary is None:
+            if index != 0 or binary is None:
                 raise MeshError(f"buffer {index} has no data")
-            return self._binary
-        if uri.startswith("data:"):
-            return base64.b64decode(uri.partition(",")[2], validate=True)
-        beside = _beside(self._path, uri)
-        if beside not in self._files:
-            try:
-                self._files[beside] = read_regular(
-                    beside, gzipped=False, factor=_MEMORY_FACTOR, held_bytes=self.loaded_bytes
-                )
-            except MeshError as error:
-                raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
-        return self._files[beside]
+            buffers.append(binary)
+        elif uri.startswith("data:"):
+            buffers.append(base64.b64decode(uri.partition(",")[2], validate=True))
+        else:
+            beside = _beside(path, uri)
+            if beside not in files:
+                held_bytes = sum(map(len, files.values()))
+                try:
+                    files[beside] = read_regular(beside, gzipped=False, factor=_MEMORY_FACTOR, held_bytes=held_bytes)
+                except MeshError as error:
+                    raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
+            buffers.append(files[beside])
+        if len(buffers[-1]) < buffer["byteLength"]:
+            raise MeshError(f"buffer {index} announces {buffer['byteLength']} bytes, found {len(buffers[-1])}")
+    return buffers
+
+
+def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -> NDArray[Any]:
+    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
+    accessor = tree["accessors"][index]
+    if accessor["type"] != kind:
+        raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
+    if "sparse" in accessor or accessor.get("normalized") or "bufferView" not in accessor:
+        raise MeshError(f"accessor {index} is sparse, normalized or without data: not supported, export it plainly")
+    view = tree["bufferViews"][accessor["bufferView"]]
+    dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
+    stride = view.get("byteStride", dtype.itemsize * width)
+    offset = accessor.get("byteOffset", 0)
+    end = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
+    if stride < dtype.itemsize * width:
+        raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
+    if min(offset, count) < 0 or end > view["byteLength"]:
+        raise MeshError(f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold")
+    start, buffer = view.get("byteOffset", 0), buffers[view["buffer"]]
+    if start < 0 or start + view["byteLength"] > len(buffer):
+        raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
+    values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
+    return values[:, 0] if kind == "SCALAR" else values
 
 
 def _beside(path: Path, uri: str) -> Path:
@@ -208,15 +191,17 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _primitives(mesh: dict[str, Any], buffers: _Buffers) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+def _primitives(
+    tree: dict[str, Any], buffers: list[bytes], mesh: dict[str, Any]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
     """Yield positions and triangles of each primitive that has area, so no points or lines."""
     for primitive in mesh["primitives"]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             continue
-        vertices = buffers.array(primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
+        vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
         if "indices" in primitive:
-            corners = buffers.array(primitive["indices"], "SCALAR").astype(np.int64)
+            corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
         else:
             corners = np.arange(len(vertices), dtype=np.int64)
         triangles = _triangles(corners, mode)

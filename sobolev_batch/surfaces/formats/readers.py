@@ -274,7 +274,7 @@ def as_mesh(mesh: MeshLike) -> Mesh:
     - an ``open3d.geometry.TriangleMesh`` or ``open3d.t.geometry.TriangleMesh``.
 
     Coordinates become float64, and are copied. Vertices stay as they are: none are merged, moved or left out. For the
-    way back there are `Mesh.to_trimesh`, `Mesh.to_pyvista`, `Mesh.to_meshio` and `Mesh.to_open3d`.
+    way back there are `Mesh.to_trimesh` and `Mesh.to_pyvista`, and the arrays of the mesh.
 
     Args:
         mesh: Any of these.

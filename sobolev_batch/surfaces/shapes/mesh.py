@@ -29,23 +29,6 @@ _MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
 
 
-@dataclass(frozen=True)
-class MeshCounts:
-    """Counts of what is unusual about a mesh. All of it is legitimate in a surface measure, none is repaired.
-
-    Attributes:
-        zero_area: Number of triangles whose area is zero to double precision.
-        duplicate: Number of triangles that repeat the three vertices of an earlier one, in any orientation.
-        boundary_edges: Number of edges of exactly one triangle.
-        nonmanifold_edges: Number of edges of more than two triangles.
-    """
-
-    zero_area: int
-    duplicate: int
-    boundary_edges: int
-    nonmanifold_edges: int
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh in three-dimensional space, as a sum of flat area measures.
@@ -64,7 +47,7 @@ class Mesh:
 
     >>> import sobolev_batch as sb
     >>> mesh = sb.Mesh([[0, 0, 0], [3, 0, 0], [0, 4, 0]], [[0, 1, 2]])
-    >>> mesh.area, mesh.edge_lengths.tolist(), mesh.counts.boundary_edges
+    >>> mesh.area, mesh.edge_lengths.tolist(), mesh.counts["boundary_edges"]
     (6.0, [[3.0, 5.0, 4.0]], 3)
     """
 
@@ -170,17 +153,21 @@ class Mesh:
         return np.ascontiguousarray(self.vertices[self.used_vertices].T)
 
     @cached_property
-    def counts(self) -> MeshCounts:
-        """Counts of degenerate and duplicate triangles, and of open and non-manifold edges."""
+    def counts(self) -> dict[str, int]:
+        """Counts of what is unusual about the mesh. All of it is legitimate in a surface measure, none is repaired.
+
+        The keys are "zero_area_triangles", to double precision; "duplicate_triangles", which repeat the three vertices
+        of an earlier one in any orientation; "boundary_edges" of exactly one triangle; and "nonmanifold_edges" of more
+        than two.
+        """
         boundary, nonmanifold = _boundary_and_nonmanifold_edges(self.triangles, len(self.vertices))
-        return MeshCounts(
-            zero_area=sum(
-                int(np.count_nonzero(self.areas[batch] <= zero_areas)) for batch, zero_areas in self._zero_areas()
-            ),
-            duplicate=_duplicate_triangles(self.triangles),
-            boundary_edges=boundary,
-            nonmanifold_edges=nonmanifold,
-        )
+        zero_area = sum(int(np.count_nonzero(self.areas[batch] <= limit)) for batch, limit in self._zero_areas())
+        return {
+            "zero_area_triangles": zero_area,
+            "duplicate_triangles": _duplicate_triangles(self.triangles),
+            "boundary_edges": boundary,
+            "nonmanifold_edges": nonmanifold,
+        }
 
     def batches(self, size: int) -> Iterator[tuple[int, Mesh]]:
         """Yield the mesh as numbered meshes of at most ``size`` triangles, each with only the vertices that it uses.
@@ -221,39 +208,8 @@ class Mesh:
         try:
             import pyvista
         except ImportError as error:
-            raise _missing("PyVista", "'sobolev-batch[vtk]'") from error
+            raise InputError("PyVista is not installed: pip install 'sobolev-batch[vtk]'") from error
         return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
-
-    def to_meshio(self) -> Any:
-        """Return a new ``meshio.Mesh`` of the same vertices and triangles, all digits kept.
-
-        Raises:
-            InputError: meshio is not installed.
-        """
-        try:
-            import meshio
-        except ImportError as error:
-            raise _missing("meshio", "meshio") from error
-        return meshio.Mesh(np.array(self.vertices), [("triangle", np.array(self.triangles))])
-
-    def to_open3d(self) -> Any:
-        """Return a new ``open3d.geometry.TriangleMesh`` of the same vertices and triangles, all digits kept.
-
-        For Open3D's tensors pass it to ``open3d.t.geometry.TriangleMesh.from_legacy``, which keeps single precision
-        unless its ``vertex_dtype`` is float64.
-
-        Raises:
-            InputError: Open3D is not installed.
-        """
-        try:
-            import open3d
-        except ImportError as error:
-            raise _missing("Open3D", "open3d") from error
-        # Its indices have 32 bits.
-        vertices, triangles = np.array(self.vertices), self.triangles.astype(np.int32)
-        return open3d.geometry.TriangleMesh(
-            open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
-        )
 
     def _zero_areas(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Yield, for each batch of triangles, the areas below which rounding hides whether they are zero."""
@@ -289,10 +245,6 @@ class Mesh:
 
     def __reduce__(self) -> tuple[type[Mesh], tuple[NDArray[np.float64], NDArray[np.int64]]]:
         return Mesh, (self.vertices, self.triangles)
-
-
-def _missing(name: str, requirement: str) -> InputError:
-    return InputError(f"{name} is not installed: pip install {requirement}")
 
 
 def _areas(edges: _Edges) -> NDArray[np.float64]:

@@ -102,7 +102,7 @@ def _ends_well(path: Path, content: bytes) -> None:
             assert mesh.triangles.max() < len(mesh.vertices)
             assert math.isfinite(mesh.area)
             assert mesh.area > 0
-            assert mesh.counts.zero_area < len(mesh.triangles)
+            assert mesh.counts["zero_area_triangles"] < len(mesh.triangles)
             assert math.isfinite(mesh.edge_length_range[1])
     assert time.process_time() - start < _LONGEST_SECONDS
     held_bytes = len(content) * (4 if path.suffix == ".gz" else 1)

@@ -67,7 +67,7 @@ def test_strips_are_cut_and_keep_their_side(tmp_path: Path, suffix: str) -> None
 
 def test_pixels_have_their_corners_in_rows(tmp_path: Path) -> None:
     mesh = read_mesh(saved(grid([[0, 1, 2, 3]], 8), tmp_path / "scan.vtu"))
-    assert (mesh.area, mesh.counts.boundary_edges) == (8.0, 4)
+    assert (mesh.area, mesh.counts["boundary_edges"]) == (8.0, 4)
 
 
 @pytest.mark.parametrize(("suffix", "binary"), KINDS)

@@ -14,6 +14,7 @@ from scipy.special import ellipe
 from sobolev_batch import Ellipsoid, InputError, Mesh, Similarity, Sphere, Torus, icosphere
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
+from tests.support.shapes import CLOSED
 
 EGG = Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3))
 TORUS = Torus(1.0, 0.4, (0.1, -0.2, 0.3))
@@ -102,8 +103,7 @@ def test_meshes_of_ellipsoids_are_stretched_icospheres() -> None:
 def test_grids_of_tori_are_closed_and_face_outwards() -> None:
     mesh = TORUS.mesh(12, 6)
     assert (len(mesh.vertices), len(mesh.triangles)) == (72, 144)
-    counts = mesh.counts
-    assert (counts.zero_area, counts.duplicate, counts.boundary_edges, counts.nonmanifold_edges) == (0, 0, 0, 0)
+    assert mesh.counts == CLOSED
     # Neighbours run along a shared edge in opposite directions.
     edges = np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
     assert len(np.unique(edges, axis=0)) == len(edges)

@@ -10,6 +10,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, Edges
+from tests.support.shapes import CLOSED
 
 
 def open_mesh() -> sb.Mesh:
@@ -112,8 +113,7 @@ def test_counts(level: int) -> None:
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_surface_is_closed_and_lies_on_the_sphere(level: int) -> None:
     mesh = sb.icosphere(level)
-    counts = mesh.counts
-    assert (counts.zero_area, counts.duplicate, counts.boundary_edges, counts.nonmanifold_edges) == (0, 0, 0, 0)
+    assert mesh.counts == CLOSED
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 4 * np.finfo(float).eps
     # Symmetric about the origin.
     assert np.abs(mesh.vertices.mean(axis=0)).max() < 1e-15
