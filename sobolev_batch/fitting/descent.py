@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 
 from sobolev_batch.errors import LatticeError
 from sobolev_batch.fitting.gradient import SquaredDistance
+from sobolev_batch.fitting.transform import normals
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
@@ -51,70 +52,26 @@ class End(Enum):
 _END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 
 
-@dataclass(frozen=True, eq=False)
 class Descent:
-    """Vertices after a descent.
-
-    Attributes:
-        vertices: Positions (n, 3), in units of length.
-        objective: Weighted squared distances there, with the penalty of shapes.
-        steps: Number of steps.
-        end: Why it ended.
-    """
-
-    vertices: Reals
-    objective: float
-    steps: int
-    end: End
-
-
-def descend(
-    objective: SquaredDistance,
-    vertices: Reals,
-    smoothing: Smoothing,
-    steps: int,
-    floor: float,
-    unit: float,
-    notify: Notify,
-) -> Descent:
-    """Lower a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
+    """The descent of a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
 
     Args:
         objective: Squared distance, or a weighted sum of several.
-        vertices: Positions (n, 3) to start from.
+        vertices: Positions (n, 3) to start from, in units of length.
         smoothing: Smoothing of the steps.
-        steps: Largest number of steps.
         floor: Squared distance below which nothing is left to gain.
         unit: Length of a long step, such as that of an edge.
         notify: Called with the positions and the objective after each step.
 
-    Returns:
-        The last positions that were accepted. A step that leaves the lattice's period ends the descent before it.
+    Attributes:
+        vertices: The last positions that were accepted.
+        value: Weighted squared distances there, with the penalty of shapes.
+        steps: Number of steps so far.
+        end: Why it ended.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.
     """
-    path = _Path(objective, vertices, smoothing, floor, unit, notify)
-    if path.value <= floor:
-        return Descent(vertices, path.value, 0, End.ERROR)
-    try:
-        result = minimize(
-            path.scaled,
-            np.zeros(3 * len(smoothing.free)),
-            jac=True,
-            method="L-BFGS-B",
-            callback=path.accept,
-            options={"maxiter": steps, "maxfun": 3 * steps, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
-        )
-    except LatticeError:
-        path.end = End.LEFT
-    else:
-        path.end = path.end or _END_OF_STATUS.get(result.status, End.STUCK)
-    return Descent(path.vertices, path.value, path.steps, path.end)
-
-
-class _Path:
-    """The accepted positions on the way down, and the functions that scipy calls."""
 
     def __init__(
         self,
@@ -131,30 +88,50 @@ class _Path:
         self.steps = 0
         self.end: End | None = None
         self._history = [self.first]
-        self._normals = _normals(vertices, objective.transform.triangles)
-        self._penalty = ShapePenalty.from_shapes(vertices, objective.transform.triangles)
+        self._triangles = objective.transform.triangles
+        self._normals = normals(vertices, self._triangles)
+        self._references = lowest_free_qualities(vertices, self._triangles)
 
-    def positions(self, parameters: Reals) -> Reals:
+    def run(self, steps: int) -> None:
+        """Take this many steps at most. One that leaves the lattice's period ends the descent before it."""
+        if self.value <= self.floor:
+            self.end = End.ERROR
+            return
+        try:
+            result = minimize(
+                self._scaled,
+                np.zeros(3 * len(self.smoothing.free)),
+                jac=True,
+                method="L-BFGS-B",
+                callback=self._accept,
+                options={"maxiter": steps, "maxfun": 3 * steps, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
+            )
+        except LatticeError:
+            self.end = End.LEFT
+        else:
+            self.end = self.end or _END_OF_STATUS.get(result.status, End.STUCK)
+
+    def _positions(self, parameters: Reals) -> Reals:
         """Return the vertices for parameters, the steps of free vertices in long steps."""
         return self.start + self.unit * self.smoothing.movement(parameters.reshape(-1, 3))
 
-    def scaled(self, parameters: Reals) -> tuple[float, Reals]:
+    def _scaled(self, parameters: Reals) -> tuple[float, Reals]:
         """Return the squared distance relative to the first with the penalty of shapes, and its derivative."""
-        vertices = self.positions(parameters)
+        vertices = self._positions(parameters)
         value, gradient = self.objective(vertices)
-        penalty, slopes = self._penalty.value_and_gradient(vertices)
+        penalty, slopes = shape_penalty(vertices, self._triangles, self._references)
         total = gradient / self.first + _SHAPE_WEIGHT * slopes
         return value / self.first + _SHAPE_WEIGHT * penalty, (self.unit * self.smoothing.pulled_back(total)).ravel()
 
-    def accept(self, intermediate_result: OptimizeResult) -> None:
+    def _accept(self, intermediate_result: OptimizeResult) -> None:
         """Keep a step if it turns no triangle over, and end the descent where nothing more is to be gained."""
-        vertices = self.positions(intermediate_result.x)
-        normals = _normals(vertices, self.objective.transform.triangles)
+        vertices = self._positions(intermediate_result.x)
+        turned = normals(vertices, self._triangles)
         # A triangle that lost its area could go on to any side.
         had_area = np.any(self._normals != 0, axis=1)
-        if np.any(np.einsum("ij,ij->i", normals, self._normals)[had_area] <= 0):
+        if np.any(np.einsum("ij,ij->i", turned, self._normals)[had_area] <= 0):
             self._stop(End.TURNED)
-        self.vertices, self._normals = vertices, normals
+        self.vertices, self._normals = vertices, turned
         self.value = float(intermediate_result.fun) * self.first
         self.steps += 1
         self._history.append(self.value)
@@ -168,12 +145,6 @@ class _Path:
     def _stop(self, end: End) -> Any:
         self.end = end
         raise StopIteration
-
-
-def _normals(vertices: Reals, triangles: NDArray[np.int64]) -> Reals:
-    """Return the normals of triangles (m, 3), each as long as twice its area."""
-    a, b, c = (vertices[corner] for corner in triangles.T)
-    return np.asarray(np.cross(b - a, c - a))
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,63 +197,44 @@ class Smoothing:
         return splu(csc_array(eye_array(len(self.free)) + self.amount * among_free))
 
 
-@dataclass(frozen=True, eq=False)
-class ShapePenalty:
-    """A sum over the triangles that become much worse than they were.
+def triangle_qualities(vertices: Reals, triangles: Indices) -> Reals:
+    """Return 4√3 area / (sum of squared edges) of triangles (m,), one for equilateral ones and zero without an area."""
+    a, b, c = (vertices[corner] for corner in triangles.T)
+    areas = np.linalg.norm(normals(vertices, triangles), axis=1) / 2
+    # A triangle that is a point has no quality to lose.
+    squares = _squared_edges(a, b, c)
+    return np.where(squares > 0, _EQUILATERAL * areas / np.maximum(squares, 1e-300), 0)
 
-    The quality q of a triangle is 4√3 area / (sum of its squared edges), one for equilateral triangles and zero without
-    an area. It costs ((r - q) / r)² where it falls below a reference r, and nothing above.
 
-    Attributes:
-        triangles: Indices of corners, int64 (m, 3).
-        references: r of each triangle (m,).
+def lowest_free_qualities(vertices: Reals, triangles: Indices) -> Reals:
+    """Return the quality (m,) that each triangle may come down to without a penalty."""
+    return np.minimum(_FREE_LOSS * triangle_qualities(vertices, triangles), _GOOD)
+
+
+def shape_penalty(vertices: Reals, triangles: Indices, references: Reals) -> tuple[float, Reals]:
+    """Return a penalty for triangles that become much worse than they were, and its derivative (n, 3).
+
+    A quality q costs ((r - q) / r)² where it falls below a reference r (m,), and nothing above.
     """
-
-    triangles: NDArray[np.int64]
-    references: Reals
-
-    @classmethod
-    def from_shapes(cls, vertices: Reals, triangles: NDArray[np.int64]) -> Self:
-        """Return the penalty of triangles relative to their present shapes."""
-        quality = _Quality(vertices, triangles)
-        return cls(triangles, np.minimum(_FREE_LOSS * quality.values, _GOOD))
-
-    def value_and_gradient(self, vertices: Reals) -> tuple[float, Reals]:
-        """Return the penalty for vertices (n, 3), and its derivative with respect to them."""
-        quality = _Quality(vertices, self.triangles)
-        bad = np.flatnonzero(quality.values < self.references)
-        lacks = 1 - quality.values[bad] / self.references[bad]
-        gradient = np.zeros_like(vertices)
-        for corner, slopes in enumerate(quality.gradients(bad)):
-            terms = (-2 * lacks / self.references[bad])[:, None] * slopes
-            np.add.at(gradient, self.triangles[bad, corner], terms)
-        return float(np.sum(lacks**2)), gradient
+    qualities = triangle_qualities(vertices, triangles)
+    bad = np.flatnonzero(qualities < references)
+    lacks = 1 - qualities[bad] / references[bad]
+    gradient = np.zeros_like(vertices)
+    corners = [vertices[corner] for corner in triangles[bad].T]
+    doubled = normals(vertices, triangles[bad])
+    units = doubled / np.maximum(np.linalg.norm(doubled, axis=1), 1e-300)[:, None]
+    squares = _squared_edges(*corners)[:, None]
+    for corner in range(3):
+        this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
+        of_area = np.cross(units, previous - following) / 2
+        of_squares = 2 * (2 * this - following - previous)
+        slopes = (_EQUILATERAL * of_area - qualities[bad, None] * of_squares) / squares
+        np.add.at(gradient, triangles[bad, corner], (-2 * lacks / references[bad])[:, None] * slopes)
+    return float(np.sum(lacks**2)), gradient
 
 
-class _Quality:
-    """Qualities of triangles, and their derivatives."""
-
-    def __init__(self, vertices: Reals, triangles: NDArray[np.int64]) -> None:
-        self.corners = [vertices[corner] for corner in triangles.T]
-        a, b, c = self.corners
-        self.normals = np.cross(b - a, c - a)
-        self.areas = np.linalg.norm(self.normals, axis=1) / 2
-        self.squares = sum(np.einsum("ij,ij->i", side, side) for side in (b - a, c - b, a - c))
-        # A triangle that is a point has no quality to lose.
-        self.values: Reals = np.where(self.squares > 0, _EQUILATERAL * self.areas / np.maximum(self.squares, 1e-300), 0)
-
-    def gradients(self, selected: NDArray[np.intp]) -> list[Reals]:
-        """Return the derivatives of some triangles' qualities with respect to each of their corners, (k, 3)."""
-        corners = [corner[selected] for corner in self.corners]
-        units = self.normals[selected] / np.maximum(2 * self.areas[selected], 1e-300)[:, None]
-        squares, values = self.squares[selected][:, None], self.values[selected][:, None]
-        found = []
-        for corner in range(3):
-            this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
-            of_area = np.cross(units, previous - following) / 2
-            of_squares = 2 * (2 * this - following - previous)
-            found.append((_EQUILATERAL * of_area - values * of_squares) / squares)
-        return found
+def _squared_edges(a: Reals, b: Reals, c: Reals) -> Reals:
+    return np.asarray(sum(np.einsum("ij,ij->i", side, side) for side in (b - a, c - b, a - c)))
 
 
 def smallest_angle(mesh: Mesh) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.fitting.descent import End, Smoothing, descend, smallest_angle
+from sobolev_batch.fitting.descent import Descent, End, Smoothing, smallest_angle
 from sobolev_batch.fitting.problem import FitProblem, FitSettings, OrderWeights
 from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.lattice import Lattice
@@ -235,8 +235,9 @@ class FitRun:
         left = min(steps, problem.settings.steps - self.taken)
         while left > 0:
             objective, floor = problem.objective(self.vertices, weights)
-            descent = descend(objective, self.vertices, smoothing, left, floor, unit, self._count)
-            self.vertices, left, self.end = descent.vertices, left - descent.steps, descent.end
+            descent = Descent(objective, self.vertices, smoothing, floor, unit, self._count)
+            descent.run(left)
+            self.vertices, left, self.end = descent.vertices, left - descent.steps, descent.end or End.CONVERGED
             if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
                 retreats += 1
                 smoothing = replace(smoothing, amount=max(_SMOOTHER * smoothing.amount, 1.0))

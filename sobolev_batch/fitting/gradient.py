@@ -1,17 +1,18 @@
-"""Squared distances as functions of the vertices of a mesh: the value, its derivative, and the error of that."""
+"""Squared distances as functions of the vertices of a mesh, also of tensors: value, derivative, error of that."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting.transform import MeshTransform, PlacedMesh
+from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral.backends import Complexes, backend_named
 from sobolev_batch.spectral.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.fields import (
@@ -114,7 +115,7 @@ class SquaredDistance:
         values = field_values(field)
         execution = Execution(backend_named(backend), thread_count(threads))
         transform = MeshTransform.from_mesh(mesh, own, TransformSettings(eps), execution)
-        transform.at(np.asarray(mesh.vertices))
+        transform.nodes(np.asarray(mesh.vertices))
         return cls(transform, values, factors_of(SobolevWeights(own, orders))[0])
 
     def __call__(self, vertices: ArrayLike) -> tuple[float, Reals]:
@@ -124,22 +125,22 @@ class SquaredDistance:
             InputError: The vertices are not finite, or not as many as the mesh has.
             LatticeError: The mesh extends beyond the lattice's half period.
         """
-        placed = self._placed(vertices)
-        difference = placed.transform() - self.target
-        gradient = 2 * placed.derivative(self.factors * difference)
+        positions = self._positions(vertices)
+        difference = self.transform.transform(positions) - self.target
+        gradient = 2 * self.transform.derivative(positions, self.factors * difference)
         return self._square(difference), gradient.reshape(np.shape(vertices))
 
     def value(self, vertices: ArrayLike) -> float:
         """Return the squared distance alone, which takes a third of the time; see `__call__`."""
-        return self._square(self._placed(vertices).transform() - self.target)
+        return self._square(self.transform.transform(self._positions(vertices)) - self.target)
 
-    def _placed(self, vertices: ArrayLike) -> PlacedMesh:
-        """Return the mesh with vertices at some positions, (n, 3) or (3n,)."""
+    def _positions(self, vertices: ArrayLike) -> Reals:
+        """Return positions of vertices, given as (n, 3) or (3n,)."""
         positions = np.asarray(vertices)
         if positions.dtype.kind not in "iuf":
             raise InputError(f"positions of vertices must be real numbers, found {positions.dtype}")
         is_flat = positions.shape == (3 * self.transform.count,)
-        return self.transform.at((positions.reshape(-1, 3) if is_flat else positions).astype(np.float64, copy=False))
+        return (positions.reshape(-1, 3) if is_flat else positions).astype(np.float64, copy=False)
 
     def _square(self, difference: Complexes) -> float:
         return float(np.sum(self.factors * (difference.real**2 + difference.imag**2)))
@@ -149,6 +150,106 @@ def factors_of(weights: SobolevWeights) -> Reals:
     """Return the weight of each sample of the half lattice in squared norms, float64 (orders, *lattice.shape)."""
     lattice = weights.lattice
     return np.asarray(weights.per_shell[:, lattice.shells(lattice.half)] * lattice.trapezoid_weights(lattice.half))
+
+
+def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
+    """Return a squared distance as a differentiable function of a PyTorch tensor.
+
+    Args:
+        squared: The squared distance.
+
+    Returns:
+        Function of a tensor of vertices, (n, 3) or (3n,), that returns a scalar tensor of the same dtype and device. It
+        computes in double precision on the processor; a double tensor there is read without a copy. It can be
+        differentiated once. Errors are those of `SquaredDistance`.
+
+    Raises:
+        InputError: PyTorch is not installed.
+
+    >>> import sobolev_batch as sb
+    >>> ball = sb.icosphere(1)
+    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> function = sb.torch_function(squared)  # doctest: +SKIP
+    >>> function(torch.tensor(ball.vertices, requires_grad=True)).backward()  # doctest: +SKIP
+    """
+    try:
+        import torch
+        from torch.autograd.function import once_differentiable
+    except ImportError as error:
+        raise _missing("PyTorch", "torch") from error
+
+    class _Function(torch.autograd.Function):  # type: ignore[misc]
+        @staticmethod
+        def forward(context: Any, vertices: Any) -> Any:
+            positions = vertices.detach().cpu().numpy()
+            if not context.needs_input_grad[0]:
+                return vertices.new_tensor(squared.value(positions))
+            value, gradient = squared(positions)
+            context.save_for_backward(torch.from_numpy(gradient).to(vertices))
+            return vertices.new_tensor(value)
+
+        @staticmethod
+        @once_differentiable
+        def backward(context: Any, slope: Any) -> Any:
+            (gradient,) = context.saved_tensors
+            return slope * gradient
+
+    function: Callable[[Any], Any] = _Function.apply
+    return function
+
+
+def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
+    """Return a squared distance as a differentiable function of a JAX array.
+
+    Args:
+        squared: The squared distance.
+
+    Returns:
+        Function of an array of vertices, (n, 3) or (3n,), that returns a scalar of the same dtype. It works under
+        `jax.jit` and `jax.grad`, and computes in double precision on the host. It can be differentiated once, in
+        reverse mode. JAX passes errors of `SquaredDistance` on as its own.
+
+    Raises:
+        InputError: JAX is not installed.
+
+    >>> import sobolev_batch as sb
+    >>> ball = sb.icosphere(1)
+    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> function = sb.jax_function(squared)  # doctest: +SKIP
+    >>> gradient = jax.grad(function)(jax.numpy.asarray(ball.vertices))  # doctest: +SKIP
+    """
+    try:
+        import jax
+    except ImportError as error:
+        raise _missing("JAX", "jax") from error
+
+    def value(vertices: Any) -> Any:
+        found = np.asarray(squared.value(np.asarray(vertices)))
+        return found.astype(vertices.dtype)
+
+    def value_and_gradient(vertices: Any) -> tuple[Any, Any]:
+        found, gradient = squared(np.asarray(vertices))
+        return np.asarray(found).astype(vertices.dtype), gradient.astype(vertices.dtype)
+
+    def forward(vertices: Any) -> tuple[Any, Any]:
+        shapes = jax.ShapeDtypeStruct((), vertices.dtype), jax.ShapeDtypeStruct(vertices.shape, vertices.dtype)
+        found: tuple[Any, Any] = jax.pure_callback(value_and_gradient, shapes, vertices)
+        return found
+
+    def backward(gradient: Any, slope: Any) -> tuple[Any]:
+        return (slope * gradient,)
+
+    @jax.custom_vjp
+    def function(vertices: Any) -> Any:
+        return jax.pure_callback(value, jax.ShapeDtypeStruct((), vertices.dtype), vertices)
+
+    function.defvjp(forward, backward)
+    result: Callable[[Any], Any] = function
+    return result
+
+
+def _missing(name: str, extra: str) -> InputError:
+    return InputError(f"{name} is not installed; the extra has it: pip install 'sobolev-batch[{extra}]'")
 
 
 def gradient(
@@ -225,14 +326,14 @@ class _Difference:
 
     Attributes:
         mesh: The mesh.
-        placed: The mesh on the lattice.
+        transform: Its transform.
         field: Field of the target.
         is_given: True if the field was given, with the error that it has.
         weights: Weights of the orders.
     """
 
     mesh: Mesh
-    placed: PlacedMesh
+    transform: MeshTransform
     field: xr.DataArray
     is_given: bool
     weights: SobolevWeights
@@ -253,13 +354,13 @@ class _Difference:
         else:
             field = fourier_transform(target, lattice, settings.eps, order=orders)
         own = Lattice.from_field(field)
-        placed = MeshTransform.from_mesh(mesh, own, settings, execution).at(np.asarray(mesh.vertices))
-        return cls(mesh, placed, field, is_given, SobolevWeights(own, orders))
+        transform = MeshTransform.from_mesh(mesh, own, settings, execution)
+        return cls(mesh, transform, field, is_given, SobolevWeights(own, orders))
 
     @cached_property
     def values(self) -> Complexes:
         """Difference on the half lattice."""
-        return self.placed.transform() - field_values(self.field)
+        return self.transform.transform(np.asarray(self.mesh.vertices)) - field_values(self.field)
 
     @cached_property
     def factors(self) -> Reals:
@@ -273,7 +374,10 @@ class _Difference:
 
     def gradients(self, factors: Reals) -> Reals:
         """Return the derivatives of these sums with respect to the vertices, (orders, n, 3)."""
-        return np.array([2 * self.placed.derivative(one * self.values) for one in factors])
+        return np.array([2 * self._derivative(one * self.values) for one in factors])
+
+    def _derivative(self, coefficients: Complexes) -> Reals:
+        return self.transform.derivative(np.asarray(self.mesh.vertices), coefficients)
 
     def errors(self, gradients: Reals) -> dict[str, Reals]:
         """Return the parts of the gradients' errors (orders,), besides quadrature and NUFFT."""
@@ -318,15 +422,15 @@ class _Difference:
         """Return the largest norm of the transform's derivative along movements of length 1, by power iteration."""
         vertices = np.asarray(self.mesh.vertices)
         step = _DIFFERENCE * self.mesh.edge_length_range[0]
-        movement = self.placed.derivative(factors * self.values)
+        movement = self._derivative(factors * self.values)
         largest = 0.0
         for _ in range(_POWER_STEPS):
             movement = movement / max(float(np.linalg.norm(movement)), np.finfo(np.float64).tiny)
             length = step / max(float(np.abs(movement).max()), np.finfo(np.float64).tiny)
-            ends = [self.placed.mesh.at(vertices + sign * length * movement).transform() for sign in (1, -1)]
+            ends = [self.transform.transform(vertices + sign * length * movement) for sign in (1, -1)]
             change = (ends[0] - ends[1]) / (2 * length)
             largest = max(largest, float(np.sqrt(np.sum(factors * np.abs(change) ** 2))))
-            movement = self.placed.derivative(factors * change)
+            movement = self._derivative(factors * change)
         return _POWER_CAUTION * largest
 
 

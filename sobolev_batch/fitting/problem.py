@@ -184,7 +184,7 @@ class FitProblem:
 
     def squares(self, vertices: Reals, orders: Sequence[float]) -> Reals:
         """Return the squared distances with vertices at some positions, (orders,), from coarse settings."""
-        difference = self._transform(vertices, TransformSettings(1e-4)).at(vertices).transform() - self.values
+        difference = self._transform(vertices, TransformSettings(1e-4)).transform(vertices) - self.values
         energies = difference.real**2 + difference.imag**2
         return np.array([float(np.sum(factors * energies)) for factors in self._factors(orders)])
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
@@ -32,6 +31,8 @@ _LAST_GROWTH = 1.15
 _STEPS_BETWEEN = 40
 MOST_TRIANGLES = 1_000_000
 
+Notify = Callable[[FitProgress], None]
+
 
 def refine(
     mesh: MeshLike,
@@ -44,7 +45,7 @@ def refine(
     smoothing: float = DEFAULT_SMOOTHING,
     keep_boundary: bool = False,
     threads: int | None = None,
-    notify: Callable[[FitProgress], None] | None = None,
+    notify: Notify | None = None,
 ) -> Fit:
     """Split edges of a mesh where that lowers its Sobolev distance from a target most, and move its vertices.
 
@@ -83,10 +84,10 @@ def refine(
     """
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    refinement = _Refinement(target, lattice, settings, Execution(threads=thread_count(threads)), triangles)
-    problem = refinement.first_problem(mesh)
+    make = _problems(target, lattice, settings, Execution(threads=thread_count(threads)))
+    problem = _first_problem(mesh, triangles, make)
     before = start_quality(problem)
-    refined = conclude(mesh, before, *refinement.run(problem, notify))
+    refined = conclude(mesh, before, *_refine(problem, triangles, make, notify))
     count = len(refined.mesh.triangles)
     if count >= triangles or refined.end == End.INTERRUPTED.value:
         return refined
@@ -101,89 +102,75 @@ def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSetti
         LatticeError: The mesh does not fit into the lattice of a field.
         InputError: See `refine`.
     """
-    refinement = _Refinement(target, None, settings, execution, triangles)
-    last, fitted = refinement.run(refinement.first_problem(mesh))
+    make = _problems(target, None, settings, execution)
+    last, fitted = _refine(_first_problem(mesh, triangles, make), triangles, make)
     return last.problem.given_mesh(fitted)
 
 
-@dataclass(frozen=True, eq=False)
-class _Refinement:
-    """Rounds of fits and splits.
+def _problems(
+    target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
+) -> Callable[[Mesh], FitProblem]:
+    """Return the function that makes the problem of a round from its mesh."""
+    return lambda mesh: FitProblem.for_target(mesh, target, lattice, settings, execution)
 
-    Attributes:
-        target: Target, as it was given.
-        lattice: Lattice, if one was given.
-        settings: Settings of the last fit.
-        execution: Threads.
-        triangles: Number of triangles to reach.
+
+def _first_problem(mesh: Mesh, goal: int, make: Callable[[Mesh], FitProblem]) -> FitProblem:
+    """Return the problem of the first round.
+
+    Raises:
+        InputError: See `refine`.
     """
+    count = len(mesh.triangles)
+    if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
+        raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
+    if count >= goal:
+        raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")
+    return make(welded(mesh)[0])
 
-    target: Operand
-    lattice: Lattice | None
-    settings: FitSettings
-    execution: Execution
-    triangles: int
 
-    def first_problem(self, mesh: Mesh) -> FitProblem:
-        """Return the problem of the first round.
+def _refine(
+    problem: FitProblem, triangles: int, make: Callable[[Mesh], FitProblem], notify: Notify | None = None
+) -> tuple[FitRun, Mesh]:
+    """Return the last run, with the steps of all rounds, and the prepared mesh at its end."""
+    settings = problem.settings
+    between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
+    goals, taken = _goals(len(problem.start.triangles), triangles), 0
+    total = between.steps * len(goals) + settings.steps
 
-        Raises:
-            InputError: See `refine`.
-        """
-        count, goal = len(mesh.triangles), self.triangles
-        if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
-            raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
-        if count >= goal:
-            raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")
-        return self._problem(welded(mesh)[0])
+    def count(progress: FitProgress) -> None:
+        if notify is not None:
+            notify(FitProgress(taken + progress.step, total, progress.relative))
 
-    def run(self, problem: FitProblem, notify: Callable[[FitProgress], None] | None = None) -> tuple[FitRun, Mesh]:
-        """Return the last run, with the steps of all rounds, and the prepared mesh at its end."""
-        between = replace(self.settings, steps=min(_STEPS_BETWEEN, self.settings.steps))
-        goals, taken = _goals(len(problem.start.triangles), self.triangles), 0
-        total = between.steps * len(goals) + self.settings.steps
-
-        def count(progress: FitProgress) -> None:
-            if notify is not None:
-                notify(FitProgress(taken + progress.step, total, progress.relative))
-
-        for goal in goals:
-            run = FitRun(replace(problem, settings=between), count)
-            fitted = run.finish()
-            taken += run.taken
-            run.taken = taken
-            if run.end is not End.INTERRUPTED:
-                try:
-                    problem = self._problem(self._split(problem.given_mesh(fitted), goal))
-                    continue
-                except KeyboardInterrupt:
-                    run.end = End.INTERRUPTED
-            return run, fitted
-        run = FitRun(problem, count)
+    for goal in (*goals, None):
+        run = FitRun(problem if goal is None else replace(problem, settings=between), count)
         fitted = run.finish()
-        run.taken += taken
-        return run, fitted
+        taken += run.taken
+        run.taken = taken
+        if goal is None or run.end is End.INTERRUPTED:
+            break
+        try:
+            problem = make(_split(problem.given_mesh(fitted), goal, make))
+        except KeyboardInterrupt:
+            run.end = End.INTERRUPTED
+            break
+    return run, fitted
 
-    def _problem(self, mesh: Mesh) -> FitProblem:
-        return FitProblem.for_target(mesh, self.target, self.lattice, self.settings, self.execution)
 
-    def _split(self, mesh: Mesh, triangles: int) -> Mesh:
-        """Return a fitted mesh with the edges split where that helps most."""
-        edges = Edges.from_mesh(mesh)
-        if triangles >= 4 * len(mesh.triangles):
-            return edges.split(np.ones(len(edges.ends), dtype=bool))
-        scores = edges.lengths * np.linalg.norm(self._derivatives(edges), axis=1)
-        if self.settings.keep_boundary:
-            scores[edges.on_boundary] = 0.0
-        return edges.split(edges.best(scores[edges.sides].sum(axis=1), triangles))
-
-    def _derivatives(self, edges: Edges) -> NDArray[np.float64]:
-        """Return the derivative with respect to a vertex at the middle of each edge, (e, 3)."""
-        problem = self._problem(edges.split(np.ones(len(edges.ends), dtype=bool)))
-        vertices = np.asarray(problem.start.vertices)
-        weights = problem.relative_to(vertices, self.settings.shares)
-        _, gradient = problem.objective(vertices, weights)[0](vertices)
-        return np.asarray(gradient[problem.place][len(edges.mesh.vertices) :])
+def _split(mesh: Mesh, triangles: int, make: Callable[[Mesh], FitProblem]) -> Mesh:
+    """Return a fitted mesh with the edges split where that helps most."""
+    edges = Edges.from_mesh(mesh)
+    everywhere = edges.split(np.ones(len(edges.ends), dtype=bool))
+    if triangles >= 4 * len(mesh.triangles):
+        return everywhere
+    problem = make(everywhere)
+    vertices = np.asarray(problem.start.vertices)
+    weights = problem.relative_to(vertices, problem.settings.shares)
+    _, gradient = problem.objective(vertices, weights)[0](vertices)
+    at_middles = gradient[problem.place][len(mesh.vertices) :]
+    scores = edges.lengths * np.linalg.norm(at_middles, axis=1)
+    if problem.settings.keep_boundary:
+        scores[edges.on_boundary] = 0.0
+    return edges.split(edges.best(scores[edges.sides].sum(axis=1), triangles))
 
 
 def largest_while_refining(count: int, triangles: int) -> int:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC
-from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -38,11 +36,13 @@ _VERSION = 2
 _STEP_SECONDS, _STEP_TRIANGLE_SECONDS = 0.01, 4e-5
 # Measured peak of a fit: its lattice, and for each triangle of the mesh and of the target.
 _LATTICE_BYTES, _TRIANGLE_BYTES, _TARGET_BYTES = 3e8, 2e3, 400.0
+# The last fits of this process, by the fingerprints of their members.
 _KEPT = 8
+_fits: dict[str, Mesh] = {}
 
 
-class TargetSource(NestedSource, ABC):
-    """A source of meshes that come nearer to a target.
+class FitSource(NestedSource):
+    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`.
 
     Distances are those in the unit ball of the target, as in a study that is scaled by its reference.
 
@@ -84,10 +84,6 @@ class TargetSource(NestedSource, ABC):
             )
         return single_member(self.target, folder)
 
-
-class FitSource(TargetSource):
-    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`."""
-
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each mesh to start from."""
         target, starts = self.target_member(folder), self.mesh.members(folder)
@@ -99,7 +95,7 @@ class FitSource(TargetSource):
         )
 
 
-class RefineSource(TargetSource):
+class RefineSource(FitSource):
     """Finer versions of one mesh, with edges split where that brings it nearer to a surface: see `refine`.
 
     Attributes:
@@ -134,15 +130,19 @@ class FittedMember(Member):
     triangles: int | None = None
 
     def load(self) -> Surface:
-        """Fit the mesh, or take it over from an earlier call in this process."""
-        return _fitted(_Request(self.fingerprint_digest(), self))
-
-    def fit(self) -> Mesh:
-        """Return the fitted mesh.
+        """Return the fitted mesh, that of an earlier call in this process if there is one.
 
         Raises:
             MeshError: A mesh or the target cannot be made, or the one cannot be fitted to the other.
         """
+        digest = self.fingerprint_digest()
+        fitted = _fits.get(digest) or self._fit()
+        _fits[digest] = fitted
+        if len(_fits) > _KEPT:
+            _fits.pop(next(iter(_fits)), None)
+        return fitted
+
+    def _fit(self) -> Mesh:
         start, target = load_mesh(self.start), self.target.load()
         similarity = Similarity.to_unit_ball(target)
         try:
@@ -180,16 +180,3 @@ class FittedMember(Member):
             max(start.projected_bytes, target.projected_bytes, own_bytes),
             start.seconds + target.seconds + step_seconds * self.settings.steps,
         )
-
-
-@dataclass(frozen=True)
-class _Request:
-    """A member, equal to others of the same fingerprint."""
-
-    digest: str
-    member: FittedMember = field(compare=False)
-
-
-@lru_cache(maxsize=_KEPT)
-def _fitted(request: _Request) -> Mesh:
-    return request.member.fit()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, vstack
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends import Backend, Complexes, NufftSpec
+from sobolev_batch.spectral.backends import Complexes, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import RuleAssignment, TriangleBatch, WeightedPoints
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
@@ -78,12 +78,12 @@ class MeshTransform:
         """Number n of vertices."""
         return int(self.of_vertices.shape[1])
 
-    def at(self, vertices: Reals) -> PlacedMesh:
-        """Return the mesh with its vertices at positions (n, 3), in units of length.
+    def nodes(self, vertices: Reals) -> WeightedPoints:
+        """Return the quadrature nodes with the vertices at positions (n, 3), in units of length.
 
         Raises:
             InputError: The positions are not finite or not (n, 3).
-            LatticeError: Quadrature nodes lie beyond the lattice's half period.
+            LatticeError: Nodes lie beyond the lattice's half period.
         """
         if vertices.shape != (self.count, 3):
             raise InputError(
@@ -94,59 +94,46 @@ class MeshTransform:
         if not np.isfinite(coordinates).all():
             raise InputError("positions of vertices must be finite: found NaN or infinity")
         require_points_inside(coordinates, self.lattice)
-        areas = _Areas(vertices, self.triangles)
-        return PlacedMesh(self, WeightedPoints(coordinates, self.of_areas @ areas.values), areas)
+        areas = np.linalg.norm(normals(vertices, self.triangles), axis=1) / 2
+        return WeightedPoints(coordinates, self.of_areas @ areas)
 
-
-@dataclass(frozen=True, eq=False)
-class PlacedMesh:
-    """A mesh with its vertices at given positions.
-
-    Attributes:
-        mesh: Transform of the mesh at any positions.
-        points: Quadrature nodes with their weights.
-        areas: Areas of the triangles.
-    """
-
-    mesh: MeshTransform
-    points: WeightedPoints
-    areas: _Areas
-
-    def transform(self) -> Complexes:
-        """Return the transform on the half lattice, complex128."""
-        lattice, backend = self.mesh.lattice, self._backend
-        spec = NufftSpec(lattice.shape, self.mesh.eps, threads=self.mesh.execution.threads)
-        points = WeightedPoints(backend.upload(self.points.coordinates), backend.upload(self.points.weights))
-        values, _ = transform_points([points], lattice, lattice.half, spec, backend)
+    def transform(self, vertices: Reals) -> Complexes:
+        """Return the transform on the half lattice, complex128; see `nodes` for the positions."""
+        nodes, backend = self.nodes(vertices), self.execution.backend
+        spec = NufftSpec(self.lattice.shape, self.eps, threads=self.execution.threads)
+        points = WeightedPoints(backend.upload(nodes.coordinates), backend.upload(nodes.weights))
+        values, _ = transform_points([points], self.lattice, self.lattice.half, spec, backend)
         return np.asarray(backend.download(values))
 
-    def derivative(self, coefficients: Complexes) -> Reals:
+    def derivative(self, vertices: Reals, coefficients: Complexes) -> Reals:
         """Return the derivative of Re Σ conj(c(ξ)) μ^(ξ) over the half lattice with respect to the vertices, (n, 3).
 
         It is that of the sum over quadrature nodes x_j with weights a_j, at any number of nodes. The function
         w(x) = Re Σ c(ξ) exp(+2πi ξ·x) and its gradient at the nodes give Σ_j (w(x_j) da_j + a_j ∇w(x_j) · dx_j).
 
         Args:
+            vertices: Positions (n, 3).
             coefficients: c, complex128 on the half lattice.
         """
-        values, slopes = self._evaluated(coefficients)
-        gradient = self.mesh.of_vertices.T @ (self.points.weights[:, None] * slopes)
-        return np.asarray(gradient + self.areas.pulled_back(self.mesh.of_areas.T @ values, self.mesh.count))
+        nodes = self.nodes(vertices)
+        values, slopes = self._evaluated(nodes, coefficients)
+        gradient = self.of_vertices.T @ (nodes.weights[:, None] * slopes)
+        return np.asarray(gradient + self._from_areas(vertices, self.of_areas.T @ values))
 
-    def _evaluated(self, coefficients: Complexes) -> tuple[Reals, Reals]:
+    def _evaluated(self, nodes: WeightedPoints, coefficients: Complexes) -> tuple[Reals, Reals]:
         """Return the function of the coefficients (k,) and its gradient (k, 3) at the nodes.
 
         Each NUFFT gives two real functions, as real and imaginary part: the coefficients of f + i g on the whole
         lattice are F + i G with those of f and g.
         """
-        lattice, backend, eps = self.mesh.lattice, self._backend, self.mesh.eps
-        most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * eps)
+        lattice, backend = self.lattice, self.execution.backend
+        most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * self.eps)
         middle, axis = lattice.M // 2, 2 * np.pi * lattice.spacing * np.arange(-most, most + 1)
         inner = slice(middle - most, middle + most + 1)
         whole = _whole(coefficients[inner, inner, : most + 1])
         x, y, z = np.ix_(axis, axis, axis)
-        spec = NufftSpec(whole.shape, eps, threads=self.mesh.execution.threads)
-        points = self.points.coordinates
+        spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
+        points = nodes.coordinates
         plan = backend.evaluation_plan(backend.costs.with_oversampling(spec, points.shape[1]))
         # setpts keeps references, not copies: the angles live until both functions are evaluated.
         angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
@@ -155,9 +142,23 @@ class PlacedMesh:
         first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
         return first.real, np.stack([first.imag, second.real, second.imag], axis=1)
 
-    @property
-    def _backend(self) -> Backend:
-        return self.mesh.execution.backend
+    def _from_areas(self, vertices: Reals, slopes: Reals) -> Reals:
+        """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (n, 3)."""
+        directions = normals(vertices, self.triangles)
+        # At a triangle without an area, the area has no derivative; take zero.
+        directions /= np.maximum(np.linalg.norm(directions, axis=1), np.finfo(np.float64).tiny)[:, None]
+        corners, gradient = [vertices[corner] for corner in self.triangles.T], np.zeros((self.count, 3))
+        for corner in range(3):
+            terms = slopes[:, None] * np.cross(directions, corners[corner - 1] - corners[corner - 2]) / 2
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(self.triangles[:, corner], terms[:, axis], self.count)
+        return gradient
+
+
+def normals(vertices: Reals, triangles: Indices) -> Reals:
+    """Return the normals of triangles (m, 3), each as long as twice its area."""
+    a, b, c = (vertices[corner] for corner in triangles.T)
+    return np.asarray(np.cross(b - a, c - a))
 
 
 def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:
@@ -184,30 +185,6 @@ def _whole(half: Complexes) -> Complexes:
     """Return the coefficients of a real function on the whole lattice, from those on its half that count twice."""
     inner = half[:, :, 1:] / 2
     return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
-
-
-class _Areas:
-    """Areas of triangles, and their derivative."""
-
-    def __init__(self, vertices: Reals, triangles: NDArray[np.int64]) -> None:
-        self.triangles = triangles
-        self.corners = [vertices[corner] for corner in triangles.T]
-        a, b, c = self.corners
-        normals = np.cross(b - a, c - a)
-        lengths = np.linalg.norm(normals, axis=1)
-        self.values: Reals = lengths / 2
-        # At a triangle without an area, the area has no derivative; take zero.
-        self.normals: Reals = normals / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
-
-    def pulled_back(self, slopes: Reals, count: int) -> Reals:
-        """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (count, 3)."""
-        gradient = np.zeros((count, 3))
-        for corner in range(3):
-            opposite = self.corners[corner - 1] - self.corners[corner - 2]
-            terms = slopes[:, None] * np.cross(self.normals, opposite) / 2
-            for axis in range(3):
-                gradient[:, axis] += np.bincount(self.triangles[:, corner], terms[:, axis], count)
-        return gradient
 
 
 def _node_matrices(mesh: Mesh, batch: TriangleBatch) -> tuple[csr_array, csr_array]:

@@ -15,7 +15,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.fitting import fit as module
-from sobolev_batch.fitting.descent import End, Smoothing, descend
+from sobolev_batch.fitting.descent import Descent, End, Smoothing
 
 
 def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:
@@ -223,7 +223,8 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
 
     objective: Any = Drawn()
     smoothing = Smoothing.from_mesh(sb.Mesh(fan, triangles), np.arange(7), 0.0)
-    found = descend(objective, fan, smoothing, 20, 0.0, 1.0, lambda vertices, value: None)
+    found = Descent(objective, fan, smoothing, 0.0, 1.0, lambda vertices, value: None)
+    found.run(20)
     assert found.end is End.TURNED
     assert found.vertices[0, 0] < 1
     a, b, c = (found.vertices[corner] for corner in triangles.T)

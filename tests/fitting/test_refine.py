@@ -70,7 +70,7 @@ def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> No
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module._Refinement, "_derivatives", interrupted)
+    monkeypatch.setattr(module, "_split", interrupted)
     found = sb.refine(start, target, -4.0, triangles=70, steps=5)
     assert found.end == "it was interrupted"
     assert len(found.mesh.triangles) == 20

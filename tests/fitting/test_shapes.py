@@ -6,39 +6,47 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.descent import ShapePenalty, Smoothing, smallest_angle
+from sobolev_batch.fitting.descent import (
+    Smoothing,
+    lowest_free_qualities,
+    shape_penalty,
+    smallest_angle,
+    triangle_qualities,
+)
+
+TRIANGLE = np.array([[0, 1, 2]])
 
 
 def test_shapes_that_hardly_change_cost_nothing() -> None:
     ball, rng = sb.icosphere(2), np.random.default_rng(0)
-    penalty = ShapePenalty.from_shapes(np.array(ball.vertices), ball.triangles)
-    value, gradient = penalty.value_and_gradient(ball.vertices + 0.01 * rng.normal(size=ball.vertices.shape))
+    references = lowest_free_qualities(np.array(ball.vertices), ball.triangles)
+    vertices = ball.vertices + 0.01 * rng.normal(size=ball.vertices.shape)
+    value, gradient = shape_penalty(vertices, ball.triangles, references)
     assert value == 0
     assert not gradient.any()
 
 
 def test_triangles_that_were_bad_before_may_stay_so() -> None:
     sliver = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0]])
-    penalty = ShapePenalty.from_shapes(sliver, np.array([[0, 1, 2]]))
-    assert penalty.value_and_gradient(sliver)[0] == 0
-    assert penalty.value_and_gradient(sliver * [1, 0.25, 1])[0] == pytest.approx(0.25, rel=1e-3)
+    references = lowest_free_qualities(sliver, TRIANGLE)
+    assert shape_penalty(sliver, TRIANGLE, references)[0] == 0
+    assert shape_penalty(sliver * [1, 0.25, 1], TRIANGLE, references)[0] == pytest.approx(0.25, rel=1e-3)
 
 
-def test_the_penalty_grows_to_one_for_a_triangle_without_an_area() -> None:
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.8, 0]])
-    penalty = ShapePenalty.from_shapes(corners, np.array([[0, 1, 2]]))
-    values = [penalty.value_and_gradient(corners * [1, factor, 1])[0] for factor in (0.3, 0.2, 0.1, 1e-9)]
-    assert values == sorted(values)
-    assert values[-1] == pytest.approx(1.0, abs=1e-6)
+@pytest.mark.parametrize(("height", "quality"), [(np.sqrt(0.75), 1.0), (0.5, 0.5 * np.sqrt(3)), (0.0, 0.0)])
+def test_the_quality_of_a_triangle_and_its_penalty(height: float, quality: float) -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, height, 0]])
+    assert triangle_qualities(corners, TRIANGLE) == pytest.approx([quality], abs=1e-12)
+    assert shape_penalty(corners, TRIANGLE, np.ones(1))[0] == pytest.approx((1 - quality) ** 2, abs=1e-12)
 
 
 def test_its_derivative_is_that_of_differences() -> None:
     ball, rng, step = sb.icosphere(1), np.random.default_rng(1), 1e-6
-    penalty = ShapePenalty.from_shapes(np.array(ball.vertices), ball.triangles)
+    references = lowest_free_qualities(np.array(ball.vertices), ball.triangles)
     vertices = ball.vertices + 0.3 * rng.normal(size=ball.vertices.shape)
     direction = rng.normal(size=vertices.shape)
-    value, gradient = penalty.value_and_gradient(vertices)
-    ends = [penalty.value_and_gradient(vertices + sign * step * direction)[0] for sign in (1, -1)]
+    value, gradient = shape_penalty(vertices, ball.triangles, references)
+    ends = [shape_penalty(vertices + sign * step * direction, ball.triangles, references)[0] for sign in (1, -1)]
     assert value > 0.1
     assert np.sum(gradient * direction) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
 
