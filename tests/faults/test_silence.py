@@ -142,6 +142,6 @@ def test_a_patience_that_is_too_short(seconds: float, study: Study, store_path: 
 
 
 def test_a_silence_counts_only_what_was_heard_missing() -> None:
-    silence = watch._Silence(1.0).lasting(1.0, 5.0).lasting(1.0, 2.5)
-    assert silence.seconds == 7.5
-    assert silence.lasting(2.0, 100.0).seconds == 0.0
+    silence = watch._silence(1.0, watch._silence(1.0, watch._silence(1.0), 5.0), 2.5)
+    assert silence[2] == 7.5
+    assert watch._silence(2.0, silence, 100.0)[2] == 0.0

@@ -50,7 +50,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
         memory: Memory of each, in bytes or as a text such as "4GB"; by default the machine's, divided equally.
 
     Raises:
-        InputError: The memory is not a size, too little for a worker, or more than there is for all of them.
+        InputError: See `memory_limit`.
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.
@@ -105,11 +105,10 @@ def _ending_at_once(cluster: LocalCluster) -> Iterator[None]:
 
 @contextmanager
 def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
-    """Keep Ctrl-C from processes that are started from now on, or by threads that are.
+    """Keep Ctrl-C from processes that are started from now on, until the yielded function is called.
 
-    A terminal sends it to all processes at once. It is the driver that ends, and its cluster with it;
-    workers that are interrupted themselves only print where they were. What the signal mask of a thread
-    blocks is blocked in everything that it starts. Calling the yielded function restores the caller's own.
+    A terminal sends it to all processes at once. The driver ends, and its cluster with it; workers would only print
+    where they were. What the signal mask of a thread blocks is blocked in everything that it starts.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield lambda: None

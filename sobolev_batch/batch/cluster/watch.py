@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 from uuid import uuid4
@@ -32,25 +31,10 @@ _POLL_SECONDS = 5.0
 _RESTART_SECONDS = 15.0
 _MOST_NAMED = 4
 
-
-@dataclass(frozen=True)
-class _Silence:
-    """Time for which a process has said nothing, while this process was looking.
-
-    Attributes:
-        heard: When it was last heard of. It is compared with nothing else: clocks differ, and this process may itself
-            be stopped for a while, in which it hears nobody.
-        since: Time at which the silence was noticed; now unless given.
-        seconds: Seconds that it has lasted since.
-    """
-
-    heard: object
-    since: str = field(default_factory=lambda: f"{datetime.now(UTC):%H:%M:%S} UTC")
-    seconds: float = 0.0
-
-    def lasting(self, heard: object, elapsed: float) -> _Silence:
-        """Return the silence after some time, which ends it if the process was heard of since."""
-        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else _Silence(heard)
+# When a process was last heard of, the time from which on it has said nothing, and the seconds since. The first is
+# compared with nothing else: clocks differ, and this process may itself be stopped for a while, in which it hears
+# nobody.
+_Silence = tuple[object, str, float]
 
 
 class Watch:
@@ -71,7 +55,7 @@ class Watch:
         self._client, self._needs_gpu, self._give_up_after = client, needs_gpu, give_up_after
         self._address = str(client.scheduler.address)
         self._workers: dict[str, _Silence] = {}
-        self._scheduler = _Silence(None)
+        self._scheduler = _silence(None)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._look_out, name="sobolev-batch-watch", daemon=True)
 
@@ -98,7 +82,7 @@ class Watch:
 
     @property
     def _has_lost_scheduler(self) -> bool:
-        return self._scheduler.seconds > self._give_up_after
+        return self._scheduler[2] > self._give_up_after
 
     def _look_out(self) -> None:
         before = time.monotonic()
@@ -119,20 +103,20 @@ class Watch:
         try:
             workers = self._ask("identity", n_workers=-1)["workers"]
         except TimeoutError:
-            self._scheduler = self._scheduler.lasting(None, elapsed)
+            self._scheduler = _silence(None, self._scheduler, elapsed)
             if self._has_lost_scheduler:
                 # What waits for its answer wakes up, as if it had ended.
                 self._client.loop.add_callback(self._hang_up)
-            return self._silent_scheduler() if self._scheduler.seconds > _TELL_AFTER_SECONDS else ""
-        self._scheduler = _Silence(None)
+            return self._silent_scheduler() if self._scheduler[2] > _TELL_AFTER_SECONDS else ""
+        self._scheduler = _silence(None)
         self._workers = {
-            address: self._workers.get(address, _Silence(None)).lasting(worker["last_seen"], elapsed)
+            address: _silence(worker["last_seen"], self._workers.get(address), elapsed)
             for address, worker in workers.items()
         }
-        for address, silence in self._workers.items():
-            if silence.seconds > self._give_up_after:
-                self._give_up(address, silence)
-        silent = {name: one for name, one in self._workers.items() if one.seconds > _TELL_AFTER_SECONDS}
+        for address, (_, since, seconds) in self._workers.items():
+            if seconds > self._give_up_after:
+                self._give_up(address, since)
+        silent = {name: since for name, (_, since, seconds) in self._workers.items() if seconds > _TELL_AFTER_SECONDS}
         if silent:
             return self._silent_workers(silent)
         if not workers:
@@ -141,14 +125,14 @@ class Watch:
             return "no worker with a GPU is left, and the study requests one; waiting for one to start"
         return ""
 
-    def _silent_workers(self, silences: Mapping[str, _Silence]) -> str:
+    def _silent_workers(self, silences: Mapping[str, str]) -> str:
         tasks = self._ask("processing", workers=list(silences))
         told = []
-        for address, silence in list(silences.items())[:_MOST_NAMED]:
+        for address, since in list(silences.items())[:_MOST_NAMED]:
             labels = list(dict.fromkeys(_label_of(key) for key in tasks.get(address, ())))
             more = f" and {len(labels) - _MOST_NAMED} more" if len(labels) > _MOST_NAMED else ""
             held = f", and has {', '.join(labels[:_MOST_NAMED])}{more}" if labels else ""
-            told.append(f"the worker {address} has said nothing since {silence.since}{held}")
+            told.append(f"the worker {address} has said nothing since {since}{held}")
         if len(silences) > _MOST_NAMED:
             told.append(f"and {len(silences) - _MOST_NAMED} more workers have")
         return (
@@ -157,15 +141,12 @@ class Watch:
         )
 
     def _silent_scheduler(self) -> str:
-        return f"the scheduler at {self._address} has said nothing since {self._scheduler.since}"
+        return f"the scheduler at {self._address} has said nothing since {self._scheduler[1]}"
 
-    def _give_up(self, address: str, silence: _Silence) -> None:
+    def _give_up(self, address: str, since: str) -> None:
         """Have a worker started again by its nanny, or forgotten; its tasks go to others."""
-        _log.warning(
-            "the worker %s has said nothing since %s and is given up; its tasks are given to others",
-            address,
-            silence.since,
-        )
+        message = "the worker %s has said nothing since %s and is given up; its tasks are given to others"
+        _log.warning(message, address, since)
         reason = f"sobolev-batch-silent-{uuid4().hex}"
         try:
             self._ask(
@@ -206,6 +187,13 @@ def require_give_up_after(seconds: float) -> float:
             "says nothing for some seconds now and then"
         )
     return seconds
+
+
+def _silence(heard: object, before: _Silence | None = None, elapsed: float = 0.0) -> _Silence:
+    """Return the silence of a process after some time; it ends if the process was heard of since."""
+    if before is not None and before[0] == heard:
+        return heard, before[1], before[2] + elapsed
+    return heard, f"{datetime.now(UTC):%H:%M:%S} UTC", 0.0
 
 
 def _label_of(key: object) -> str:

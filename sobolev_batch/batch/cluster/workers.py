@@ -1,5 +1,7 @@
 """The workers of a cluster: the memory and the backend of each, found once when it starts and used by all its tasks.
 
+A worker with a GPU has it for itself on its host.
+
 Before a study begins, all processes must have the same versions and see the same store.
 """
 
@@ -7,15 +9,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterable, Mapping
+import os
+import socket
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Lock as ThreadLock
 from typing import Any
 
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
-from sobolev_batch.batch.cluster.gpus import lock_gpu, release_gpu, visible_devices
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
@@ -24,7 +30,7 @@ from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreEr
 from sobolev_batch.machine import MachineMemory
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends import CPU, Backend, gpu_backend
+from sobolev_batch.spectral.backends import CPU, INSTALL, Backend, gpu_backend
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, slowness
 from sobolev_batch.visible import make_messages_visible
 
@@ -40,6 +46,12 @@ _ALLOWED_FRACTION, _IDLE_BYTES = 0.85, 300e6
 _MOST_NAMED = 4
 _NAME = "sobolev-batch"
 _SETUP_SECONDS = 0.05
+
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
+# The device of this process and its lock. It has one at most, since CUDA settles on the devices that it sees at its
+# start.
+_own: dict[str, socket.socket] = {}
+_locking = ThreadLock()
 
 _OF_DASK = ("dask", "distributed")
 _OF_NUMBERS = (
@@ -284,26 +296,33 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None
     Raises:
         ClusterError: They differ; the message names the processes and both versions.
     """
-    required = (*_OF_DASK, *_OF_NUMBERS, *libraries)
+    required = ("python", *_OF_DASK, *_OF_NUMBERS, *libraries)
     # Dask answers this itself: code of ours would not run where the package is missing.
-    answers = client.get_versions(packages=[*required, *_OF_EXTRAS])
-    ours = _packages(answers["client"])
-    differences = _differences(
-        ours, {f"scheduler {client.scheduler.address}": _packages(answers["scheduler"])}, _OF_DASK
-    )
-    # A worker that is just leaving answers nothing.
-    workers = {f"worker {address}": _packages(answer) for address, answer in answers["workers"].items() if answer}
-    differences += _differences(ours, workers, ("python", *required))
-    for name in filter(ours.get, _OF_EXTRAS):
-        differences += _differences(ours, {who: found for who, found in workers.items() if found[name]}, [name])
-    if not differences:
-        # One checkout may follow another without a new version.
-        replies = client.run(_checkout, on_error="return")
-        workers = {f"worker {address}": reply for address, reply in replies.items() if isinstance(reply, dict)}
-        differences = _differences(_checkout(), workers, _checkout())
-    if differences:
+    answers = client.get_versions(packages=[*required[1:], *_OF_EXTRAS])
+    # One checkout may follow another without a new version.
+    checkouts = client.run(_checkout, on_error="return")
+    ours = _packages(answers["client"]) | _checkout()
+    scheduler = _packages(answers["scheduler"])
+    processes = {f"scheduler {client.scheduler.address}": {name: scheduler[name] for name in _OF_DASK}}
+    for address, answer in answers["workers"].items():
+        if answer:  # a worker that is just leaving answers nothing
+            found, checkout = _packages(answer), checkouts.get(address)
+            names = (*required, *(name for name in _OF_EXTRAS if ours[name] and found[name]))
+            theirs = {name: found[name] for name in names}
+            processes[f"worker {address}"] = theirs | (checkout if isinstance(checkout, dict) else {})
+    differing = defaultdict(list)
+    for process in sorted(processes):
+        for name, version in processes[process].items():
+            if version != ours[name]:
+                differing[name, version].append(process)
+    if differing:
+        differences = (
+            f"{name} {version or 'is missing'} at the {who[0]}{f' and {len(who) - 1} more' if who[1:] else ''}, "
+            f"{f'{ours[name]} here' if ours[name] else 'there is none here'}"
+            for (name, version), who in differing.items()
+        )
         raise ClusterError(
-            f"versions differ, and results would mix what they compute: {'; '.join(dict.fromkeys(differences))}. "
+            f"versions differ, and results would mix what they compute: {'; '.join(differences)}. "
             "Install the same ones everywhere and start those processes again"
         )
 
@@ -317,16 +336,88 @@ def _checkout() -> dict[str, str]:
     return {"numerics of sobolev-batch": str(NUMERICS_VERSION), "schema of sobolev-batch": str(SCHEMA_VERSION)}
 
 
-def _differences(ours: Mapping[str, str], theirs: Mapping[str, Mapping[str, str]], names: Iterable[str]) -> list[str]:
-    """Describe each version other than ours, and who has it."""
-    described = []
-    for name in names:
-        for version in sorted({versions[name] for versions in theirs.values()} - {ours[name]}):
-            first, *others = sorted(who for who, versions in theirs.items() if versions[name] == version)
-            more = f" and {len(others)} more" if others else ""
-            here = f"{ours[name]} here" if ours[name] else "there is none here"
-            described.append(f"{name} {version or 'is missing'} at the {first}{more}, {here}")
-    return described
+def lock_gpu(devices: Sequence[str]) -> str | None:
+    """Lock the first device that no other process of this host has, and make it the only visible one.
+
+    The device belongs to this process until it ends or releases it. The lock is a socket bound to a name that Linux
+    keeps in memory: it is exclusive, needs no permissions, leaves no file, and ends with the process however that ends.
+    Containers share it if they share the network of the host. A file would not serve others better, since they have
+    temporary folders of their own.
+
+    Args:
+        devices: UUIDs of the devices.
+
+    Returns:
+        UUID of the device, or None where all are locked or this process has one already.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    with _locking:
+        for device in () if _own else devices:
+            name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                name.bind(f"\0sobolev-batch/{device}")
+            except OSError:
+                name.close()
+                continue
+            _own[device] = name
+            os.environ[_VISIBLE] = device
+            return device
+    return None
+
+
+def release_gpu(device: str) -> None:
+    """Let another process have a device that this process has locked."""
+    _own.pop(device).close()
+
+
+def visible_devices() -> tuple[str, ...]:
+    """Return the UUIDs of the GPUs that this process may use: those of CUDA_VISIBLE_DEVICES, or all of the host.
+
+    CUDA itself is not started: it would settle on its devices for good.
+
+    Raises:
+        BackendError: The host has none, or they cannot be listed.
+    """
+    try:
+        import pynvml
+    except ImportError as error:
+        raise BackendError(f"no GPU: nvidia-ml-py, which lists them, is not installed: {INSTALL}") from error
+    try:
+        pynvml.nvmlInit()
+        count = pynvml.nvmlDeviceGetCount()
+        uuids = [str(pynvml.nvmlDeviceGetUUID(pynvml.nvmlDeviceGetHandleByIndex(i))) for i in range(count)]
+    except pynvml.NVMLError_LibraryNotFound as error:
+        raise BackendError("no GPU: the NVIDIA driver is not installed on this machine") from error
+    except pynvml.NVMLError as error:
+        raise BackendError(f"no GPU: the NVIDIA driver says: {error}") from error
+    visible = os.environ.get(_VISIBLE)
+    devices = tuple(uuids) if visible is None else chosen_devices(visible, uuids)
+    if not devices:
+        reason = f"CUDA_VISIBLE_DEVICES={visible} hides all {count}" if count else "the NVIDIA driver sees none"
+        raise BackendError(f"no GPU: {reason}")
+    return devices
+
+
+def chosen_devices(visible: str, uuids: Sequence[str]) -> tuple[str, ...]:
+    """Return the devices that a value of CUDA_VISIBLE_DEVICES names, up to the first entry that is no device.
+
+    Args:
+        visible: Indices, UUIDs or unique beginnings of them, or names of MIG instances, separated by commas.
+        uuids: UUIDs of the host's devices, in the order of their indices.
+    """
+    chosen: list[str] = []
+    for entry in map(str.strip, visible.split(",")):
+        if entry.isdecimal() and int(entry) < len(uuids):
+            chosen.append(uuids[int(entry)])
+        elif entry.startswith("MIG-"):
+            chosen.append(entry)
+        else:
+            matching = [uuid for uuid in uuids if entry and uuid.startswith(entry)]
+            if len(matching) != 1:
+                break
+            chosen += matching
+    return tuple(dict.fromkeys(chosen))
 
 
 def require_store_access(client: Client, location: Location, lock: Lock) -> None:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from sobolev_batch import BackendError
-from sobolev_batch.batch.cluster.gpus import chosen_devices, lock_gpu, release_gpu, visible_devices
+from sobolev_batch.batch.cluster.workers import chosen_devices, lock_gpu, release_gpu, visible_devices
 
 HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 
@@ -86,7 +86,7 @@ def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 WORKER = """
 import os, sys
-from sobolev_batch.batch.cluster.gpus import lock_gpu
+from sobolev_batch.batch.cluster.workers import lock_gpu
 print(lock_gpu(sys.argv[1:]), os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
 sys.stdin.read()
 """
