@@ -133,7 +133,7 @@ def test_the_smallest_mesh_below_a_bound(folder: Path) -> None:
 def test_plot_draws_every_picture(folder: Path) -> None:
     options = ("--format", "svg,png", "--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
     done = call("plot", STORE, "--output", "pictures", "--witness", "ico/1", *options, folder=folder)
-    names = ["convergence", "transform", "matrix", "map", "spectrum", "energy"]
+    names = ["convergence", "matrix", "map", "spectrum", "energy"]
     if obstacle() is None:
         assert (done.returncode, done.stderr) == (0, "")
         names += ["witness-0001-ico-1", "witness"]
@@ -293,6 +293,7 @@ MISUSED = [
     (f"table {STORE} --format xml", "xml"),
     (f"table {STORE} --order -3;-10", "'-3;-10' is neither a number nor a list of numbers"),
     (f"table {STORE} --below 1% --matrix", "--matrix, --over-time and --below"),
+    (f"table {STORE} --factor 3", "--factor belongs to --over-time"),
     (f"plot {STORE} --format png,gif", "'gif' is none of png, svg, pdf"),
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),

@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -15,9 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import sobolev_batch as sb
+from sobolev_batch.results.figures.drawing import PLOTS
 from sobolev_batch.results.figures.plots import write_plots
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.style import Plot, drawing, parse_size, set_log_scale, style_of
+from sobolev_batch.results.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 
 DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
 
@@ -55,15 +57,6 @@ def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> N
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
-@pytest.mark.slow
-def test_pictures_are_written_and_refused_places_named(tree: xr.DataTree, tmp_path: Path) -> None:
-    for path in write_plots(Selection.from_store(tree), tmp_path / "new" / "folder")[0]:
-        assert path.read_bytes().startswith(b"\x89PNG")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(sb.StoreError, match="pictures cannot be written there"):
-        write_plots(Selection.from_store(tree), tmp_path / "file")
-
-
 @pytest.mark.process
 def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTree) -> None:
     axes = Figure().subplots()
@@ -81,6 +74,8 @@ def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
         sb.plot(tree, "transform")
     with pytest.raises(sb.InputError, match="the study has no family 'g\\*', only f_1, reference"):
         sb.plot(tree, family="g*")
+    with pytest.raises(sb.InputError, match="no size of meshes is named 'weight'; known are edge_length, triangles"):
+        sb.plot(tree, x="weight")
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
     alone = xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest})
     for kind in ("matrix", "map"):
@@ -137,18 +132,80 @@ def test_vector_formats_keep_text_and_no_dates(tree: xr.DataTree, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_the_size_is_that_of_a_panel(tree: xr.DataTree, tmp_path: Path) -> None:
-    (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path, size=parse_size("3x2in"))
+def test_the_size_is_that_of_a_panel_and_refused_places_are_named(tree: xr.DataTree, tmp_path: Path) -> None:
+    (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path / "new" / "folder", size=parse_size("3x2in"))
     # The header of a PNG: two panels of 300 dots per inch.
     assert struct.unpack(">II", path.read_bytes()[16:24]) == (900, 1200)
+    with pytest.raises(sb.StoreError, match="pictures cannot be written there"):
+        write_plots(Selection.from_store(tree), path)
 
 
-@pytest.mark.parametrize("text", ["8.4x6cm", "84x60mm", "84 × 60 mm"])
-def test_sizes_in_other_units(text: str) -> None:
-    assert parse_size(text) == pytest.approx((8.4 / 2.54, 6 / 2.54))
+def test_sizes() -> None:
+    for text in ("8.4x6cm", "84x60mm", "84 × 60 mm"):
+        assert parse_size(text) == pytest.approx((8.4 / 2.54, 6 / 2.54))
+    for text in ("6", "6x", "6x4m", "axb", "1.2.3x4", "100x100", "0x4", "5x5mm"):
+        with pytest.raises(sb.InputError, match=r"size|inches"):
+            parse_size(text)
 
 
-@pytest.mark.parametrize("text", ["6", "6x", "6x4m", "axb", "1.2.3x4", "100x100", "0x4", "5x5mm"])
-def test_wrong_sizes(text: str) -> None:
-    with pytest.raises(sb.InputError, match=r"size|inches"):
-        parse_size(text)
+def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTree) -> None:
+    axes = sb.plot(tree)
+    assert axes.get_title() == "order -10\nnot drawn: 1 not computed"
+    assert sb.plot(tree, "convergence", -2.5).get_title().startswith("order -2.5\n")
+    labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+    assert labels == ["f_1", "slope 2"]
+    data = axes.lines[0].get_xydata()
+    assert np.allclose(data, [[0.1, 0.025], [0.2, 0.1]])
+    slope = np.asarray(axes.lines[1].get_xydata())
+    assert np.log(slope[1, 1] / slope[0, 1]) / np.log(2) == pytest.approx(2.0)
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+
+
+@pytest.mark.parametrize(
+    ("x", "places", "label", "slope"),
+    [
+        ("triangles", [1280, 20], "number of triangles", -1),
+        ("vertices", [642, 12], "number of vertices", -1),
+        ("seconds", [2.0, 0.25], "computing time of the mesh in seconds", None),
+    ],
+)
+def test_other_horizontal_axes(
+    tree: xr.DataTree,
+    x: Literal["triangles", "vertices", "seconds"],
+    places: list[float],
+    label: str,
+    slope: int | None,
+) -> None:
+    axes = sb.plot(tree, x=x)
+    assert axes.get_xlabel() == label
+    family, *others = axes.lines
+    assert np.asarray(family.get_xdata()).tolist() == places
+    assert [line.get_label() for line in others] == ([] if slope is None else [f"slope {slope}"])
+    for line in others:
+        ends = np.log(np.asarray(line.get_xydata()))
+        assert np.diff(ends[:, 1]) / np.diff(ends[:, 0]) == pytest.approx(slope)
+
+
+def changed(tree: xr.DataTree, **values: list[float]) -> xr.DataTree:
+    """The same, with other numbers of the meshes at all orders."""
+    dataset = tree["convergence"].to_dataset()
+    columns = {name: (("mesh", "order"), np.repeat(np.array(column)[:, None], 2, 1)) for name, column in values.items()}
+    return xr.DataTree.from_dict({**tree.to_dict(), "/convergence": dataset.assign(columns)})
+
+
+def test_distances_below_their_errors_are_hollow_and_stretch_no_axis(tree: xr.DataTree) -> None:
+    unsure = changed(tree, relative_error=[1e-3, 0.2, np.nan, 0.0], resolved=[1, 0, 0, 1])
+    axes = sb.plot(unsure)
+    assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == ["f_1", "slope 2", "not above its error"]
+    hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and np.size(line.get_xydata())]
+    assert [np.asarray(line.get_xydata()).tolist() for line in hollow] == [[[0.1, 0.025]]]
+    assert axes.get_ylim()[0] > 0.025 / 10
+    assert axes.get_ylim()[1] > 0.225
+
+
+def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
+    figure = PLOTS["convergence"].figure(Selection.from_store(changed(tree, relative=[0.0, 0.0, np.nan, 0.0])))
+    assert notes_of(figure) == ["not drawn: 1 not computed, 2 equal to the reference", "families not drawn: f_1"]
+    assert [axes.get_title().split("\n")[0] for axes in figure.axes] == ["order -10", "order -2.5"]
+    nameless = sb.plot(tree, x="triangles", family="f?1")
+    assert "families" not in nameless.get_title()

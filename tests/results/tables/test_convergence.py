@@ -8,8 +8,8 @@ import re
 import pytest
 import xarray as xr
 
-from sobolev_batch import InputError, table
-from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch import InputError, smallest_below, table
+from sobolev_batch.results.tables.convergence import format_smallest, format_table, format_tables
 
 
 def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
@@ -68,10 +68,6 @@ def test_programs_get_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) ->
     assert lines[3].endswith(",,,,,False,False")
 
 
-def test_latex_escapes_labels(tree: xr.DataTree) -> None:
-    assert r"f\_1/0" in format_table(tree, "latex")
-
-
 def test_frame_is_long_and_leaves_the_reference_out(tree: xr.DataTree) -> None:
     frame = table(tree)
     assert len(frame) == 6
@@ -103,3 +99,58 @@ def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataT
         assert r"f\_1/1" if style == "latex" else "f_1/1" in table_of_both
     first, second = json.loads(format_table(near, "json"))[:2]
     assert (first["hausdorff"], first["chamfer"], second["hausdorff"]) == (0.25, 0.125, None)
+
+
+def test_notes_are_those_of_all_objects(tree: xr.DataTree, near: xr.DataTree) -> None:
+    precise = tree.copy()
+    precise["convergence"].attrs["rtol"] = 0.02
+    for objects in ({"a": near, "b": precise}, {"b": precise, "a": near}):
+        text = format_tables(objects, x="triangles")
+        assert re.findall(r"^Object (.)$", text, re.MULTILINE) == list(objects)
+        assert "Hausdorff is a lower bound" in text
+        assert "an error of at most 0.02" in text
+        # Failures follow the table of their own object.
+        a, b = (text.index(f"Object {name}") for name in "ab")
+        assert text.index("f_1/1 has no proximity") > a
+        assert (text.index("f_1/1 has no proximity") < b) == (a < b)
+
+
+def smallest(tree: xr.DataTree, below: float | str, order: float = -10.0) -> dict[str, object]:
+    frame = smallest_below(tree, below, order)
+    assert len(frame) == 1
+    row: dict[str, object] = frame.iloc[0].to_dict()
+    return row
+
+
+def test_the_fewest_triangles_win(tree: xr.DataTree) -> None:
+    """Meshes of 20 and 1,280 triangles at 10 % and 2.5 %."""
+    assert (smallest(tree, 0.2)["mesh"], smallest(tree, "20%")["triangles"]) == ("f_1/0", 20)
+    assert (smallest(tree, "5 %")["mesh"], smallest(tree, 0.05)["relative"]) == ("f_1/1", 0.025)
+    assert smallest_below(tree, 0.2).attrs == {"reference": "reference", "below": 0.2}
+
+
+def test_none_is_near_enough(tree: xr.DataTree) -> None:
+    row = smallest(tree, 0.01)
+    assert (row["mesh"], row["nearest"], row["nearest_relative"], row["undecided"]) == ("", "f_1/1", 0.025, "")
+    assert "none" in format_smallest(tree, below=0.01)
+    assert "nearest: f_1/1, 2.500 % ± 0.003 %" in format_smallest(tree, "text", [-10.0], below=0.01)
+
+
+def test_errors_leave_smaller_meshes_open(tree: xr.DataTree) -> None:
+    # 10 % ± 0.01 %.
+    assert (smallest(tree, 0.10005)["mesh"], smallest(tree, 0.10005)["undecided"]) == ("f_1/1", "f_1/0")
+    assert smallest(tree, 0.1002)["mesh"] == "f_1/0"
+    assert smallest(tree, 0.0998)["undecided"] == ""
+    # Where even the largest mesh is open, none is below.
+    assert (smallest(tree, 0.025)["mesh"], smallest(tree, 0.025)["undecided"]) == ("", "f_1/1")
+
+
+def test_what_has_no_smallest_mesh(tree: xr.DataTree) -> None:
+    (record,) = json.loads(format_smallest(tree, "json", [-10.0], below=0.001))
+    assert (record["mesh"], record["triangles"], record["relative"]) == ("", None, None)
+    for bound in (0, -1, "x%", "", True):
+        with pytest.raises(InputError, match="a fraction is a positive number"):
+            smallest_below(tree, bound)
+    tree["meshes"]["triangles"] = 0 * tree["meshes"].to_dataset()["triangles"]
+    with pytest.raises(InputError, match="no surface of the store is known to have any"):
+        smallest_below(tree, 0.01)
