@@ -159,11 +159,7 @@ def fields_read(store: AnyStore) -> Iterator[None]:
 
 
 def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
-    """Return a table of an open store, in memory unless it may stay on disk.
-
-    Raises:
-        InputError: The store has no tables yet.
-    """
+    """Return a table of an open store, in memory unless it may stay on disk; InputError if it has no tables yet."""
     if name not in tree.children:
         raise InputError("the store has no tables yet: run the study to its end")
     dataset = tree[name].to_dataset()
@@ -171,11 +167,7 @@ def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dat
 
 
 def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
-    """Return one order or several of a table as a list; all of them by default.
-
-    Raises:
-        InputError: The table lacks one of them.
-    """
+    """Return one order or several of a table as a list, default all of them; InputError if it lacks one."""
     stored: list[float] = dataset["order"].values.tolist()
     if order is None:
         return stored
@@ -188,11 +180,7 @@ def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
 
 
 def chosen_order(tree: xr.DataTree, order: float | None) -> float:
-    """Return one of the orders of an open store; its first by default.
-
-    Raises:
-        InputError: The store has no tables yet, or lacks the order.
-    """
+    """Return one of the orders of an open store, default its first; InputError as of `chosen_orders`."""
     return chosen_orders(finished_group(tree, "convergence", load=False), order)[0]
 
 
@@ -213,11 +201,7 @@ def families_of(tree: xr.DataTree) -> dict[str, str]:
 
 
 def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
-    """Return the families that names or globs choose, in the order of the study; all of them by default.
-
-    Raises:
-        InputError: A name or glob fits no family.
-    """
+    """Return the families that names or globs choose, in the study's order; InputError if one fits none of it."""
     known = list(dict.fromkeys(families_of(tree).values()))
     if family is None:
         return known
@@ -265,11 +249,7 @@ def label_of(x: str) -> str:
 
 
 def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
-    """Return the sizes of the meshes of a table, NaN where they are not known.
-
-    Args:
-        frame: Rows of `table`.
-        x: Name of the size.
+    """Return the sizes of the meshes of a table, a column of `table`; NaN where they are not known.
 
     Raises:
         InputError: The table has no such column of numbers.

@@ -189,11 +189,6 @@ class StudyPlan:
         return {label: size.projected_bytes for label, size in self._sizes.items()}
 
     @property
-    def task_count(self) -> int:
-        """Number of tasks, if nothing were stored."""
-        return sum(size.task_count for size in self._sizes.values())
-
-    @property
     def lattice(self) -> Lattice:
         """Lattice of all fields."""
         return self._plan.lattice
@@ -297,7 +292,10 @@ class StudyPlan:
             f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
         )
         chunks = len(self._plan.blocks)
-        yield "tasks", f"{self.task_count} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}"
+        yield (
+            "tasks",
+            f"{sum(size.task_count for size in self._sizes.values())} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}",
+        )
         if self._sizes:
             largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
             yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
@@ -409,7 +407,11 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     planning_seconds = 0.0 if study_plan.choice is earlier_choice else time.process_time() - started
     sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
     records = _stored_records(location)
-    stored = {row.label: records[row.label] for row in study_plan.rows if _is_stored(row, records)}
+    stored = {
+        row.label: records[row.label]
+        for row in study_plan.rows
+        if row.label in records and records[row.label].completes(row.key)
+    }
     return StudyPlan(
         store=str(location),
         stored=tuple(stored),
@@ -420,10 +422,6 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         _sizes=sizes,
         _forecast=Forecast.for_plan(study_plan, stored, workers, client, planning_seconds),
     )
-
-
-def _is_stored(row: Row, records: Mapping[str, Record]) -> bool:
-    return row.label in records and records[row.label].completes(row.key)
 
 
 def _doubts_of(study_plan: Plan) -> dict[str, str]:

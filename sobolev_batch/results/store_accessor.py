@@ -236,15 +236,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
-    """Return the distances of an open store's meshes at some orders, lazily if the store has them all.
-
-    Args:
-        tree: Open store.
-        order: See `convergence_at`.
-
-    Raises:
-        InputError, OrderError, DamageError: See `convergence_at`.
-    """
+    """Return the distances of a store's meshes at some orders, lazily if it has them all; see `convergence_at`."""
     stored = finished_group(tree, "distances", load=False)
     chosen, others = _divided(stored, order)
     if not others:
@@ -258,11 +250,7 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
 
 
 def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
-    """Return the norm of an open store's reference at one order, with its error.
-
-    Raises:
-        InputError, OrderError, DamageError: See `convergence_at`.
-    """
+    """Return the norm of an open store's reference at one order, with its error; see `convergence_at`."""
     stored, reference = finished_group(tree, "norms"), reference_of(tree)
     if order in stored["order"].values:
         return stored.sel(mesh=reference, order=order)

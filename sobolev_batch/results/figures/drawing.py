@@ -320,16 +320,10 @@ def draw_map(selection: Selection, order: float, axes: Axes) -> None:
 
 
 def clustered_order(distances: Reals) -> NDArray[np.intp]:
-    """Return an order of meshes with similar ones beside each other.
+    """Return indices of meshes with similar ones beside each other, from distances (meshes, meshes) without NaN.
 
     Hierarchical clustering by mean distances, its leaves in the order that makes neighbours closest
     (Z. Bar-Joseph et al. 2001, doi:10.1093/bioinformatics/17.suppl_1.S22).
-
-    Args:
-        distances: Distances (meshes, meshes), symmetric, without NaN.
-
-    Returns:
-        Indices of meshes, (meshes,).
     """
     if len(distances) < 3:
         return np.arange(len(distances))
@@ -338,21 +332,14 @@ def clustered_order(distances: Reals) -> NDArray[np.intp]:
 
 
 def embedded(distances: Reals) -> tuple[Reals, float]:
-    """Return meshes as points of the plane that is nearest to all, by classical scaling.
+    """Return meshes as points (meshes, 2) of the plane that is nearest to all, by classical scaling, and its share.
 
-    Distances of a norm are those of points in a Euclidean space, so that double centring gives their
-    inner products exactly, up to the errors of the distances. Its first two principal axes span the
-    plane that shows most of their variance. Distances in it are never larger than the true ones.
+    Distances of a norm are those of points in a Euclidean space, so that double centring gives their inner products
+    exactly, up to the errors of the distances. The first two principal axes, the longer one first, show most of the
+    variance; the share is the fraction that they show, NaN where all meshes are equal. Distances in the plane are never
+    larger than the true ones.
 
-    Args:
-        distances: Distances (meshes, meshes), symmetric, without NaN.
-
-    Returns:
-        Coordinates (meshes, 2) in the unit of the distances, the first axis the longer one; and the fraction of the
-        meshes' variance that the plane shows, NaN where all meshes are equal.
-
-    Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952),
-    doi:10.1007/BF02288916.
+    Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952), doi:10.1007/BF02288916.
     """
     count = len(distances)
     if count == 0:

@@ -53,11 +53,7 @@ class StudyMeshes:
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
-        """List the meshes of an open store.
-
-        Args:
-            tree: Open store.
-            folder: Folder where relative paths in its study start.
+        """List the meshes of an open store, whose study has relative paths that start in a folder.
 
         Raises:
             InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
@@ -96,11 +92,7 @@ class StudyMeshes:
         return own, scaled
 
     def with_witness(self, label: str, orders: Sequence[float]) -> tuple[Mesh, Reals]:
-        """Return the mesh of a label in its own unit, and its witness function (orders, vertices) in the study's.
-
-        Raises:
-            SobolevBatchError: The mesh cannot be made again, or its field is damaged.
-        """
+        """Return the mesh of a label in its own unit, and its witness function (orders, vertices) in the study's."""
         own, scaled = self.make(label)
         with fields_read(self.tree):
             return own, witness_at_vertices(*fields_of(self.tree, label), orders, scaled)

@@ -81,12 +81,7 @@ class Selection:
 
     @cached_property
     def spectra(self) -> Spectra:
-        """Spectra of the chosen families.
-
-        Raises:
-            InputError: The store has no mesh to compare.
-            DamageError: A field is damaged.
-        """
+        """Spectra of the chosen families; InputError where the store has no mesh to compare."""
         with fields_read(self.tree):
             spectra = Spectra.from_tree(self.tree, self.orders, self.families)
         if spectra is None:
@@ -180,12 +175,7 @@ class Spectra:
 
 
 def _spread_over_families(labels: Sequence[tuple[str, str]], most: int) -> list[str]:
-    """Return a limited number of labels, of all families alike, in the order given.
-
-    Args:
-        labels: Family and label of each mesh.
-        most: Number of meshes at most; where it is below the number of families, some families have none.
-    """
+    """Return a limited number of labels, of all families alike, from the family and label of each mesh."""
     members: dict[str, list[str]] = {}
     for family, label in labels:
         members.setdefault(family, []).append(label)

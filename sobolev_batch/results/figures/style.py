@@ -91,13 +91,7 @@ class Plot:
     layout: Layout = "constrained"
 
     def figure(self, subject: Any, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:
-        """Return a figure with a panel for each item, below each other, and one legend.
-
-        Args:
-            subject: What is drawn.
-            items: Items to draw; default all.
-            size: Width and height of each panel in inches instead of its own.
-        """
+        """Return a figure with a panel of a size for each item, default all, below each other, and one legend."""
         items = self.items(subject) if items is None else items
         width, height = size or (WIDTH_INCHES, self.height)
         figure = Figure(figsize=(width, height * len(items)), layout=self.layout)
@@ -214,13 +208,7 @@ def drawing(size: Size | None) -> Iterator[None]:
 def write_figures(
     figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[PictureFormat], size: Size | None
 ) -> tuple[Path, ...]:
-    """Write figures into a folder by their file names without suffix, and return the paths.
-
-    Args:
-        figures: Figures that were made while `drawing` with the size.
-        folder: Folder, which is created.
-        formats: Formats of each picture.
-        size: Width and height of each panel in inches; None for those of the plots.
+    """Write figures, made while `drawing` with a size of panels, into a new or old folder, and return the paths.
 
     Raises:
         StoreError: The folder cannot be written.

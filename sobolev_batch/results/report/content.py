@@ -138,11 +138,7 @@ _COLUMNS = (
 
 
 def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], PageTable, str]:
-    """Return the verdict on a study at each order, from the rows of `table`.
-
-    Args:
-        frame: Rows of all orders.
-        failed: Reason for each mesh that is missing.
+    """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 
     Returns:
         A sentence for each order; the table of nearest meshes, smallest meshes below bounds, and meshes that are

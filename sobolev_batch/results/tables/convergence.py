@@ -188,13 +188,7 @@ def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 def tables_of(
     stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
 ) -> dict[str, pd.DataFrame]:
-    """Return the rows of `table` of each object that has any, by its name.
-
-    Raises:
-        InputError: No object has tables, or one that has lacks a size.
-        OrderError: An order is not below -1/2.
-        StoreError: A location has no store, or it is damaged.
-    """
+    """Return the rows of `table` of each object that has any, by its name; InputError if none has."""
     trees = {name: as_tree(place) for name, place in stores.items()}
     finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
     if not finished:
@@ -335,12 +329,8 @@ def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
 
 
 def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
-    """Return rows of `table` with rates in another size, in place of those in the edge length.
-
-    Raises:
-        InputError: See `sizes_of`.
-    """
-    sizes = sizes_of(frame, x) if x == EDGE_LENGTH else 1 / sizes_of(frame, x)
+    """Return rows of `table` with rates in another size, in place of those in the edge length; see `sizes_of`."""
+    sizes = 1 / sizes_of(frame, x)
     rates, errors = np.full(len(frame), np.nan), np.full(len(frame), np.nan)
     numbered = frame.reset_index(drop=True)
     for _, rows in numbered.groupby(["order", "family"], sort=False):

@@ -97,14 +97,7 @@ def matrix(
 
 
 def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
-    """Return the distances of one order in long form: one row for each pair of meshes.
-
-    Columns order, mesh, other, distance, error, truncation, aliasing, discretisation, statistical.
-
-    Args:
-        distances: Table of the distances of an open store.
-        order: One of its orders.
-    """
+    """Return the distances of one order in long form, with their errors: one row for each pair of meshes."""
     columns = list(_COLUMNS)
     chosen = distances[columns].sel(order=order).load()
     frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()

@@ -148,10 +148,7 @@ class Interval:
 
 
 def within_objects(values: Reals) -> Reals:
-    """Return the standard deviation of each method over objects, without what the objects themselves differ by.
-
-    Args:
-        values: (objects, methods), each object with all methods.
+    """Return the standard deviation of each method over values (objects, methods), without that of the objects.
 
     Each object's mean over the methods is taken off, and the variance scaled by m / (m - 1) for m methods: Morey,
     Confidence intervals from normalized data, Tutorials in Quantitative Methods for Psychology 4(2), 2008.
@@ -164,14 +161,10 @@ def within_objects(values: Reals) -> Reals:
 
 
 def sign_flip_test(differences: Reals, errors: Reals) -> float:
-    """Return the p-value of paired differences whose mean is zero: the share of sign changes with as large a mean.
+    """Return the p-value of paired differences with mean zero: the share of sign changes with as large a mean.
 
     If two methods were alike, each difference could as well have the other sign. It is the permutation test of pairs,
-    and the p-value is the largest that the errors of the differences allow.
-
-    Args:
-        differences: One for each object (n,).
-        errors: Bounds on their errors (n,).
+    and the p-value is the largest that the bounds on the errors of the differences allow.
     """
     count = len(differences)
     if count == 0 or not np.isfinite(errors).all():

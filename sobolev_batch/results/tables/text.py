@@ -41,9 +41,6 @@ def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
 
     The error has one digit and is rounded up, so that it stays a bound; it may be unknown (NaN). NaN gives an empty
     text.
-
-    >>> with_error(0.04733, 4.6e-4), with_error(2.0123e-5, 1.23e-8)
-    ('0.0473 ± 0.0005', '(2.012 ± 0.002) × 10⁻⁵')
     """
     if not math.isfinite(value):
         return ""
@@ -64,11 +61,7 @@ def rounded(value: float, error: float = math.nan, unit: str = "") -> str:
 
 
 def percent(fraction: float, error: float = math.nan) -> str:
-    """Return a fraction in per cent with its error.
-
-    >>> percent(0.010203, 0.000094)
-    '1.02 % ± 0.01 %'
-    """
+    """Return a fraction in per cent with its error."""
     return with_error(100 * fraction, 100 * error, " %")
 
 
@@ -78,11 +71,7 @@ def count(number: int) -> str:
 
 
 def bound(fraction: float) -> str:
-    """Return an upper bound in per cent, with two digits, rounded up.
-
-    >>> bound(0.00301)
-    '0.31 %'
-    """
+    """Return an upper bound in per cent, with two digits, rounded up."""
     rounded = _rounded_up(100 * fraction, 2)
     return f"{_shown(rounded, _magnitude(rounded) - 1)} %"
 
@@ -116,12 +105,9 @@ def second_digit(value: float) -> float:
 
 
 def concise(value: float, error: float) -> str:
-    """Return a number with its error in brackets, in units of the last digit.
+    """Return a number with its error, rounded up, in brackets in units of the last digit.
 
-    The error is rounded up. NaN gives an empty text; "?" stands for an unknown error.
-
-    >>> concise(0.012341, 0.00005), concise(1.2341e-7, 5e-10)
-    ('0.01234(5)', '1.234(5)e-07')
+    NaN gives an empty text; "?" stands for an unknown error.
     """
     if not math.isfinite(value):
         return ""
@@ -189,13 +175,6 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
         reference: Name of the reference.
         result: Variables of `distance` at one order, and the order.
         area_change: Area of the surface over that of the reference, minus one.
-
-    >>> numbers = {"distance": 0.3, "error": 0.003, "relative": 0.0102, "relative_error": 0.0001}
-    >>> shares = {"area_share": 0.561, "area_share_error": 0.02, "excess": -0.007}
-    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares}, area_change=-0.008)
-    'small.obj differs from large.obj by 1.02 % ± 0.01 % at order -2; 56 % of it is lost area.'
-    >>> answer("small.obj", "large.obj", {"order": -2.0, **numbers, **shares, "distance": 1e-3}, area_change=-0.008)
-    'small.obj differs from large.obj by less than 1.1 % at order -2: not resolved.'
     """
     numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
     at_order = f"at order {float(result['order']):g}"
