@@ -292,10 +292,8 @@ class StudyPlan:
             f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
         )
         chunks = len(self._plan.blocks)
-        yield (
-            "tasks",
-            f"{sum(size.task_count for size in self._sizes.values())} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}",
-        )
+        tasks = sum(size.task_count for size in self._sizes.values())
+        yield "tasks", f"{tasks} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}"
         if self._sizes:
             largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
             yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"

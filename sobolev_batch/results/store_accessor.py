@@ -109,7 +109,7 @@ class StoreAccessor:
         norms, distances, parts = fields.reducer(check_orders(order), against).norms([row, against])
         relative, relative_errors = distances.relative_to(NormEstimate(*(part[:, 1:] for part in norms)))
         others = {"relative": relative, "relative_error": relative_errors}
-        parts_by_name = {"area_part": parts.area, "shape_part": parts.shape}
+        parts_by_name = {"area_part": parts[0], "shape_part": parts[1]}
         return _labelled(order, "distance", distances, {**others, **parts_by_name})
 
     def spectrum(self, mesh: str, other: str | None, order: Orders) -> xr.Dataset:

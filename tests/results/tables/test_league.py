@@ -112,27 +112,47 @@ def test_a_distance_below_its_error_bounds_nothing(ranked: Ranked) -> None:
     assert "?" in format_league([made])
 
 
-def test_objects_without_a_method_are_left_out_and_named(ranked: Ranked) -> None:
-    both, one = of_powers({"a": 1, "b": 2}, 1.0), of_powers({"a": 1}, 1.0)
-    made = ranked({"x": both, "y": one, "z": both})
+POWERS = of_powers({"a": 1, "b": 2}, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("distances", "reason"),
+    [
+        ({"a": {n: 1.0 / n for n in SIZES}}, "no distance of b"),
+        ({"a": {1000: 1.0, 8000: 1e-3}}, "no distance of b"),
+        ({"a": dict.fromkeys(SIZES, 3e-8), "b": {n: 1.0 / n for n in SIZES}}, "a reproduced it, up to rounding"),
+        ({"a": dict.fromkeys(SIZES, 0.0), "b": {n: 1.0 / n for n in SIZES}}, "a reproduced it, up to rounding"),
+        ({"a": {1000: 1.0}, "b": {2000: 2.0}}, "no common range of sizes: b begins at 2,000, a ends at 1,000"),
+    ],
+)
+def test_objects_that_cannot_be_compared_are_left_out_and_named(
+    distances: Mapping[str, Mapping[int, float]], reason: str
+) -> None:
+    tables = {"x": POWERS, "y": frame(distances, error=0.03), "z": POWERS}
+    (made,) = leagues_of(tables, [*tables, "later"])
     assert made.objects == ("x", "z")
-    assert made.left_out == {"y": "no distance of b"}
-    assert "y is left out: no distance of b." in format_league([made])
-    assert ranked({"x": both, "y": one}, methods=["a"]).objects == ("x", "y")
+    assert made.left_out == {"later": "it has no tables yet", "y": reason}
+    assert f"y is left out: {reason}." in format_league([made])
+    assert made.pairs["ratio"].item() == pytest.approx(0.5)
+    np.testing.assert_allclose(made.table["rate"], 2.0)
+
+
+def test_methods_may_be_chosen_and_must_be_known(ranked: Ranked) -> None:
+    one = of_powers({"a": 1}, 1.0)
+    assert ranked({"x": POWERS, "y": one}, methods=["a"]).objects == ("x", "y")
     with pytest.raises(sb.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"):
         ranked({"y": one, "w": of_powers({"b": 1}, 1.0)})
     with pytest.raises(sb.InputError, match="no method is named 'c'; known are a, b"):
-        ranked({"x": both}, methods=["c"])
+        ranked({"x": POWERS}, methods=["c"])
 
 
-@pytest.mark.parametrize("distance", [3e-8, 0.0])
-def test_objects_that_a_method_reproduced_are_left_out_and_named(distance: float, ranked: Ranked) -> None:
-    plain = of_powers({"a": 1, "b": 2}, 1.0)
-    box = frame({"a": dict.fromkeys(SIZES, distance), "b": {n: 1.0 / n for n in SIZES}}, error=0.03)
-    made = ranked({"x": plain, "box": box, "z": plain})
-    assert made.left_out == {"box": "a reproduced it, up to rounding"}
+def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate(ranked: Ranked) -> None:
+    near = frame({"a": {1000: 1.0}, "b": {1100: 2.0}})
+    made = ranked({"x": near, "z": near})
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
-    np.testing.assert_allclose(made.table["rate"], 2.0)
+    assert made.table["rate"].isna().all()
+    steep = frame({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
+    np.testing.assert_allclose(ranked({"x": POWERS, "steep": steep}).table["rate"], 2.0)
 
 
 def test_objects_are_named_with_the_orders_that_leave_them_out(ranked: Ranked) -> None:
@@ -150,14 +170,6 @@ def test_few_objects_are_said_to_be_too_few(ranked: Ranked) -> None:
     assert "a is 2 times nearer than b" in format_league([six])
 
 
-def test_sizes_that_do_not_meet_are_not_compared(ranked: Ranked) -> None:
-    near = frame({"a": {1000: 1.0}, "b": {1100: 2.0}})
-    far = frame({"a": {1000: 1.0}, "b": {2000: 2.0}})
-    made = ranked({"x": near, "y": far, "z": near})
-    assert made.left_out == {"y": "no common range of sizes: b begins at 2,000, a ends at 1,000"}
-    assert made.pairs["ratio"].item() == pytest.approx(0.5)
-
-
 def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size(ranked: Ranked) -> None:
     close = frame({"a": {1000: 0.0100, 1001: 0.0102}, "b": {1150: 0.0100}})
     made = ranked(dict.fromkeys("stuvwxyz", close))
@@ -170,20 +182,6 @@ def test_meshes_of_one_size_all_count(ranked: Ranked) -> None:
     made = ranked(dict.fromkeys("stuvwxyz", pd.concat([tables, *more], ignore_index=True)))
     assert made.table["method"].tolist() == ["b", "a"]
     assert made.table["relative"].iloc[1] == pytest.approx((0.01 * 0.03 * 0.03) ** (1 / 3))
-
-
-def test_rates_are_those_of_the_objects_that_count_and_need_sizes(ranked: Ranked) -> None:
-    plain = of_powers({"a": 1, "b": 2}, 1.0)
-    steep = frame({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
-    lone = frame({"a": {1000: 1.0, 8000: 1e-3}})
-    made = ranked({"x": plain, "steep": steep, "lone": lone, "z": plain})
-    assert list(made.left_out) == ["lone"]
-    np.testing.assert_allclose(made.table["rate"], 2.0)
-
-
-def test_objects_without_tables_are_named() -> None:
-    (made,) = leagues_of({"x": of_powers({"a": 1, "b": 2}, 1.0)}, ["x", "y"])
-    assert "y is left out: it has no tables yet." in format_league([made])
 
 
 def test_one_object_has_no_intervals_and_no_ranks(ranked: Ranked) -> None:
