@@ -13,7 +13,7 @@ import numpy as np
 from distributed import Client
 
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
-from sobolev_batch.batch.analysis.reduce import are_tabulated, tabulate_fields
+from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
-from sobolev_batch.batch.analysis.datasets import DistancesToReference, convergence_dataset, distances_dataset
-from sobolev_batch.batch.analysis.reduce import StoredFields
-from sobolev_batch.batch.analysis.tiles import Reducer
-from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.analysis.tabulate import Results
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
+from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.results.open import finished_group, is_sequence, location_of, reference_of, require_unchanged
+from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
-from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.causes import band_coordinates
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
@@ -32,7 +28,6 @@ from sobolev_batch.spectral.metrics.datasets import (
 )
 from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.sums import squared_moduli
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import quoted
@@ -80,8 +75,8 @@ class StoreAccessor:
         >>> f"{tree.sobolev.norm('reference', -4)['norm'].item():.3f}"
         '3.511'
         """
-        fields, row = self._fields(mesh)
-        norms, _, _ = fields.reducer(check_orders(order), row).norms([row])
+        reducer, rows = stored_reducer(self._tree, order, mesh)
+        norms, _, _ = reducer.norms(rows)
         return _labelled(order, "norm", norms, {})
 
     def distance(self, mesh: str, other: str, order: Orders) -> xr.Dataset:
@@ -105,8 +100,8 @@ class StoreAccessor:
         >>> bool(abs(found["area_part"] ** 2 + found["shape_part"] ** 2 - found["distance"] ** 2) < 1e-12)
         True
         """
-        fields, row, against = self._fields(mesh, other)
-        norms, distances, parts = fields.reducer(check_orders(order), against).norms([row, against])
+        reducer, rows = stored_reducer(self._tree, order, mesh, other)
+        norms, distances, parts = reducer.norms(rows)
         relative, relative_errors = distances.relative_to(NormEstimate(*(part[:, 1:] for part in norms)))
         others = {"relative": relative, "relative_error": relative_errors}
         parts_by_name = {"area_part": parts[0], "shape_part": parts[1]}
@@ -136,9 +131,7 @@ class StoreAccessor:
         >>> round(bands["share"].sum().item(), 6)
         1.0
         """
-        rows = self._fields(mesh) if other is None else self._fields(mesh, other)
-        fields, indices, orders = rows[0], [int(row) for row in rows[1:]], check_orders(order)
-        reducer = fields.reducer(orders)
+        reducer, indices = stored_reducer(self._tree, order, *([mesh] if other is None else [mesh, other]))
         bands = [*_inner_bands(reducer, indices), *_octaves(reducer, indices)]
         upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
         upper *= _HALF_WEIGHT
@@ -161,46 +154,36 @@ class StoreAccessor:
             attrs={"kernel": KERNEL, "energy_limit": 2 * float(areas)},
         )
 
-    def _fields(self, *labels: str) -> tuple[Any, ...]:
-        """Return the stored fields of some meshes, and the row of each label. No record of other meshes is read."""
-        fields = stored_fields(self._tree, labels)
-        known = fields.store.labels()
-        for label in labels:
-            record = fields.records[known.index(label)] if label in known else None
-            if record is None or record.status != "complete":
-                raise InputError(
-                    f"{fields.store.path}: no mesh {quoted(label)} with a field; its labels begin {known[:3]}"
-                )
-        return fields, *map(known.index, labels)
 
-
-def stored_fields(tree: xr.DataTree, meshes: Collection[str] | None = None) -> StoredFields:
-    """Return fields of an open store.
+def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Reducer, list[int]]:
+    """Return the reducer of an open store for any orders, and the rows of some meshes.
 
     Args:
         tree: Open store.
-        meshes: Labels of the meshes whose records are read; all of them by default.
+        order: One order s < -1/2, or several.
+        meshes: Labels of meshes. No record of others is read, and distances are to the last one. Without any, all are
+            read, and distances are to the reference.
 
     Raises:
-        InputError: The tree does not say where it was opened.
+        InputError: The tree does not say where it was opened, or no mesh with a field has that label.
+        OrderError: An order is not below -1/2.
         DamageError: The record of a mesh is not the one that the tables were made from.
     """
-    store = Store.open(location_of(tree))
-    study = store.attributes()["study"]
-    lattice, octaves = Lattice(**study["lattice"]), study.get("octaves")
-    tail = None if octaves is None else TailSampling.from_table(octaves)
+    store, orders = Store.open(location_of(tree)), check_orders(order)
     labels, removed = store.labels(), store.removed
-    rows = [i for i, label in enumerate(labels) if label not in removed and (meshes is None or label in meshes)]
-    read = store.records() if meshes is None else {i: store.read_record(i) for i in rows}
-    records: list[Record | None] = [None] * len(labels)
-    for i in rows:
-        records[i] = read[i]
-    unlike = rows_unlike_tables(store, records, rows) if rows else {}
-    for i, problem in unlike.items():
+    wanted = [i for i, label in enumerate(labels) if label not in removed and (not meshes or label in meshes)]
+    read = {i: store.read_record(i) for i in wanted} if meshes else dict(enumerate(store.records()))
+    records = [read[i] if i in wanted else None for i in range(len(labels))]
+    for i, problem in (rows_unlike_tables(store, records, wanted) if wanted else {}).items():
         raise DamageError(
             f"{store.path}: the field of {labels[i]} is damaged ({problem}); run the study again", problem, i
         )
-    return StoredFields(store, records, lattice, tail, labels.index(study["reference"]))
+    for mesh in meshes:
+        if mesh not in labels or labels.index(mesh) not in complete_records(records):
+            raise InputError(f"{store.path}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
+    rows, reference = [labels.index(mesh) for mesh in meshes], labels.index(store.attributes()["study"]["reference"])
+    compared_with = rows[-1] if rows else None
+    return Reducer.for_records(store, store.choice(), orders, records, reference, compared_with), rows
 
 
 def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -221,18 +204,9 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    fields, meshes = stored_fields(tree), finished_group(tree, "meshes")
-    results = fields.results(others, meshes["row"].values.tolist(), every_pair=False)
-    require_unchanged(tree)
-    to_reference = DistancesToReference(
-        reference_of(tree),
-        NormEstimate(*results.to_reference),
-        results.proportions,
-        NormEstimate(*results.norms[..., results.places[fields.reference]]),
-    )
+    results = _computed(tree, others, every_pair=False)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
-    sizes, families = meshes["edge_length_mean"].to_numpy(), _sequences(meshes)
-    return _joined(stored, convergence_dataset(meshes.coords, others, to_reference, sizes, families, accuracy), chosen)
+    return _joined(stored, results.convergence_table(accuracy), chosen)
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -241,12 +215,8 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    fields, every_pair = stored_fields(tree), stored.sizes["other"] == stored.sizes["mesh"]
-    meshes = finished_group(tree, "meshes")
-    results = fields.results(others, meshes["row"].values.tolist(), every_pair=every_pair)
-    require_unchanged(tree)
-    estimate = NormEstimate(*results.distances)
-    return _joined(stored, distances_dataset(meshes.coords, stored["other"].values, others, estimate), chosen)
+    results = _computed(tree, others, every_pair=stored.sizes["other"] == stored.sizes["mesh"])
+    return _joined(stored, results.distances_table(), chosen)
 
 
 def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
@@ -259,15 +229,23 @@ def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     """Return what orders that were computed from the fields rest on, as lines of a note of a table."""
-    fields = stored_fields(tree, meshes=())
-    frequencies = f"frequencies up to {fields.lattice.xi_max:g} on each axis"
-    if fields.tail is not None:
-        frequencies = f"{frequencies}, and samples in octaves up to {fields.tail.highest_frequency:.4g}"
+    choice = Store.open(location_of(tree)).choice()
+    frequencies = f"frequencies up to {choice.lattice.xi_max:g} on each axis"
+    if choice.tail is not None:
+        frequencies = f"{frequencies}, and samples in octaves up to {choice.tail.highest_frequency:.4g}"
     return [
         f"Not of the study, but computed now from its stored fields: order {', '.join(f'{s:g}' for s in orders)}.",
         f"They hold {frequencies}.",
         "What lies beyond is in the errors, which grow at orders nearer to -1/2.",
     ]
+
+
+def _computed(tree: xr.DataTree, orders: tuple[float, ...], *, every_pair: bool) -> Results:
+    """Return the norms and distances of an open store at other orders than its own."""
+    (reducer, _), meshes = stored_reducer(tree, orders), finished_group(tree, "meshes")
+    results = Results.computed(reducer, meshes, reference_of(tree), every_pair)
+    require_unchanged(tree)
+    return results
 
 
 def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:
@@ -285,12 +263,6 @@ def _joined(stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr
     )  # fmt: skip
     table = both.sel(order=chosen)
     return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
-
-
-def _sequences(meshes: xr.Dataset) -> list[list[int]]:
-    """Return the places of the meshes of each family that goes from coarse to fine."""
-    frame = pd.DataFrame({name: meshes[name].values for name in ("family", "ordered_by")})
-    return [rows.index.tolist() for _, rows in frame.groupby("family", sort=False) if is_sequence(rows)]
 
 
 def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[str, Reals]) -> xr.Dataset:

@@ -22,7 +22,7 @@ from sobolev_batch import (
     proportion,
     run,
 )
-from sobolev_batch.batch.analysis import reduce
+from sobolev_batch.batch.analysis import tabulate
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.mesh_files import off
 from tests.support.studies import SMALL_LATTICE, small_table, variable
@@ -118,7 +118,7 @@ def test_tables_of_an_older_version_are_made_anew(
     client: Client, study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(reduce, "TABLES_VERSION", reduce.TABLES_VERSION - 1)
+        patch.setattr(tabulate, "TABLES_VERSION", tabulate.TABLES_VERSION - 1)
         run(study, store_path, client)
     steps: list[Progress] = []
     assert run(study, store_path, client, on_progress=steps.append).computed == ()

@@ -263,7 +263,7 @@ def test_damaged_metadata_are_told(damage: Damage, store: Path, study: Study, th
 
 def test_a_field_of_zeros_is_one(store: Path, study: Study, threads: Client) -> None:
     there = Store.open(store)
-    (place,) = there.block_slices()
+    (place,) = there.places()
     record = there.read_record(1)
     assert record is not None
     zeros = np.zeros([part.stop for part in place], dtype=complex)

@@ -48,7 +48,7 @@ from tests.support.studies import small_table
 path = Path(sys.argv[1])
 plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
 store = prepare_store(path, plan)
-(place,) = store.block_slices()
+(place,) = store.places()
 shape = [part.stop for part in place]
 chunk = path / "fourier/fourier/c/0/0/0/0"
 chunk.parent.mkdir(parents=True)

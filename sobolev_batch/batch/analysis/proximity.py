@@ -10,14 +10,14 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.batch.analysis.datasets import TableOrder
+from sobolev_batch.batch.analysis.tabulate import table_order
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.fields.compute import MESH_BYTES
 from sobolev_batch.batch.store.records import ProximityRecord, Record
@@ -76,7 +76,7 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
     for i, key in keys.items():
         triangles = complete[i].facts.triangles + complete[reference].facts.triangles
         search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * points
-        pair = tuple(StoredMesh(workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
+        pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
         arguments = workspace.store, i, complete[i], key, pair, plan.similarity, points
         projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
         tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i]))
@@ -92,54 +92,19 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
         advance(task.label, None)
 
 
-@dataclass(frozen=True)
-class StoredMesh:
-    """A mesh whose field is stored.
-
-    Attributes:
-        row: Row of the plan.
-        digest: Digest of the mesh whose field is stored, in the study's unit.
-    """
-
-    row: Row
-    digest: str
-
-    def load(self, similarity: Similarity) -> Mesh:
-        """Load the mesh, in the study's unit.
-
-        Raises:
-            MeshError: It cannot be loaded, or is not the mesh whose field is stored.
-        """
-        surface = similarity.apply(self.row.member.load())
-        if not isinstance(surface, Mesh) or surface.digest != self.digest:
-            raise MeshError(
-                f"what is made of {self.row.label} now is not the mesh whose field is stored; a file may have "
-                "changed: run the study again"
-            )
-        return surface
-
-
 def measure_proximity(
     store: Store,
     index: int,
     record: Record,
     key: str,
-    pair: tuple[StoredMesh, StoredMesh],
+    pair: Sequence[tuple[Row, str]],
     similarity: Similarity,
     points: int,
 ) -> Record:
     """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
 
-    A mesh that cannot be measured does not raise: the reason is part of the record.
-
-    Args:
-        store: Store of the record.
-        index: Row of the mesh in the store.
-        record: Record of the mesh's field.
-        key: Key of the distances.
-        pair: Mesh and reference.
-        similarity: Similarity of the study.
-        points: Number of points that are drawn on each of the two.
+    A mesh that cannot be measured does not raise: the reason is part of the record. Of the pair, mesh and reference,
+    each has the digest of the mesh whose field is stored.
 
     Raises:
         StoreError: The store cannot be read or written, which is not the mesh's fault.
@@ -150,17 +115,28 @@ def measure_proximity(
         return stored
     started = time.perf_counter()
     try:
-        distances = proximity(*(mesh.load(similarity) for mesh in pair), points=points)
+        distances = proximity(*(_load(*mesh, similarity) for mesh in pair), points=points)
         measured = ProximityRecord(key, "", **asdict(distances))
     except StoreError:
         raise
     except Exception as error:
         if not isinstance(error, InputError):
-            _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0].row.label, exc_info=error)
+            _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0][0].label, exc_info=error)
         measured = ProximityRecord(key, one_line(error))
     record = replace(record, proximity=replace(measured, seconds=time.perf_counter() - started))
     store.write_record(index, record)
     return record
+
+
+def _load(row: Row, digest: str, similarity: Similarity) -> Mesh:
+    """Load the mesh of a row in the study's unit, where it is still the one whose field is stored."""
+    surface = similarity.apply(row.member.load())
+    if not isinstance(surface, Mesh) or surface.digest != digest:
+        raise MeshError(
+            f"what is made of {row.label} now is not the mesh whose field is stored; a file may have changed: run the "
+            "study again"
+        )
+    return surface
 
 
 def _keys(workspace: Workspace) -> dict[int, str]:
@@ -187,30 +163,29 @@ def _pending(workspace: Workspace) -> dict[int, str]:
 
 def _dataset(workspace: Workspace) -> xr.Dataset:
     """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
-    records, rows = _current(workspace), TableOrder.from_workspace(workspace).rows
+    labels, records = _current(workspace)
     columns: dict[str, Any] = {
-        name: [getattr(records[i], name) if i in records else np.nan for i in rows]
+        name: [np.nan if record is None else getattr(record, name) for record in records]
         for name in (field.name for field in fields(Proximity))
     }
-    columns["reason"] = np.array([records[i].reason if i in records else "" for i in rows], dtype=object)
+    columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
     attributes = {
         "reference": workspace.plan.reference,
         "points": workspace.plan.study.proximity,
         "digest": _digest(workspace),
     }
-    labels = np.array([workspace.labels[i] for i in rows], dtype=object)
     variables = {name: ("mesh", values) for name, values in columns.items()}
-    return describe(xr.Dataset(variables, coords={"mesh": labels}, attrs=attributes))
+    return describe(xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes))
 
 
-def _current(workspace: Workspace) -> dict[int, ProximityRecord]:
-    """Return the distances of the meshes and points that there are now, by the rows of the meshes."""
-    keys = _keys(workspace)
-    records = {i: record.proximity for i, record in workspace.complete.items() if i in keys}
-    return {i: record for i, record in records.items() if record is not None and record.key == keys[i]}
+def _current(workspace: Workspace) -> tuple[list[str], list[ProximityRecord | None]]:
+    """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
+    keys, rows = _keys(workspace), [i for i, _, _ in table_order(workspace)]
+    measured = {i: record.proximity for i, record in workspace.complete.items() if i in keys}
+    records = [record if (record := measured.get(i)) and record.key == keys[i] else None for i in rows]
+    return [workspace.labels[i] for i in rows], records
 
 
 def _digest(workspace: Workspace) -> str:
-    records, rows = _current(workspace), TableOrder.from_workspace(workspace).rows
-    lines = [[workspace.labels[i], asdict(records[i]) if i in records else None] for i in rows]
+    lines = [[label, record and asdict(record)] for label, record in zip(*_current(workspace), strict=True)]
     return hashlib.sha256(json.dumps(lines).encode()).hexdigest()

@@ -68,17 +68,14 @@ def _copy_from(other: Store, workspace: Workspace) -> list[int]:
 
 def _copy_field(source: Store, row: int, record: Record, store: Store, target_row: int) -> bool:
     """Copy a field with its record into a row of another store; return False where the field is damaged."""
-    places, checksums = source.block_slices(), list(record.checksums)
-    if places != store.block_slices() or len(checksums) != len(places) + source.has_octaves:
+    places = source.places()
+    if places != store.places() or len(record.checksums) != len(places):
         raise StoreError(
             f"{source.path}: it cuts fields into other blocks than {store.path}; run the study without it, or make "
             "both stores by one version of this program"
         )
     try:
-        if source.has_octaves:
-            # Behind those of the field.
-            store.write_octaves(target_row, source.read_octaves([row], [checksums.pop()])[0])
-        for place, checksum in zip(places, checksums, strict=True):
+        for place, checksum in zip(places, record.checksums, strict=True):
             store.write_field(target_row, place, source.read_fields([row], place, [checksum])[0])
     except DamageError as error:
         _log.warning("%s; it is computed here", error)

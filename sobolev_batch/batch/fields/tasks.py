@@ -235,7 +235,8 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         remainder([surface], [1], cutoff, points=_POINTS_OF_NORM),
         None if reference is None else remainder([surface, reference], [1, -1], cutoff),
     )
-    checksum = job.store.write_octaves(job.index, np.concatenate([octave.values for octave in values]))
+    samples = np.concatenate([octave.values for octave in values])
+    checksum = job.store.write_field(job.index, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 

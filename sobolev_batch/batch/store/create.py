@@ -61,10 +61,9 @@ def require_usable(location: Location) -> None:
 
 
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
-    """Create the store of a plan, or open it and add rows for new meshes.
+    """Create the store of a plan, or open it and add rows for new meshes. Rows that the study has lost stay.
 
-    Rows of meshes that the study has lost stay. If one has come back under another name, it gets this name. If tables,
-    coordinates or metadata are not those that were written, all of them are made again, and the fields stay.
+    If tables, coordinates or metadata are not those that were written, all of them are made again, and the fields stay.
 
     Raises:
         StoreError: The location cannot be read or written, or holds something else or the store of another study,
@@ -81,22 +80,21 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         _create(store, plan)
         return store
     if store.is_unfinished:
-        _replace_everything(store, plan)
+        _create(store, plan)
         return store
-    attributes = store.attributes()
+    attributes, lattice = store.attributes(), _lattice_entry(plan)
     if not store.has_digest():
-        expected = {"name": plan.study.name, **_lattice_entry(plan)}
-        is_same = all(attributes["study"].get(name) == value for name, value in expected.items())
+        is_same = attributes["study"].items() >= {"name": plan.study.name, **lattice}.items()
         return _mended(store, plan, None if is_same else _ALTERED)
     _check_same_study(store, plan)
     store.location.remove_partial_files()
     with store.location.access("written"):
-        if any(attributes["study"].get(name) != value for name, value in _lattice_entry(plan).items()):
+        if not attributes["study"].items() >= lattice.items():
             done = sum(record is not None for record in store.records())
             _log.warning(
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
             )
-            _replace_everything(store, plan)
+            _create(store, plan)
         _require_same_samples(store, plan, is_trusted=True)
         stored = store.labels()
         labels = _labels_for(plan, stored, store.records(), is_trusted=True)
@@ -117,13 +115,8 @@ _ALTERED = DamageError("the metadata at the root are damaged", "they are not wha
 def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     """Return a store with new metadata, coordinates and labels, and without tables, around its fields and records.
 
-    Args:
-        store: Store whose tables, coordinates or metadata are not those that were written.
-        plan: Plan of the study.
-        damage: Reason to doubt that it is the store of the plan's study.
-
     Raises:
-        DamageError: There is such a reason, and no field in the store is one of the study's.
+        DamageError: With this damage it may be the store of another study, and no field in it is one of this study.
     """
     stored: tuple[str, ...] = ()
     with suppress(StoreError, ValueError, TypeError, KeyError):
@@ -156,36 +149,23 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     return fresh
 
 
-def _replace_everything(store: Store, plan: Plan) -> None:
-    """Remove everything that was computed and create the arrays for another lattice."""
-    _mark_unfinished(store, plan)
+def _create(store: Store, plan: Plan) -> None:
+    """Create all arrays, in place of everything that is there."""
+    # This process may be killed before all is there: until then the content is declared invalid.
+    attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
+    store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
     store.location.remove_partial_files()
     for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT}):
         store.location.remove(name)
-    _create(store, plan)
-
-
-def _mark_unfinished(store: Store, plan: Plan) -> None:
-    """Declare the content of the store invalid, since this process may be killed before it has created the arrays."""
-    attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
-    store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
-
-
-def _create(store: Store, plan: Plan) -> None:
-    _mark_unfinished(store, plan)
     store.documents = {}
     _lay_out(store, plan, [row.label for row in plan.rows], ())
     store.consolidate()
 
 
 def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequence[str]) -> None:
-    """Write the metadata, coordinates and labels of all arrays that tasks fill. Their chunks and the tables stay.
+    """Write the metadata and coordinates of all arrays that tasks fill, with qualities of the first rows.
 
-    Args:
-        store: Store of the arrays.
-        plan: Plan of the study.
-        labels: Labels of all rows.
-        qualities: Qualities of the first rows.
+    Their chunks and the tables stay.
     """
     rows, mesh = len(labels), np.array(labels, dtype=object)
     padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
@@ -246,25 +226,18 @@ def _root(attributes: dict[str, Any]) -> dict[str, Any]:
 def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None:
     """Check that octaves were sampled at the frequencies that this program draws.
 
-    Args:
-        store: Store of the samples.
-        plan: Plan of the study.
-        is_trusted: False where some coordinates may be damaged: then one of three is enough.
+    Where coordinates may be damaged, and are not trusted, one axis of three is enough.
 
     Raises:
         StoreError: They were sampled at others.
     """
-    columns = {} if plan.tail is None else _sample_columns(plan.tail)
     agree = []
-    for name in AXES if columns else ():
-        try:
+    for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):
+        with suppress(StoreError, ValueError, TypeError, KeyError):
             stored = np.asarray(store.read(f"{OCTAVES_GROUP}/{name}"))
-        except (StoreError, ValueError, TypeError, KeyError):
-            continue
-        # Of a deleted array the fill values are left.
-        if not np.isnan(stored).any():
-            expected = columns[name][1]
-            agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
+            # Of a deleted array the fill values are left.
+            if not np.isnan(stored).any():
+                agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
     if agree and not (all if is_trusted else any)(agree):
         raise StoreError(
             f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
@@ -278,11 +251,12 @@ def _check_same_study(store: Store, plan: Plan) -> None:
     may_change = plan.study.accuracy is not None and study.get("choice")
     comparisons = [("the study", repr(study["name"]), repr(plan.study.name))]
     if not may_change:
-        planned = _lattice_entry(plan)["lattice"]
-        comparisons += [
-            ("a lattice of", _describe(study["lattice"]), _describe(planned)),
-            ("dtype", repr(study["dtype"]), repr(plan.choice.dtype)),
-        ]
+        old_lattice, new_lattice = (
+            f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
+            for lattice in (study["lattice"], _lattice_entry(plan)["lattice"])
+        )
+        comparisons.append(("a lattice of", old_lattice, new_lattice))
+        comparisons.append(("dtype", repr(study["dtype"]), repr(plan.choice.dtype)))
         old, new = study.get("octaves"), plan.choice.octaves
         if old != new:
             first, second = (str(len(table["octaves"])) if table else "none" for table in (old, new))
@@ -298,13 +272,8 @@ def _check_same_study(store: Store, plan: Plan) -> None:
 def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
     """Return a label for each stored row, followed by the labels of new meshes.
 
-    A row whose mesh the study has lost gets the label of a new mesh with the same field.
-
-    Args:
-        plan: Plan of the study.
-        stored: Stored labels; empty where they are not known.
-        records: Completion records of the rows.
-        is_trusted: False where only the key in a record is believed to say whose field it is.
+    A row whose mesh the study has lost gets the label of a new mesh with the same field. Labels that are not trusted
+    count only where the key of the record is that of their mesh.
     """
     planned = {row.label: row.key for row in plan.rows}
     labels = [
@@ -345,10 +314,6 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
         "similarity": _similarity_entry(plan.similarity),
         "versions": {name: version(name) for name in _RECORDED_VERSIONS},
     }
-
-
-def _describe(lattice: dict[str, Any]) -> str:
-    return f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:

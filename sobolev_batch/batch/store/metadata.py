@@ -48,9 +48,9 @@ def check_documents(store: str, documents: Mapping[str, Any]) -> None:
         problem = _problem(name, document)
         if problem:
             raise StoreError(f"{store}: the store is not used: {problem}; this program did not write that")
-        if document["node_type"] == "group":
-            prefix = f"{name}/" if name else ""
-            nodes = (document.get("consolidated_metadata") or {}).get("metadata") or {}
+        # zarr repeats in each group what the root has.
+        if document.get("consolidated_metadata"):
+            nodes, prefix = document["consolidated_metadata"]["metadata"], f"{name}/" if name else ""
             check_documents(store, {f"{prefix}{path}": node for path, node in nodes.items()})
 
 
@@ -68,17 +68,13 @@ def _problem(name: str, document: Any) -> str:
         return f"{node} has metadata {_shown(min(unknown))}"
     if not isinstance(document.get("attributes", {}), dict):
         return f"the attributes of {node} are no table"
-    return _problem_of_group(node, document) if kind == "group" else _problem_of_array(node, document)
-
-
-def _problem_of_group(node: str, document: Document) -> str:
-    consolidated = document.get("consolidated_metadata")
-    if consolidated is None:
-        return ""
-    is_inline = isinstance(consolidated, dict) and consolidated.get("kind") == "inline"
-    if not is_inline or not isinstance(consolidated.get("metadata"), dict):
+    if kind == "array":
+        return _problem_of_array(node, document)
+    consolidated = document.get("consolidated_metadata") or {"kind": "inline", "metadata": {}}
+    nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+    if not isinstance(nodes, dict) or consolidated.get("kind") != "inline":
         return f"the consolidated metadata of {node} are {_shown(consolidated)}"
-    return ""
+    return "a node is named ''" if "" in nodes else ""
 
 
 def _problem_of_array(node: str, document: Document) -> str:

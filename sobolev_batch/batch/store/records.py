@@ -6,7 +6,7 @@ import json
 from collections.abc import Hashable
 from dataclasses import asdict, dataclass
 from functools import cache
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -18,14 +18,31 @@ RunState = Literal["submitted", "running", "done", "failed"]
 _ROW = "row"
 
 
+Kind = TypeVar("Kind")
+
+
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors(include_url=False)[0]
-    return ": ".join(filter(None, (".".join(map(str, problem["loc"])), problem["msg"])))
+def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:
+    """Return the record that a table holds.
+
+    Raises:
+        DamageError: The table is not such a record; the message begins with the name.
+    """
+    try:
+        record: Kind = _adapter(cast(Hashable, kind)).validate_python(table)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
+        raise _damage(name, problem, table) from error
+    return record
+
+
+def _damage(name: str, problem: str, content: object) -> DamageError:
+    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}", problem)
 
 
 @dataclass(frozen=True)
@@ -129,18 +146,15 @@ class Record:
         """
         if not text:
             return None
+        name = "a completion record"
         try:
             table = dict(json.loads(text))
-            stored_row = table.pop(_ROW, None)
-            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
-        except ValidationError as error:
-            problem = _first_problem(error)
         except (ValueError, TypeError, RecursionError) as error:
-            problem = f"no table: {error}"
-        else:
-            problem = "" if stored_row == row else f"it is that of row {stored_row!r}"
-        if problem:
-            raise DamageError(f"a completion record is damaged ({problem}): {text[:80]!r}", problem)
+            raise _damage(name, f"no table: {error}", text) from error
+        stored_row = table.pop(_ROW, None)
+        record = record_from_table(cls, table, name)
+        if stored_row != row:
+            raise _damage(name, f"it is that of row {stored_row!r}", text)
         return record
 
 
@@ -163,21 +177,3 @@ class RunRecord:
     seen: str
     stage: str = ""
     error: str = ""
-
-    def to_table(self) -> dict[str, str]:
-        """Return the record as a table."""
-        return asdict(self)
-
-    @classmethod
-    def from_table(cls, table: dict[str, str]) -> Self:
-        """Return the record that a table holds.
-
-        Raises:
-            DamageError: The table is not a record.
-        """
-        try:
-            record: Self = _adapter(cast(Hashable, cls)).validate_python(table)
-        except ValidationError as error:
-            problem = _first_problem(error)
-            raise DamageError(f"the record of the latest run is damaged ({problem}): {table}", problem) from error
-        return record

@@ -13,9 +13,9 @@ import hashlib
 import json
 import logging
 import math
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any, Self
@@ -23,11 +23,9 @@ from typing import Any, Self
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.abc.buffer import Buffer
 from zarr.abc.store import Store as ZarrStore
-from zarr.buffer.cpu import Buffer as BytesBuffer
 from zarr.buffer.cpu import NDBuffer
-from zarr.storage import MemoryStore, StorePath
+from zarr.storage import StorePath
 
 from sobolev_batch.batch.storage.checked import (
     CHANGED,
@@ -38,14 +36,16 @@ from sobolev_batch.batch.storage.checked import (
 )
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
-from sobolev_batch.batch.store.records import Record, RunRecord
+from sobolev_batch.batch.store.records import Record, RunRecord, record_from_table
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import AXES, Block, Lattice
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 
 _log = logging.getLogger(__name__)
 
-BlockSlices = tuple[slice, slice, slice]
+# Of a field's values: slices of a block of the lattice, or the slice of all samples of octaves.
+Place = tuple[slice, ...]
 
 ROOT = "zarr.json"
 FIELD = "fourier/fourier"
@@ -113,8 +113,8 @@ class Store:
             root = self._read_document("")
             if root is None:
                 return False
-            # Groups repeat the metadata of what is in them, as the root does.
             for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
+                # zarr repeats in each group what the root has.
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
             self.documents[""] = root
@@ -148,6 +148,15 @@ class Store:
             )
         return attributes
 
+    def choice(self) -> LatticeChoice:
+        """Return the lattice of all fields, with the octaves beside it."""
+        study = self.attributes()["study"]
+        if study.get("choice"):
+            return LatticeChoice.from_table(study["choice"], study.get("octaves"))
+        octaves = study.get("octaves")
+        tail = None if octaves is None else TailSampling.from_table(octaves)
+        return LatticeChoice(Lattice(**study["lattice"]), study["dtype"], tail=tail)
+
     @property
     def is_unfinished(self) -> bool:
         """True if the creation of the store was not finished: nothing in it counts."""
@@ -178,39 +187,29 @@ class Store:
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
-        chunk = self.document(name)["chunk_grid"]["configuration"]["chunk_shape"]
-        keys = self.location.zarr_store(math.prod(chunk) * np.dtype(np.complex128).itemsize)
         # The values of fields are compared with their records, which does more.
-        store = keys if name in (FIELD, OCTAVES) else CheckedStore(keys, self.path, self.documents)
-        path = StorePath(store, name)
+        path = StorePath(self._keys(name) if name in (FIELD, OCTAVES) else self.checked_keys(name), name)
         metadata = zarr.AsyncArray.from_dict(path, self.document(name)).metadata
         # Chunks of zeros are data too: they must exist, or they would read as never computed.
         return zarr.Array(zarr.AsyncArray(metadata, path, config={"write_empty_chunks": True}))
 
-    def checked_keys(self) -> ZarrStore:
-        """Return the store that zarr and xarray take to read all arrays, whose chunks are checked."""
-        chunk = self.document(FIELD)["chunk_grid"]["configuration"]["chunk_shape"]
-        keys = self.location.zarr_store(math.prod(chunk) * np.dtype(np.complex128).itemsize)
-        return CheckedStore(keys, self.path, self.documents)
+    def checked_keys(self, largest: str = FIELD) -> ZarrStore:
+        """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked."""
+        return CheckedStore(self._keys(largest), self.path, self.documents)
+
+    def _keys(self, largest: str) -> ZarrStore:
+        chunk = self.document(largest)["chunk_grid"]["configuration"]["chunk_shape"]
+        return self.location.zarr_store(math.prod(chunk) * np.dtype(np.complex128).itemsize)
 
     def read(self, name: str, selection: Any = ...) -> Any:
-        """Return a selection of an array.
-
-        Raises:
-            DamageError: The array is damaged.
-            StoreError: The store cannot be read.
-        """
+        """Return a selection of an array; a damaged one raises a `DamageError`."""
         array = self.array(name)
         # Each record is a chunk, and a chunk a request.
         with self.location.access("read"), zarr.config.set({"async.concurrency": _REQUESTS_AT_ONCE}):
             return array[selection]
 
     def read_strings(self, name: str) -> tuple[str, ...]:
-        """Return all elements of an array of strings.
-
-        Raises:
-            DamageError, StoreError: See `read`.
-        """
+        """Return all elements of an array of strings; see `read`."""
         return tuple(map(str, np.asarray(self.read(name)).tolist()))
 
     def write(self, name: str, selection: Any, values: Any) -> None:
@@ -220,24 +219,17 @@ class Store:
         with self.location.access("written"):
             array[selection] = values
 
-    def publish(self, keys: Mapping[str, bytes], last: str = "") -> None:
-        """Write keys of new nodes, and the last one after all others. Readers find the nodes after `consolidate`."""
-        self.location.write({key: content for key, content in keys.items() if key != last})
-        if last in keys:
-            self.location.write({last: keys[last]})
+    def publish(self, keys: Mapping[str, bytes]) -> None:
+        """Write keys of new nodes. Readers find the nodes after `consolidate`."""
+        self.location.write(keys)
         for key, content in keys.items():
             self._hashes[key] = hashlib.sha256(content).hexdigest()
             if key.endswith(f"/{ROOT}"):
                 self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
 
-    def hide(self, names: Iterable[str]) -> None:
-        """Forget nodes. They stay, but readers do not find them after `consolidate`."""
-        for name in names:
-            del self.documents[name]
-
     def remove(self, group: str) -> None:
         """Remove a group and everything in it, first from what readers find."""
-        self.hide([name for name in self.documents if name == group or name.startswith(f"{group}/")])
+        self.documents = {name: document for name, document in self.documents.items() if name.split("/")[0] != group}
         self.consolidate()
         self.location.remove(group)
         self._forget(group)
@@ -258,17 +250,11 @@ class Store:
             return False
 
     def _root(self) -> Document:
-        """Return the document at the root with those of all nodes, and without the digest."""
+        """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
         attributes = {name: value for name, value in self.documents[""]["attributes"].items() if name != DIGEST}
-        documents = {**self.documents, "": {**self.documents[""], "attributes": attributes}}
-        keys: dict[str, Buffer] = {
-            f"{name}/{ROOT}".lstrip("/"): BytesBuffer.from_bytes(json.dumps(document).encode())
-            for name, document in documents.items()
-        }
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
-            zarr.consolidate_metadata(MemoryStore(keys), zarr_format=3)
-        return dict(json.loads(keys[ROOT].to_bytes()))
+        nodes = {name: self.documents[name] for name in sorted(self.documents) if name}
+        consolidated = {"kind": "inline", "must_understand": False, "metadata": nodes}
+        return {**self.documents[""], "attributes": attributes, "consolidated_metadata": consolidated}
 
     def _digest(self, root: Document) -> str:
         """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
@@ -295,12 +281,7 @@ class Store:
         return {"/".join([f"{name}/c", *map(str, index)]): index for index in np.ndindex(*counts)}
 
     def incomplete_chunks(self, name: str, sizes: Mapping[str, int]) -> list[tuple[int, ...]]:
-        """Return the indices of the chunks of an array that are missing, or of a wrong length. No chunk is read.
-
-        Args:
-            name: Path of the array.
-            sizes: Sizes of its keys.
-        """
+        """Return the indices of an array's chunks that are missing, or of a wrong length by the sizes of its keys."""
         document = self.document(name)
         expected = 0
         # Strings have no size that is known in advance.
@@ -327,12 +308,7 @@ class Store:
     # Labels and records
 
     def labels(self) -> tuple[str, ...]:
-        """Return the label of each row.
-
-        Raises:
-            DamageError: They cannot be read.
-            StoreError: The store cannot be read.
-        """
+        """Return the label of each row."""
         return self.read_strings(LABELS)
 
     def examine_records(self) -> tuple[list[Record | None], dict[int, str]]:
@@ -395,80 +371,85 @@ class Store:
         digest = table.pop(DIGEST, "")
         if digest != _digest_of(table):
             raise DamageError(f"{self.path}: the record of the latest run is damaged ({CHANGED}): {table}", CHANGED)
-        return RunRecord.from_table(table)
+        return record_from_table(RunRecord, table, f"{self.path}: the record of the latest run")
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, in one key."""
         document = self.document(RECORDS)
         # Not remembered: consolidated metadata would tell readers of a run that ended long ago.
-        run = {**record.to_table(), DIGEST: _digest_of(record.to_table())}
+        run = {**asdict(record), DIGEST: _digest_of(asdict(record))}
         changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
         self.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
 
     # Fields
 
-    @property
-    def has_octaves(self) -> bool:
-        """True if values in octaves lie beside the fields."""
-        return OCTAVES in self.documents
-
-    def block_slices(self) -> tuple[BlockSlices, ...]:
-        """Return the slices of a field's blocks, in the order of a plan's blocks."""
+    def places(self) -> tuple[Place, ...]:
+        """Return the places of a field's values: its blocks, in the order of a plan's blocks, and then its octaves."""
         array = self.array(FIELD)
         axes = [
             [slice(start, min(start + step, total)) for start in range(0, total, step)]
             for total, step in zip(array.shape[1:], array.chunks[1:], strict=True)
         ]
-        return tuple((x, y, z) for x, y, z in product(*axes))
+        octaves = [(slice(0, self.document(OCTAVES)["shape"][1]),)] if OCTAVES in self.documents else []
+        return (*product(*axes), *octaves)
 
     def blocks_of(self, lattice: Lattice) -> tuple[Block, ...]:
-        """Return the blocks of a field on its lattice, in the order of `block_slices`."""
+        """Return the blocks of a field on its lattice, in the order of `places`."""
         x, y, z = lattice.half.start
         return tuple(
             Block((x + i.start, y + j.start, z + k.start), (i.stop - i.start, j.stop - j.start, k.stop - k.start))
-            for i, j, k in self.block_slices()
+            for i, j, k in (place for place in self.places() if len(place) == len(AXES))
         )
 
-    def write_field(self, row: int, block: BlockSlices, values: NDArray[Any]) -> int:
-        """Write one block of a row's field, made of whole chunks, and return its checksum for `read_fields`."""
-        return self._write_chunks(FIELD, (row, *block), values)
+    def write_field(self, row: int, place: Place, values: NDArray[Any]) -> int:
+        """Write a row's values at a place, made of whole chunks, and return their checksum for `read_fields`."""
+        array = self.array(_array_at(place))
+        values = np.ascontiguousarray(values, dtype=array.dtype)
+        with self.location.access("written"):
+            array.set_basic_selection((row, *place), values)
+        return checksum_of(values)
 
-    def write_octaves(self, row: int, values: NDArray[Any]) -> int:
-        """Write a row's values at all samples of octaves, one chunk, and return their checksum for `read_octaves`."""
-        return self._write_chunks(OCTAVES, (row, slice(None)), values)
-
-    def read_octaves(self, rows: Sequence[int], checksums: Sequence[int] | None = None) -> NDArray[Any]:
-        """Return the values of several rows at all samples of octaves, complex (len(rows), n); see `read_fields`."""
-        return self._read_rows(OCTAVES, rows, (slice(0, self.array(OCTAVES).shape[1]),), checksums)
-
-    def read_fields(
-        self, rows: Sequence[int], block: BlockSlices, checksums: Sequence[int] | None = None
-    ) -> NDArray[Any]:
-        """Return one block of several rows' fields, complex (len(rows), ...).
+    def read_fields(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
+        """Return the values of several rows at a place, complex (len(rows), ...).
 
         Args:
             rows: Rows to read.
-            block: Slices of the block.
-            checksums: Checksums that the tasks returned for the block of each row. Without them, a missing block
-                reads as NaN.
+            place: Slices of a block of the lattice, or the slice of all samples of octaves.
+            checksums: Checksum of each row's values, which the tasks returned. Without them, missing values read as
+                NaN.
 
         Raises:
-            DamageError: A block is damaged, lost, or another one; the error names its row.
+            DamageError: Values are damaged, lost, or others; the error names their row.
             StoreError: The store cannot be read.
         """
-        return self._read_rows(FIELD, rows, block, checksums)
+        array = self.array(_array_at(place))
+        values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=array.dtype)
+        # On object storage, all but a wrong checksum is a failure of the access.
+        damage = ValueError if self.location.scheme else (OSError, ValueError)
+
+        def read(i: int) -> None:
+            with self.location.access("read"):
+                try:
+                    # In place: copying a field costs as much as reading it.
+                    array.get_basic_selection((rows[i], *place), out=NDBuffer.from_numpy_array(values[i]))
+                except damage as error:
+                    raise self._damage(rows[i], str(error)) from error
+            if checksums is not None and checksum_of(values[i]) != checksums[i]:
+                lost = bool(np.isnan(values[i]).all())
+                raise self._damage(rows[i], "it is not there" if lost else "it is not what was written for its record")
+
+        # Most of the time of a request is spent waiting.
+        with ThreadPoolExecutor(max(1, len(rows)) if self.location.scheme else 1) as pool:
+            list(pool.map(read, range(len(rows))))
+        return values
 
     def damage_of_field(self, row: int, record: Record) -> str:
         """Read the field of a row, and return how it differs from its record; empty if it does not."""
-        places, checksums = self.block_slices(), list(record.checksums)
-        count = len(places) + self.has_octaves
-        if len(checksums) != count:
-            return f"its record knows of {len(checksums)} blocks, and the store has {count}"
+        places = self.places()
+        if len(record.checksums) != len(places):
+            return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
         try:
-            if self.has_octaves:
-                # Behind those of the field.
-                self.read_octaves([row], [checksums.pop()])
-            for place, checksum in zip(places, checksums, strict=True):
+            for place, checksum in zip(places, record.checksums, strict=True):
                 self.read_fields([row], place, [checksum])
         except DamageError as error:
             return error.what
@@ -477,44 +458,9 @@ class Store:
     def rows_with_complete_fields(self) -> set[int]:
         """Return the rows whose blocks all exist in their full length. No block is read."""
         rows = set(range(self.document(FIELD)["shape"][0]))
-        for name in (FIELD, OCTAVES) if self.has_octaves else (FIELD,):
+        for name in self.documents.keys() & {FIELD, OCTAVES}:
             rows -= {index[0] for index in self.incomplete_chunks(name, self.location.sizes(f"{name}/c"))}
         return rows
-
-    def _write_chunks(self, name: str, selection: tuple[int | slice, ...], values: NDArray[Any]) -> int:
-        array = self.array(name)
-        values = np.ascontiguousarray(values, dtype=array.dtype)
-        with self.location.access("written"):
-            array[selection] = values
-        return checksum_of(values)
-
-    def _read_rows(
-        self, name: str, rows: Sequence[int], block: tuple[slice, ...], checksums: Sequence[int] | None
-    ) -> NDArray[Any]:
-        array = self.array(name)
-        values = np.empty((len(rows), *(axis.stop - axis.start for axis in block)), dtype=array.dtype)
-        # On object storage, all but a wrong checksum is a failure of the access.
-        damage = ValueError if self.location.scheme else (OSError, ValueError)
-
-        def read(i: int) -> None:
-            with self.location.access("read"):
-                try:
-                    # In place: copying a field costs as much as reading it.
-                    array.get_basic_selection((rows[i], *block), out=NDBuffer.from_numpy_array(values[i]))
-                except damage as error:
-                    raise self._damage(rows[i], str(error)) from error
-            if checksums is not None and checksum_of(values[i]) != checksums[i]:
-                lost = bool(np.isnan(values[i]).all())
-                raise self._damage(rows[i], "it is not there" if lost else "it is not what was written for its record")
-
-        if self.location.scheme and len(rows) > 1:
-            # Most of the time of a request is spent waiting.
-            with ThreadPoolExecutor(len(rows)) as pool:
-                list(pool.map(read, range(len(rows))))
-        else:
-            for i in range(len(rows)):
-                read(i)
-        return values
 
     def _damage(self, row: int, problem: str) -> DamageError:
         label = self._labels_or_numbers(row + 1)[row]
@@ -527,6 +473,10 @@ class Store:
             return self.labels()
         except DamageError:
             return [f"row {row}" for row in range(count)]
+
+
+def _array_at(place: Place) -> str:
+    return FIELD if len(place) == len(AXES) else OCTAVES
 
 
 def _digest_of(table: Any) -> str:
@@ -548,5 +498,4 @@ def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
             return None
     except DamageError:
         return None
-    study = existing.attributes()["study"]
-    return LatticeChoice.from_table(study["choice"], study.get("octaves")) if study.get("choice") else None
+    return existing.choice() if existing.attributes()["study"].get("choice") else None

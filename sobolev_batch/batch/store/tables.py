@@ -75,36 +75,22 @@ def _bytes_of(keys: dict[str, Buffer]) -> dict[str, bytes]:
     return {key: value.to_bytes() for key, value in keys.items() if key != ROOT}
 
 
-def hide_tables(store: Store) -> tuple[str, ...]:
-    """Hide the tables from readers until they are written and listed again, and return their names.
-
-    While they are written they do not fit together.
-    """
-    names = tuple(table_names(store))
+def hide_tables(store: Store) -> list[str]:
+    """Hide the tables, which do not fit together while they are written, and return the names of their nodes."""
+    names = table_names(store)
     if names:
-        store.hide(names)
+        store.documents = {name: document for name, document in store.documents.items() if name not in names}
         store.consolidate()
     return names
 
 
-def write_table(store: Store, group: str, dataset: xr.Dataset, *, instead_of: Sequence[str] = ()) -> None:
-    """Replace a group. Readers find it after `Store.consolidate`.
-
-    Args:
-        store: Store of the table.
-        group: Name of the group.
-        dataset: New content of the group.
-        instead_of: Names of tables that were hidden. Those that the group no longer has are removed.
-    """
-    for name in instead_of:
-        if name.startswith(f"{group}/") and name.removeprefix(f"{group}/") not in dataset.variables:
-            store.location.remove(name)
-    last, large = f"{group}/{ROOT}", [name for name, values in dataset.items() if values.nbytes > _LARGEST_CHUNK_BYTES]
+def write_table(store: Store, group: str, dataset: xr.Dataset) -> None:
+    """Write a group. Readers find it after `Store.consolidate`."""
+    large = [name for name, values in dataset.items() if values.nbytes > _LARGEST_CHUNK_BYTES]
+    store.publish(dataset_keys(group, dataset.drop_vars(large)))
     # One after the other, since keys are copies.
-    for array in large:
-        keys = dataset_keys(group, dataset[[array]].drop_vars(list(dataset.coords)))
-        store.publish({key: content for key, content in keys.items() if key != last})
-    store.publish(dataset_keys(group, dataset.drop_vars(large)), last=last)
+    for name in large:
+        store.publish(dataset_keys(group, dataset[[name]].drop_vars(list(dataset.coords))))
 
 
 def table_attributes(store: Store, group: str) -> dict[str, Any] | None:
@@ -143,24 +129,17 @@ def damaged_tables(store: Store) -> dict[str, str]:
 def rows_unlike_tables(
     store: Store, records: Sequence[Record | None], among: Collection[int] | None = None
 ) -> dict[int, str]:
-    """Return how records differ from those that the tables were made from, by their rows.
-
-    Args:
-        store: Store of the tables.
-        records: Record of each row, or None.
-        among: Rows to compare; all of them by default.
-    """
+    """Return how records differ from those that the tables were made from, by their rows; of some rows, or of all."""
     if table_attributes(store, "convergence") is None:
         return {}
-    rows, statuses, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+    columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+    tabulated = {row: entry for row, *entry in zip(*columns, strict=True) if among is None or row in among}
     unlike = {}
-    for row, status, key in zip(rows, statuses, keys, strict=True):
-        if among is not None and row not in among:
-            continue
+    for row, entry in tabulated.items():
         record = records[row] if row < len(records) else None
-        if record is None and status != "missing":
+        if record is None and entry[0] != "missing":
             unlike[row] = "its completion record is missing"
-        elif record is not None and (record.status, record.key) != (status, key):
+        elif record is not None and [record.status, record.key] != entry:
             unlike[row] = "its completion record is not the one that the tables were made from"
     return unlike
 

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import sobolev_batch as sb
 from tests.support.studies import small_table, variable
+
+pytestmark = pytest.mark.slow
 
 # Levels of icospheres by the names of their files: names and triangles say different things.
 LEVELS = {"a10": 1, "a9": 2, "b": 0}
@@ -32,31 +35,32 @@ def store_of(folder: Path) -> str:
     return f"memory://{folder.as_posix().strip('/').replace('/', '-')}.zarr"
 
 
+def table(folder: Path) -> pd.DataFrame:
+    """Return the rows of order -3 by the names of the meshes, in their order."""
+    return sb.table(store_of(folder), -3).set_index("name")
+
+
 def names(folder: Path) -> list[str]:
-    return list(sb.table(store_of(folder), -3)["name"])
+    return list(table(folder).index)
 
 
-@pytest.mark.slow
-def test_files_go_from_few_triangles_to_many_and_have_rates(folder: Path) -> None:
+def test_files_go_from_few_triangles_to_many_and_have_rates_unless_a_key_orders_them(folder: Path) -> None:
+    (folder / "a0.ply").write_text("no mesh")
     run(folder)
-    frame = sb.table(store_of(folder), -3)
-    assert frame["name"].tolist() == ["b", "a10", "a9"]
-    assert frame["rank"].tolist() == [0, 1, 2]
-    assert frame["ordered_by"].tolist() == ["triangles"] * 3
-    assert frame["rate"].round().tolist()[1:] == [2, 2]
-
-
-@pytest.mark.slow
-def test_a_key_orders_by_names_naturally_and_then_there_are_no_rates(folder: Path) -> None:
+    frame = table(folder)
+    # A mesh that failed comes last.
+    assert frame.index.tolist() == ["b", "a10", "a9", "a0"]
+    assert frame["rank"].tolist() == [0, 1, 2, 3]
+    assert frame["ordered_by"].tolist() == ["triangles"] * 4
+    assert frame["rate"].round().tolist()[1:3] == [2, 2]
+    # The key alone makes the tables anew.
     run(folder, order_by="names")
-    frame = sb.table(store_of(folder), -3)
-    assert frame["name"].tolist() == ["a9", "a10", "b"]
-    assert frame["rate"].isna().all()
+    assert names(folder) == ["a0", "a9", "a10", "b"]
+    assert table(folder)["rate"].isna().all()
     run(folder)
-    assert names(folder) == ["b", "a10", "a9"], "the key alone makes the tables anew"
+    assert names(folder) == ["b", "a10", "a9", "a0"]
 
 
-@pytest.mark.slow
 def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
     ball = sb.icosphere(1)
     draw = np.random.default_rng(1)
@@ -65,14 +69,13 @@ def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
         # A triangle more or less makes none of them finer.
         sb.write_mesh(sb.Mesh(vertices, ball.triangles[int(10 * noise) :]), tmp_path / f"scan_{noise}.ply")
     run(tmp_path)
-    frame = sb.table(store_of(tmp_path), -3)
+    frame = table(tmp_path)
     assert frame["ordered_by"].tolist() == ["names"] * 3
     assert frame["rate"].isna().all()
     run(tmp_path, order_by="triangles")
-    assert sb.table(store_of(tmp_path), -3)["rate"].notna().any()
+    assert table(tmp_path)["rate"].notna().any()
 
 
-@pytest.mark.slow
 def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:
     for name in ("x10", "x9"):
         sb.write_mesh(sb.icosphere(0), tmp_path / f"{name}.ply")
@@ -80,14 +83,6 @@ def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:
     assert names(tmp_path) == ["x9", "x10"]
 
 
-@pytest.mark.slow
-def test_a_mesh_that_failed_comes_last(folder: Path) -> None:
-    (folder / "a0.ply").write_text("no mesh")
-    run(folder)
-    assert names(folder) == ["b", "a10", "a9", "a0"]
-
-
-@pytest.mark.slow
 def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folder: Path) -> None:
     run(folder)
     path, away = folder / "a10.ply", folder / "a10.away"
@@ -95,7 +90,9 @@ def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folde
     summary = run(folder)
     assert summary.computed == ()
     assert "f/a10" not in summary.reused
+    # The rate bridges the mesh that is gone.
     assert names(folder) == ["b", "a9"]
+    assert round(table(folder)["rate"]["a9"]) == 2
     tree = sb.open_store(store_of(folder))
     assert "f/a10" not in variable(tree, "distances", "other").values
     assert sb.status(store_of(folder)).total == 3
@@ -104,39 +101,19 @@ def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folde
     assert names(folder) == ["b", "a10", "a9"]
 
 
-@pytest.mark.slow
-def test_the_rate_of_a_mesh_bridges_a_removed_one(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("renames", "computed"), [([("a9", "fine")], ()), ([("a9", "c"), ("b", "a9"), ("c", "b")], ("f/a9", "f/b"))]
+)
+def test_renamed_meshes_keep_their_fields_and_swapped_names_are_not_mixed_up(
+    folder: Path, renames: list[tuple[str, str]], computed: tuple[str, ...]
+) -> None:
     run(folder)
-    (folder / "a10.ply").unlink()
-    run(folder)
-    rates = sb.table(store_of(folder), -3).set_index("name")["rate"]
-    assert round(rates["a9"]) == 2
-
-
-@pytest.mark.slow
-def test_renamed_meshes_keep_their_fields(folder: Path) -> None:
-    run(folder)
-    before = sb.table(store_of(folder), -3).set_index("name")["distance"]
-    (folder / "a9.ply").rename(folder / "fine.ply")
-    assert run(folder).computed == ()
-    after = sb.table(store_of(folder), -3).set_index("name")["distance"]
-    assert after["fine"] == before["a9"]
-    assert set(variable(sb.open_store(store_of(folder)), "fourier", "mesh").values) == {
-        "f/b",
-        "f/a10",
-        "f/fine",
-        "reference",
-    }
-    assert sb.verify(store_of(folder)).is_sound
-
-
-@pytest.mark.slow
-def test_names_that_files_swap_are_not_mixed_up(folder: Path) -> None:
-    run(folder)
-    before = sb.table(store_of(folder), -3).set_index("name")["distance"]
-    for old, new in (("a9", "c"), ("b", "a9"), ("c", "b")):
+    expected = table(folder)["distance"]
+    for old, new in renames:
         (folder / f"{old}.ply").rename(folder / f"{new}.ply")
-    run(folder)
-    after = sb.table(store_of(folder), -3).set_index("name")["distance"]
-    assert after["a9"] == before["b"]
-    assert after["b"] == before["a9"]
+        expected = expected.rename({old: new})
+    assert run(folder).computed == computed
+    pd.testing.assert_series_equal(table(folder)["distance"], expected)
+    labels = {"reference", *(f"f/{name}" for name in expected.index)}
+    assert set(variable(sb.open_store(store_of(folder)), "fourier", "mesh").values) == labels
+    assert sb.verify(store_of(folder)).is_sound

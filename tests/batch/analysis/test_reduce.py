@@ -11,7 +11,7 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, open_store, run, verify
-from sobolev_batch.batch.analysis.reduce import Results
+from sobolev_batch.batch.analysis.tabulate import Results
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import tables
 from sobolev_batch.batch.store.store import Store
@@ -21,10 +21,10 @@ from tests.support.studies import small_table
 
 
 def test_tiles_enter_the_order_of_tables_without_a_copy() -> None:
-    rows, orders = [7, 3, 5], 2
-    results = Results.empty(orders, rows, every_pair=True)
+    meshes = xr.Dataset({"row": ("mesh", [7, 3, 5])}, coords={"mesh": ["a", "b", "c"]})
+    results = Results.empty(meshes, "a", (-2.0, -1.0), every_pair=True)
     whole = results.distances
-    pairs = np.random.default_rng(0).uniform(size=(5, orders, 2, 1))
+    pairs = np.random.default_rng(0).uniform(size=(5, 2, 2, 1))
     results.enter_tile(NormEstimate(*pairs), [5, 7], [3])
     assert results.distances is whole
     np.testing.assert_array_equal(whole[..., [2, 0], :][..., [1]], pairs)

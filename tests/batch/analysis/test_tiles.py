@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Sphere, Study, fourier_transform, proportion
-from sobolev_batch.batch.analysis.tiles import Reducer
+from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
@@ -59,6 +59,14 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
     )
 
 
+def norms_of(values: NDArray[np.complex128], reducer: Reducer) -> NDArray[np.float64]:
+    """The norms (orders, ...) of fields (..., shape of the lattice), straight from their sums over shells."""
+    lattice = reducer.lattice
+    sums = shell_sums(values.reshape(-1, *lattice.shape), None, lattice, lattice.half)
+    norms = np.sqrt(SobolevWeights(lattice, reducer.orders).per_shell @ sums.T)
+    return norms.reshape(-1, *values.shape[:-3])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1, 2, 500])
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 11, 200])
@@ -83,7 +91,6 @@ def test_many_workers_get_smaller_tiles(reducer: Reducer) -> None:
 
 
 def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
-    lattice = reducer.lattice
     found = np.full((2, ROWS, ROWS), np.nan)
     for rows, others in reducer.tiles(list(range(ROWS)), 1):
         values = reducer.tile(rows, others).values
@@ -91,10 +98,7 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
         found[:, np.array(others)[:, None], np.array(rows)] = np.swapaxes(values, 1, 2)
     assert np.array_equal(found, np.swapaxes(found, 1, 2))
     assert (np.diagonal(found, axis1=1, axis2=2) == 0).all()
-    weights = SobolevWeights(lattice, reducer.orders).per_shell
-    for i in range(ROWS):
-        sums = shell_sums(fields - fields[i], None, lattice, lattice.half)
-        assert found[:, i] == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-10)
+    assert found == pytest.approx(norms_of(fields[:, None] - fields, reducer), rel=1e-10)
 
 
 def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,27 +113,18 @@ def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, mon
 @pytest.mark.parametrize(("rows", "others"), [([0, 1], [3, 4, 9]), ([2], [9]), ([5], [6, 7, 8])])
 @pytest.mark.parametrize("fitting", [5, 3])
 def test_tiles_whose_others_are_all_other_rows(
-    reducer: Reducer,
-    fields: NDArray[np.complex128],
-    rows: list[int],
-    others: list[int],
-    fitting: int,
+    reducer: Reducer, fields: NDArray[np.complex128], rows: list[int], others: list[int], fitting: int
 ) -> None:
     reducer = replace(reducer, tile_bytes=fitting * 16 * reducer.blocks[0].size)
-    found = reducer.tile(rows, others).values
-    lattice = reducer.lattice
-    differences = (fields[rows][:, None] - fields[others]).reshape(-1, *lattice.shape)
-    sums = shell_sums(differences, None, lattice, lattice.half)
-    expected = np.sqrt(SobolevWeights(lattice, reducer.orders).per_shell @ sums.T).reshape(found.shape)
-    assert found == pytest.approx(expected, rel=1e-10)
+    expected = norms_of(fields[rows][:, None] - fields[others], reducer)
+    assert reducer.tile(rows, others).values == pytest.approx(expected, rel=1e-10)
 
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
-    norms, to_reference, (areas, shapes, _) = reducer.norms([1, 3, REFERENCE])
-    weights = SobolevWeights(reducer.lattice, reducer.orders).per_shell
+    rows = [1, 3, REFERENCE]
+    norms, to_reference, (areas, shapes, _) = reducer.norms(rows)
     for found, values in (norms, fields), (to_reference, fields - fields[REFERENCE]):
-        sums = shell_sums(values[[1, 3, REFERENCE]], None, reducer.lattice, reducer.lattice.half)
-        assert found.values == pytest.approx(np.sqrt(weights @ sums.T), rel=1e-13)
+        assert found.values == pytest.approx(norms_of(values[rows], reducer), rel=1e-13)
     # The parts of each distance are those of the library, whatever the chunks.
     for row, area, shape in zip([1, 3], areas.T, shapes.T, strict=False):
         known = fourier_transform(Sphere(0.1), reducer.lattice)

@@ -73,7 +73,7 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     def refuse(*arguments: Any) -> None:
         raise AssertionError("it is written again")
 
-    for name in ("write_field", "write_octaves", "write_record"):
+    for name in ("write_field", "write_record"):
         monkeypatch.setattr(type(job.store), name, refuse)
     again = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
     # Those whose worker was lost are done again; the results of others may be there still.

@@ -63,6 +63,12 @@ NOT_WRITTEN_HERE: dict[str, tuple[str, Document, str]] = {
     "huge": ("fourier/mesh", {"shape": [10**15]}, r"fourier/mesh has the shape [1000000000000000]"),
     "huge table": ("convergence/relative", {"shape": [10**8, 10**7]}, "convergence/relative has the shape [100000000"),
     "negative": ("fourier/mesh", {"shape": [-1]}, "fourier/mesh has the shape [-1]"),
+    "repeated": (
+        "norms",
+        {"consolidated_metadata": {"kind": "inline", "metadata": {"b": {"node_type": "array", "zarr_format": 3}}}},
+        "the data type of norms/b is None",
+    ),
+    "not inline": ("", {"consolidated_metadata": {"kind": "x"}}, "the consolidated metadata of the root are {'kind'"),
     "attributes": ("norms", {"attributes": []}, "the attributes of norms are no table"),
 }
 
@@ -86,13 +92,6 @@ def test_nodes_with_other_names(copy: Path, name: str) -> None:
     change(copy, "", add)
     (said,) = refusals(copy)
     assert "a node is named" in said or "has metadata 'codecs'" in said
-
-
-def test_what_a_group_repeats_is_checked_too(copy: Path) -> None:
-    inner = {"kind": "inline", "metadata": {"b": {"node_type": "array", "zarr_format": 3, "data_type": "object"}}}
-    change(copy, "norms", lambda document: document.update(consolidated_metadata=inner))
-    (said,) = refusals(copy)
-    assert "the data type of norms/b is 'object'" in said
 
 
 def test_documents_beside_the_root_are_checked_when_they_are_read(copy: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.analysis.reduce import StoredFields
+from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.results.tables.matrix import format_matrix
 from tests.support.studies import small_table
@@ -72,10 +72,10 @@ def test_text_says_what_such_orders_rest_on(stores: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(StoredFields, "results")
+    monkeypatch.delattr(Reducer, "norms")
     assert set(sb.table(stores[0])["order"]) == {-10.0, -3.0}
     assert sb.matrix(stores[0], -3).attrs["order"] == -3.0
-    with pytest.raises(AttributeError, match="results"):
+    with pytest.raises(AttributeError, match="norms"):
         sb.table(stores[0], -3.7)
 
 

@@ -1,16 +1,19 @@
-"""Norms and distances from stored fields: tiles of rows, each one task over the store."""
+"""Norms and distances from stored fields: batches and tiles of rows, each one task over the store."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.analysis.tails import TailReducer
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.lattice_choice import LatticeChoice
+from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.spectral.budget import (
     NormEstimate,
     Sums,
@@ -20,14 +23,18 @@ from sobolev_batch.spectral.budget import (
     estimate_norms,
     sums_of_shells,
 )
+from sobolev_batch.spectral.fields import Quality, TailQuality
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.causes import area_and_shape
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
+from sobolev_batch.spectral.octaves.remainder import Remainder
+from sobolev_batch.spectral.octaves.sums import squared_moduli
 from sobolev_batch.spectral.octaves.tail import Tail
+from sobolev_batch.spectral.octaves.tail_sampling import TailSampling, TailWeights
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
 Reals = NDArray[np.float64]
-T = TypeVar("T", Sums, Tail)
 Complexes = NDArray[np.complex128]
 
 # Others that are multiplied with the rows of a tile at a time: nearly as fast as all of them at once.
@@ -39,23 +46,94 @@ _FEWEST_ROWS = 4
 _APART = np.ones(())
 # The others of a tile for each of its rows: they only pass through, and its rows are read but once for them.
 _TILE_LENGTH = 4
+# Of two surfaces that were not compared, the energy's limit is at least this fraction of the last measured energy.
+_LEAST_LIMIT = 0.7
+# Rows of a tile whose values in octaves are held at a time take this many bytes.
+_HELD_BYTES = 128 << 20
+# Of a sample of octaves: its frequency, weight and place, and values of three fields with their squares.
+_SAMPLE_BYTES = 200.0
 
 
 @dataclass(frozen=True, eq=False)
-class Parts(Generic[T]):
-    """What norms and distances are made of, on the lattice or beyond it.
+class TailReducer:
+    """Tails of norms and distances from stored values in octaves.
 
     Attributes:
-        own: Rows.
-        difference: Differences of the rows from the reference.
-        product: Scalar products of these differences with the reference, (orders, rows).
-        reference: Reference, as a single row.
+        store: Store of the values.
+        sampling: Samples of the octaves.
+        orders: Sobolev orders s.
+        reference: Row of the reference, or None if it has no values.
+        qualities: Quality of each row's values.
+        checksums: Checksum of each row's values.
     """
 
-    own: T
-    difference: T
-    product: Reals
-    reference: T
+    store: Store
+    sampling: TailSampling
+    orders: tuple[float, ...]
+    reference: int | None
+    qualities: Mapping[int, TailQuality]
+    checksums: Mapping[int, int]
+
+    @cached_property
+    def weights(self) -> TailWeights:
+        """Weights of all samples."""
+        return self.sampling.weights_for(self.orders)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "weights"}
+
+    @property
+    def task_bytes(self) -> float:
+        """Memory that a task takes at most."""
+        return _HELD_BYTES + (_SAMPLE_BYTES + 8 * len(self.orders)) * self.sampling.size
+
+    def read(self, row: int) -> NDArray[np.complexfloating]:
+        """Return the values of a row (n,), and check them against its record."""
+        place = (slice(0, self.sampling.size),)
+        values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row]])[0]
+        return values
+
+    def of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
+        """Return the tail of a squared norm."""
+        sums = self.weights.sums(squared_moduli(values))
+        return Tail.from_sums(sums, *self.qualities[row].own.at(self.orders))
+
+    def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
+        """Return the tail of a squared distance."""
+        sums = self.weights.sums(squared_moduli(difference))
+        return Tail.from_sums(sums, *self._remainder(row, other, sums[-1].energy).at(self.orders))
+
+    def of_pairs(self, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
+        """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
+        tails: dict[tuple[int, int], Tail] = {}
+        size = max(1, _HELD_BYTES // (16 * self.sampling.size))
+        for first in range(0, len(rows), size):
+            held = {i: self.read(rows[i]) for i in range(first, min(first + size, len(rows)))}
+            for j, other in enumerate(others):
+                if j < first and j < shared:
+                    continue
+                values = held[j] if j < shared and j in held else self.read(other)
+                for i, own in held.items():
+                    if j < shared and (j, i) in tails:
+                        tails[i, j] = tails[j, i]
+                    elif rows[i] != other:
+                        tails[i, j] = self.of_pair(rows[i], other, own - values)
+                    else:
+                        tails[i, j] = Tail(*np.zeros((4, len(self.orders))))
+        # Below the diagonal, where later rows meet earlier ones.
+        flat = [tails[i, j] if (i, j) in tails else tails[j, i] for i in range(len(rows)) for j in range(len(others))]
+        return Tail.stacked(flat).reshaped(len(rows), len(others))
+
+    def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
+        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""
+        for first, second in ((row, other), (other, row)):
+            known = self.qualities[first].difference
+            if second == self.reference and known is not None:
+                return known
+        parts = [self.qualities[number].own for number in (row, other)]
+        # Equal meshes have equal values.
+        highest = sum(max(part.energies) for part in parts) if last_energy else 0.0
+        return Remainder.between(min(_LEAST_LIMIT * last_energy, highest), highest, parts[0].cutoff)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +166,51 @@ class Reducer:
     checksums: Mapping[int, tuple[int, ...]]
     tails: TailReducer | None = None
     tile_bytes: int = 384 << 20
+
+    @classmethod
+    def for_records(
+        cls,
+        store: Store,
+        choice: LatticeChoice,
+        orders: tuple[float, ...],
+        records: Sequence[Record | None],
+        reference: int,
+        compared_with: int | None = None,
+    ) -> Self:
+        """Return the reducer of the rows whose records are complete.
+
+        Args:
+            store: Store of the fields.
+            choice: Lattice of the fields, with the octaves beside them.
+            orders: Sobolev orders s.
+            records: Record of each row; None without one.
+            reference: Row of the study's reference.
+            compared_with: Row to which distances are measured; by default the reference.
+        """
+        complete = complete_records(records)
+        areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
+        weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
+        qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
+        for row, quality in qualities.items():
+            areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
+        known, tails = reference if reference in complete else None, None
+        if choice.tail is not None:
+            of_tails = {row: quality.tail for row, quality in qualities.items() if quality.tail is not None}
+            checksums = {row: record.checksums[-1] for row, record in complete.items()}
+            tails = TailReducer(store, choice.tail, orders, known, of_tails, checksums)
+        extents = [quality.extent for quality in qualities.values()]
+        return cls(
+            store=store,
+            lattice=choice.lattice,
+            blocks=store.blocks_of(choice.lattice),
+            orders=orders,
+            reference=known if compared_with is None else compared_with,
+            areas=areas,
+            errors=errors,
+            widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
+            checksums={row: record.checksums for row, record in complete.items()},
+            tails=tails,
+        )
 
     @property
     def weights(self) -> SobolevWeights:
@@ -135,9 +258,9 @@ class Reducer:
         Without the reference's field, all but the norms are NaN.
         """
         rows = list(rows)
-        lattice = self._lattice_part(rows)
-        tail = None if self.tails is None else self._tail_part(self.tails, rows)
-        own = self._estimate(lattice.own, None if tail is None else tail.own, self.areas[rows], self.errors[:, rows])
+        sums, differences, products, reference = self._sums(rows)
+        tails = None if self.tails is None else self._tails(self.tails, rows)
+        own = self._estimate(sums, None if tails is None else tails[0], self.areas[rows], self.errors[:, rows])
         if self.reference is None:
             unknown = np.full_like(own.values, np.nan)
             return own, NormEstimate(*[unknown] * 5), np.stack([unknown] * 3)
@@ -145,18 +268,21 @@ class Reducer:
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
         errors = errors + self.errors[:, [self.reference]]
-        difference = None if tail is None else tail.difference
-        distances = self._estimate(lattice.difference, difference, areas, errors, apart)
-        product, reference = lattice.product, lattice.reference.totals
-        if tail is not None:
+        distances = self._estimate(differences, None if tails is None else tails[1], areas, errors, apart)
+        product, square = products.totals, reference.totals
+        if tails is not None:
+            tail, tail_difference, tail_product, tail_reference = tails
             # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-            beyond = tail.own.beyond - tail.reference.beyond - tail.difference.beyond * apart
-            product = product + tail.product + beyond / 2 * apart
-            reference = reference + tail.reference.squares
-        return own, distances, area_and_shape(distances.values**2, product, reference[:, 0])
+            beyond = tail.beyond - tail_reference.beyond - tail_difference.beyond * apart
+            product = product + tail_product + beyond / 2 * apart
+            square = square + tail_reference.squares
+        return own, distances, area_and_shape(distances.values**2, product, square[:, 0])
 
-    def _lattice_part(self, rows: Sequence[int]) -> Parts[Sums]:
-        """Return the sums over the lattice; zero without the reference."""
+    def _sums(self, rows: Sequence[int]) -> list[Sums]:
+        """Return sums over the lattice: of rows, differences from the reference, their products with it, and itself.
+
+        Without the reference, all but the first are zero.
+        """
         own = np.zeros((len(rows), self.lattice.shell_count))
         differences, products, reference_sums = np.zeros_like(own), np.zeros_like(own), np.zeros_like(own[:1])
         for number, block in enumerate(self.blocks):
@@ -170,11 +296,10 @@ class Reducer:
                     values -= reference
                     differences[batch] += shell_sums(values, None, self.lattice, block)
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
-        sums = [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
-        return Parts(sums[0], sums[1], sums[2].totals, sums[3])
+        return [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
 
-    def _tail_part(self, tails: TailReducer, rows: Sequence[int]) -> Parts[Tail]:
-        """Return the tails beyond the lattice; those of the norms stand for the others without the reference."""
+    def _tails(self, tails: TailReducer, rows: Sequence[int]) -> tuple[Tail, Tail, Reals, Tail]:
+        """Return the same beyond the lattice; those of the rows stand for the others without the reference."""
         reference = None if self.reference is None else tails.read(self.reference)
         own, differences, products = [], [], []
         for row in rows:
@@ -186,9 +311,9 @@ class Reducer:
                 products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
         norms = Tail.stacked(own)
         if reference is None or self.reference is None:
-            return Parts(norms, norms, norms.beyond, norms)
+            return norms, norms, norms.beyond, norms
         of_reference = tails.of_norm(self.reference, reference)
-        return Parts(norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference]))
+        return norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference])
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances of rows to other rows, over (orders, rows, others).
@@ -220,14 +345,9 @@ class Reducer:
     def _estimate(
         self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, apart: Reals = _APART
     ) -> NormEstimate:
-        """Return norms with their errors, which are zero where surfaces are equal.
+        """Return norms from sums over the lattice and tails beyond it, with errors: zero where surfaces are not apart.
 
-        Args:
-            sums: Sums over the lattice.
-            tail: Tails beyond it; None where the fields are all there is.
-            areas: Areas of the surfaces, of both of a pair together.
-            errors: Norms of the errors of the fields, likewise.
-            apart: 0 for pairs of equal surfaces, else 1.
+        Areas and norms of the errors of fields are those of both surfaces of a pair together.
         """
         if tail is None:
             return estimate_norms(sums, self.weights, Support(areas * apart, self.widths), errors * apart)
