@@ -10,6 +10,7 @@ from typing import Self, overload
 
 from distributed import Client
 
+from sobolev_batch.batch.analysis.tabulate import pairs_bytes
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.compute import TaskSizes, size_rows
@@ -297,6 +298,9 @@ class StudyPlan:
         if self._sizes:
             largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
             yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
+        if self.study.pairs == "all":
+            driver_bytes = pairs_bytes(len(self.labels), len(self.study.orders))
+            yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
         for label, reason in self.refused.items():
             yield "refused", f"{label}: {reason}"
         for label, reason in list(self.doubtful.items())[:_MOST_DOUBTS]:

@@ -171,7 +171,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
     """
     store, orders = Store.open(location_of(tree)), check_orders(order)
     labels, removed = store.labels(), store.removed
-    wanted = [i for i, label in enumerate(labels) if label not in removed and (not meshes or label in meshes)]
+    wanted = {i for i, label in enumerate(labels) if label not in removed and (not meshes or label in meshes)}
     read = {i: store.read_record(i) for i in wanted} if meshes else dict(enumerate(store.records()))
     records = [read[i] if i in wanted else None for i in range(len(labels))]
     for i, problem in (rows_unlike_tables(store, records, wanted) if wanted else {}).items():

@@ -34,6 +34,9 @@ from sobolev_batch.surfaces.sources.names import natural_key
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 5
 
+# Numbers in the driver's memory for each pair and order, as measured: results, and copies of a table that is written.
+_NUMBERS_OF_A_PAIR = 10
+
 Reals = NDArray[np.float64]
 Criterion = Literal["level", "triangles", "names", "time"]
 
@@ -75,6 +78,11 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     results.enter_reference()
     _write_tables(workspace, results)
     return NormEstimate(*results.to_reference)
+
+
+def pairs_bytes(meshes: int, orders: int) -> float:
+    """Return the memory that the distances of all pairs take in the driver."""
+    return 8.0 * _NUMBERS_OF_A_PAIR * orders * meshes**2
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, open_store, run, verify
-from sobolev_batch.batch.analysis.tabulate import Results
+from sobolev_batch.batch.analysis.tabulate import Results, pairs_bytes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import tables
 from sobolev_batch.batch.store.store import Store
@@ -32,24 +32,26 @@ def test_tiles_enter_the_order_of_tables_without_a_copy() -> None:
     assert np.isnan(whole[..., [0, 1, 2], [0, 1, 2]]).all()
 
 
-def test_a_large_table_is_written_array_by_array(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    count, names = 1000, ("a", "b", "c", "d", "e")
-    array_bytes = count * count * 8
+def test_a_table_of_all_pairs_is_written_array_by_array_within_the_memory_that_a_plan_counts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    count, array_bytes = 1000, 8_000_000
     monkeypatch.setattr(tables, "_LARGEST_CHUNK_BYTES", array_bytes // 16)
-    values = np.random.default_rng(0).uniform(size=(1, count, count))
-    # The order comes first in memory and last in a table.
-    dataset = xr.Dataset({name: (("mesh", "other", "order"), np.moveaxis(values, 0, -1)) for name in names})
+    labels = np.array([f"f/{i}" for i in range(count)], dtype=object)
+    meshes = xr.Dataset({"row": ("mesh", np.arange(count))}, coords={"mesh": labels})
     store = Store(Location.parse(tmp_path / "store"))
     tracemalloc.start()
     try:
-        tables.write_table(store, "distances", dataset)
+        results = Results.empty(meshes, "f/0", (-2.0,), every_pair=True)
+        results.distances[...] = np.random.default_rng(0).uniform(size=(count, count))
+        tables.write_table(store, "distances", results.distances_table())
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < len(names) * array_bytes
-    stored = store.array("distances/e")
+    assert 0.5 * pairs_bytes(count, 1) < peak <= pairs_bytes(count, 1)
+    stored = store.array("distances/truncation")
     assert stored.chunks[0] * stored.nbytes / count <= array_bytes // 16
-    np.testing.assert_array_equal(stored[...], np.moveaxis(values, 0, -1))
+    np.testing.assert_array_equal(stored[..., 0], results.distances[1, 0])
 
 
 def test_tables_in_many_chunks_are_those_in_one(
