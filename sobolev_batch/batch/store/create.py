@@ -150,8 +150,8 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
 
 
 def _create(store: Store, plan: Plan) -> None:
-    """Create all arrays, in place of everything that is there."""
-    # This process may be killed before all is there: until then the content is declared invalid.
+    """Create all arrays, in place of everything that the store holds."""
+    # This process may be killed before all of them exist: until then the content is declared invalid.
     attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
     store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
     store.location.remove_partial_files()
