@@ -2,10 +2,10 @@
 from .batch.run import Summary as Summary
 from .batch.run import run as run
 from .batch.store.heartbeat import release as release
-from .batch.study.collection import StudyCollection as StudyCollection
 from .batch.study.draft import StudyDraft as StudyDraft
 from .batch.study.draft import init_study as init_study
 from .batch.study.study import Study as Study
+from .batch.study.study import StudyCollection as StudyCollection
 from .batch.submit import Submission as Submission
 from .batch.submit import submit as submit
 from .batch.verify import Verification as Verification

@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.store.store import COLLECTION, ROOT, Store
-from sobolev_batch.batch.study.collection import StudyCollection
-from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.errors import InputError, StoreError
 
 Result = TypeVar("Result")

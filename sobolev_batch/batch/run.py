@@ -26,9 +26,8 @@ from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
-from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
 from sobolev_batch.errors import DamageError, InputError

@@ -23,9 +23,8 @@ from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
-from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import ClusterError, StoreError
 

@@ -25,8 +25,7 @@ from sobolev_batch.cli.output import Reporter, echo, echo_lines
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
-    from sobolev_batch.batch.study.collection import StudyCollection
-    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.batch.study.study import Study, StudyCollection
 
 Result = TypeVar("Result")
 
@@ -232,7 +231,7 @@ def plan_command(
 
 
 def _parsed(path: Path, *, best_effort: bool) -> Study | StudyCollection:
-    from sobolev_batch.batch.study.collection import read_study
+    from sobolev_batch.batch.study.study import read_study
 
     study = read_study(path)
     return study.with_best_effort() if best_effort else study

@@ -17,10 +17,9 @@ from sobolev_batch.batch.fields.compute import TaskSizes, size_rows
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
-from sobolev_batch.batch.study.collection import StudyCollection
 from sobolev_batch.batch.study.lattice_choice import look_at_extents
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
-from sobolev_batch.batch.study.study import Study
+from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import format_bytes

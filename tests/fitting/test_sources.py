@@ -113,7 +113,7 @@ def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
         ({"steps": 0}, "steps"),
         ({"smoothing": -1}, "smoothing"),
         ({"target": 3}, "must be a table that names a source"),
-        ({"mesh": "ball.ply"}, "must be a table that names a source"),
+        ({"mesh": "ball.ply"}, "no mesh is named 'ball.ply'"),
         ({"speed": 1}, "speed"),
     ],
 )

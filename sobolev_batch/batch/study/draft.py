@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
-from sobolev_batch.batch.study.collection import METHOD, OBJECT, StudyCollection, is_collection
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.schema import RESERVED
-from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
+from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection, is_collection
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
 from sobolev_batch.surfaces.sources.files import MOST_MESHES, FileMember, FileSource, expand
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
-from sobolev_batch.visible import HAZARDOUS, reasons, table_html, visible
+from sobolev_batch.visible import reasons, table_html, visible
 
 # Bytes of files that are read as a whole; the header or the length of others gives their size.
 _MOST_BYTES = 32 << 20
@@ -152,8 +151,9 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     # Links are followed, as the system follows them from the study file on.
     base = output.parent.resolve()
     relative = Path(os.path.relpath(folder.resolve(), base)).as_posix()
-    if OBJECT in relative or METHOD in relative:
-        raise StudyError(f"{folder}: its name holds {OBJECT} or {METHOD}, which study files replace; rename it")
+    problem = _path_problem(relative)
+    if problem is not None:
+        raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     prefix = "" if relative == "." else f"{relative}/"
     sizes, left_out = _look_at(folder)
     several = _several_objects(list(sizes))
@@ -172,11 +172,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     else:
         members_of(Study.from_table(table, folder=base))
     try:
-        data = text.encode("utf-8")
-        with output.open("xb") as file:
-            file.write(data)
-    except (OSError, UnicodeEncodeError) as error:
-        raise StudyError(f"{output}: no study can be written there: {getattr(error, 'strerror', error)}") from error
+        with output.open("x", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+    except OSError as error:
+        raise StudyError(f"{output}: no study can be written there: {error.strerror}") from error
     return StudyDraft(output, summary, left_out)
 
 
@@ -198,11 +197,9 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
         try:
             if other != below:
                 raise MeshError(f"its name differs from that of {quoted(other)} only in case or accents; rename one")
-            problem = label_problem(below)
+            problem = _path_problem(below)
             if problem is not None:
-                raise MeshError(f"its name cannot be a label: {problem}; rename it")
-            if OBJECT in below or METHOD in below:
-                raise MeshError(f"its name holds {OBJECT} or {METHOD}, which study files replace; rename it")
+                raise MeshError(f"its name cannot be in a study file: {problem}; rename it")
             (triangles, _), size = expected_size(folder / below), (folder / below).stat().st_size
             # A file without an expected size is of another format, damaged or empty.
             if size <= left or not triangles:
@@ -225,6 +222,13 @@ def _mesh_names(folder: Path) -> Iterator[str]:
             if count > MOST_MESHES:
                 raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
             yield Path(parent, name).relative_to(folder).as_posix()
+
+
+def _path_problem(path: str) -> str | None:
+    """Describe why a path cannot be in a study file; None where it can."""
+    if OBJECT in path or METHOD in path:
+        return f"it holds {OBJECT} or {METHOD}, which study files replace"
+    return label_problem(path)
 
 
 def _stem(path: PurePosixPath) -> str:
@@ -470,13 +474,8 @@ def _paths(entries: Iterable[str], remark: str = "") -> str:
 
 
 def _toml(text: str) -> str:
-    """Return a text as TOML spells it."""
-    # JSON spells it in the same way, but leaves some characters as they are that a terminal would obey or hide.
-    # Lone surrogates, of names that are no UTF-8, have no spelling, and cannot be written.
-    return HAZARDOUS.sub(
-        lambda match: match[0] if match[0] >= "\ud800" else f"\\u{ord(match[0]):04x}",
-        json.dumps(text, ensure_ascii=False),
-    )
+    """Return a text as TOML spells it, as JSON does."""
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _count(number: int) -> str:

@@ -364,7 +364,13 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry, (*key, number)) for number, entry in enumerate(value)]
     if isinstance(value, pd.DataFrame):
-        return _rows_of(value)
+        repeated = value.columns[value.columns.duplicated()]
+        if len(repeated):
+            raise StudyError(f"{_dotted(key)}: a DataFrame has the column {quoted(repeated[0])} twice; rename one")
+        known = value.astype(object).where(value.notna(), None)
+        return _plain(known.to_dict(orient="records"), key)
+    if isinstance(value, date):
+        return value.isoformat()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, str) and len(value) > _LONGEST_TEXT:
@@ -372,21 +378,6 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
         raise StudyError(f"{_dotted(key)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
     return os.fspath(value) if isinstance(value, os.PathLike) else value
-
-
-def _rows_of(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows of a frame, without what it does not know; dates become texts."""
-    repeated = frame.columns[frame.columns.duplicated()]
-    if len(repeated):
-        raise StudyError(f"a DataFrame has the column {quoted(repeated[0])} twice; rename one")
-    return [
-        {
-            str(key): value.isoformat() if isinstance(value, date) else _plain(value, (key,))
-            for key, value in row.items()
-            if not (pd.api.types.is_scalar(value) and pd.isna(value))
-        }
-        for row in frame.to_dict(orient="records")
-    ]
 
 
 Key = tuple[int | str, ...]

@@ -1,21 +1,30 @@
-"""A study: families of surfaces, a reference, a lattice, and orders."""
+"""Studies: of one object, and collections of several, each with its own reference, by the same methods.
+
+The file of a collection has templates: texts with {object} and {method}, which are filled in, or matched with files.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from glob import has_magic
+from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 from sobolev_batch.batch.study.schema import (
     Backends,
     Family,
     FamilyReference,
+    ObjectSection,
     StudyDocument,
     known_names,
     plain_tables,
     read_toml,
+    with_named_meshes,
 )
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -24,10 +33,20 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Similarity
-from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, quoted
+from sobolev_batch.surfaces.sources.files import MeshTable, expand, matching_files, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 from sobolev_batch.surfaces.sources.registry import Source
 
+Parsed = TypeVar("Parsed")
+
 REFERENCE_LABEL = "reference"
+OBJECT, METHOD = "{object}", "{method}"
+
+_PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
+_PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+
+# Meshes of a list as entries of a family, by object and method.
+_Listed = Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -107,11 +126,7 @@ class Study:
             StudyError: The file cannot be read, is no TOML, or has keys that are unknown, of the wrong type, or out of
                 range. The message lists every offender.
         """
-        path = Path(path)
-        try:
-            return cls.from_table(read_toml(path), folder=path.parent)
-        except InputError as error:
-            raise StudyError(f"{path}: {error}") from error
+        return _parsed_file(path, cls.from_table)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
@@ -183,3 +198,274 @@ def _require_distinct(families: Sequence[str]) -> None:
         )
     if any(caseless_key(name) == REFERENCE_LABEL for name in families):
         raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
+
+
+@dataclass(frozen=True)
+class StudyCollection:
+    """Studies of several objects by the same methods. Make it by `from_toml` or `from_table`.
+
+    Attributes:
+        name: Name of the collection; a store remembers it.
+        title: Free text.
+        studies: Study of each object, by its name. A method is a family with the same name in all of them.
+        lacking: Methods that have no files for an object, by its name.
+        table: The collection as it was written.
+
+    >>> import sobolev_batch as sb
+    >>> collection = sb.StudyCollection.from_table({
+    ...     "study": {"name": "balls"},
+    ...     "lattice": {"xi_max": 3.0, "M": 16},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "object": [
+    ...         {"name": "ball", "reference": {"source": "sphere"}},
+    ...         {"name": "egg", "reference": {"source": "ellipsoid", "axes": [1.0, 0.8, 0.8]}},
+    ...     ],
+    ...     "family": [{"name": "icosphere", "source": "icosphere", "levels": [0, 1]}],
+    ... })
+    >>> list(collection.studies)
+    ['ball', 'egg']
+    """
+
+    name: str
+    title: str
+    studies: Mapping[str, Study]
+    lacking: Mapping[str, tuple[str, ...]]
+    table: Mapping[str, Any]
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a study file with several objects. Relative paths in it start from its folder.
+
+        Args:
+            path: Path of the file. docs/leagues.md describes its sections.
+
+        Raises:
+            StudyError: The file cannot be read, or is no collection. The message lists every offender.
+        """
+        return _parsed_file(path, cls.from_table)
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
+        """Validate a collection given as nested tables, with the keys of the study file.
+
+        Args:
+            table: Sections of the study file. A pandas.DataFrame may take the place of ``meshes`` of objects.
+            folder: Folder in which relative paths start.
+
+        Raises:
+            StudyError: See `from_toml`.
+        """
+        folder = Path(folder)
+        # Objects and lists may bring references and families.
+        written = plain_tables(table)
+        values = {"reference": None, "family": [], **written}
+        document = StudyDocument.from_tables(values)
+        listed = _listed_meshes(document.objects.get("meshes", ()), folder)
+        listed_names = list(dict.fromkeys(name for name, _ in listed))
+        if document.object is None:
+            found = [{"name": name} for name in listed_names or _names_in_reference(values, folder)]
+            document = StudyDocument.from_tables({**values, "object": found})
+        objects = document.object or []
+        names = [section.name for section in objects]
+        unnamed = [name for name in listed_names if name not in names]
+        if unnamed:
+            raise StudyError(
+                f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or "
+                "give all of them sections"
+            )
+        same = duplicate_names(names)
+        if same:
+            raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
+        families = [_families(family, names, folder) for family in values["family"]]
+        studies: dict[str, Study] = {}
+        for section in objects:
+            made = [entry for entries in families for entry in entries[section.name]]
+            try:
+                table_of_object = _table_of_object(values, section, listed, made)
+                studies[section.name] = Study.from_table(table_of_object, folder=folder)
+            except StudyError as error:
+                raise StudyError(f"object {quoted(section.name)}: {error}") from error
+        own = {name: [family.name for family in study.families] for name, study in studies.items()}
+        methods = dict.fromkeys(method for names in own.values() for method in names)
+        lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
+        lacking = {name: missing for name, missing in lacking.items() if missing}
+        title = document.study.title or document.study.name
+        return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(written, default=str)))
+
+    def with_best_effort(self) -> Self:
+        """Return the collection with the key ``best_effort`` of its accuracy set.
+
+        Raises:
+            StudyError: It has a lattice instead of an accuracy.
+        """
+        studies = {name: study.with_best_effort() for name, study in self.studies.items()}
+        accuracy = {**self.table["accuracy"], "best_effort": True}
+        return replace(self, studies=studies, table={**self.table, "accuracy": accuracy})
+
+
+def is_collection(table: Mapping[str, Any]) -> bool:
+    """Return True where the table of a study file has several objects."""
+    templates = str([table.get(key) for key in ("mesh", "reference", "family")])
+    return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
+
+
+def read_study(path: str | Path) -> Study | StudyCollection:
+    """Read a study file, of one object or of several.
+
+    Raises:
+        StudyError: See `Study.from_toml`.
+    """
+
+    def parse(table: Mapping[str, Any], folder: Path) -> Study | StudyCollection:
+        return (StudyCollection if is_collection(table) else Study).from_table(table, folder=folder)
+
+    return _parsed_file(path, parse)
+
+
+def _parsed_file(path: str | Path, parse: Callable[..., Parsed]) -> Parsed:
+    path = Path(path)
+    try:
+        return parse(read_toml(path), folder=path.parent)
+    except InputError as error:
+        raise StudyError(f"{path}: {error}") from error
+
+
+def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
+    """Return the meshes of the section [objects]."""
+    base = Path()
+    if isinstance(given, str):
+        base, given = Path(given).parent, read_mesh_list(folder / given)
+    meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for mesh in given:
+        known = dict(mesh)
+        names: list[str] = []
+        for column in ("object", "method"):
+            if column not in known:
+                raise StudyError(f"[objects]: meshes: {quoted(mesh['path'])} has no {column}; each mesh needs both")
+            name = known.pop(column)
+            names.append(number_as_text(name) if isinstance(name, float) else str(name))
+        meshes.setdefault((names[0], names[1]), []).append({**known, "path": (base / known["path"]).as_posix()})
+    return meshes
+
+
+def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
+    """Return the objects that the files of the reference name, in their natural order."""
+    paths = (with_named_meshes(values["reference"], values.get("mesh", {})) or {}).get("paths")
+    templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
+    if not templates:
+        raise StudyError(
+            "a collection needs its objects: [[object]] sections, a list in [objects], or a [reference] with paths "
+            'such as ["objects/{object}.obj"]'
+        )
+    names: set[str] = set()
+    for template in templates:
+        match = re.compile(_pattern(template)).fullmatch
+        found = {
+            matched["object"] for path in expand(folder, _glob(template)) if (matched := match(_text(folder, path)))
+        }
+        if not found:
+            raise StudyError(
+                f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
+            )
+        names |= found
+    return sorted(names, key=natural_key)
+
+
+def _table_of_object(
+    values: Mapping[str, Any], section: ObjectSection, listed: _Listed, families: Iterable[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the study of an object as nested tables."""
+    name = section.name
+    common = {key: value for key, value in values.items() if key not in ("family", "object", "objects")}
+    common = _filled(common, OBJECT, name)
+    own = {method: meshes for (owner, method), meshes in listed.items() if owner == name}
+    is_reference = {method: caseless_key(method) == REFERENCE_LABEL for method in own}
+    references = [mesh["path"] for method, meshes in own.items() if is_reference[method] for mesh in meshes]
+    if section.reference is not None:
+        common["reference"] = _filled(section.reference, OBJECT, name)
+    elif references:
+        common["reference"] = {"source": "files", "paths": references}
+    if section.scaling is not None:
+        common["scaling"] = section.scaling
+    methods = (method for method in own if not is_reference[method])
+    return {
+        **common,
+        "study": {**common["study"], "name": f"{common['study']['name']} {name}"},
+        "family": [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)],
+    }
+
+
+def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the families that a section gives for each object: one, or one for each method among its files."""
+    paths = family.get("paths")
+    templates = paths if isinstance(paths, list) and all(isinstance(path, str) for path in paths) else []
+    if not any(OBJECT in template or METHOD in template for template in templates):
+        return {name: [_filled(family, OBJECT, name)] for name in names}
+    methods: dict[str, dict[str, list[str]]] = {name: {} for name in names}
+    for template in templates:
+        for name, method, path in _files(template, names, folder):
+            methods[name].setdefault(method if METHOD in family["name"] else "", []).append(path)
+    if not any(methods.values()):
+        raise StudyError(f"family {quoted(family['name'])}: no file that it names is of an object; correct its paths")
+    return {
+        name: [
+            {**_filled(_filled(family, OBJECT, name), METHOD, method), "paths": own[method]}
+            for method in sorted(own, key=natural_key)
+        ]
+        for name, own in methods.items()
+    }
+
+
+def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield object, method and path of the files that match a template.
+
+    A file is of the object with the longest name that fits, and the method is as long as it can be.
+    """
+    texts = {name: template.replace(OBJECT, name) for name in sorted(names, key=len, reverse=True)}
+    if not has_magic(_glob(template.replace(OBJECT, ""))):
+        # The files need not exist yet.
+        yield from ((name, "", text) for name, text in texts.items())
+        return
+    patterns = {name: re.compile(_pattern(text)).fullmatch for name, text in texts.items()}
+    for path in map(partial(_text, folder), matching_files(folder, _glob(template))):
+        candidates = (name for name in patterns if name in path or OBJECT not in template)
+        found = ((name, match) for name in candidates if (match := patterns[name](path)) is not None)
+        for name, match in found if OBJECT not in template else islice(found, 1):
+            yield name, match.groupdict().get("method", ""), path
+
+
+def _filled(value: Any, placeholder: str, name: str) -> Any:
+    """Return nested tables with a name in place of a placeholder."""
+    if isinstance(value, str):
+        return value.replace(placeholder, name)
+    if isinstance(value, Mapping):
+        return {key: _filled(entry, placeholder, name) for key, entry in value.items()}
+    return [_filled(entry, placeholder, name) for entry in value] if isinstance(value, list) else value
+
+
+def _glob(template: str) -> str:
+    return template.replace(OBJECT, "*").replace(METHOD, "*")
+
+
+def _text(folder: Path, path: Path) -> str:
+    """Return a path as a template of the study would have it."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
+
+
+def _pattern(template: str) -> str:
+    """Return the regular expression of a template, with the groups object and method.
+
+    A placeholder stands for as many characters as it can, of one part of the path; where it is repeated, for the same.
+    """
+    seen: set[str] = set()
+    pattern = ""
+    for part in _PART.split(Path(template).as_posix()):
+        if part in (OBJECT, METHOD):
+            group = part.strip("{}")
+            pattern += f"(?P={group})" if part in seen else f"(?P<{group}>[^/]+)"
+            seen.add(part)
+        elif part.startswith("[") and part.endswith("]"):
+            pattern += "[^" + re.escape(part[2:-1]) + "]" if part[1:2] == "!" else part
+        else:
+            pattern += _PATTERNS.get(part) or re.escape(part)
+    return pattern

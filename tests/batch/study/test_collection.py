@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.collection import is_collection, read_study
+from sobolev_batch.batch.study.study import is_collection, read_study
 from tests.support.studies import small_table
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.collection import read_study
+from sobolev_batch.batch.study.study import read_study
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.commands import call
 
