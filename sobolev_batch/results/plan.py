@@ -127,11 +127,24 @@ class StudyPlan:
     """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
 
     Attributes:
-        store: Path or URL of the study's store.
+        study: Study.
+        store: Path or URL of its store.
+        labels: Labels of all surfaces, the reference among them.
+        reference: Label of the reference.
         stored: Labels of the surfaces whose fields the store has already.
         refused: Reason for each surface that fits into no worker, by label.
         doubtful: Reason for each surface that cannot be read, or may be in another unit or place than the reference, as
-            far as surfaces are quickly looked at.
+            long as surfaces are quickly looked at.
+        lattice: Lattice of all fields.
+        octaves: Number of octaves that are sampled beyond the lattice.
+        dtype: Type of the fields, "complex128" or "complex64".
+        similarity: Similarity from the meshes' own unit of length to the study's.
+        field_bytes: Bytes of one stored field.
+        memory_bytes: Projected peak memory of each surface's largest task, by label.
+        seconds: Time that a run will take on the workers, if they have their cores for themselves. It leaves out
+            Hausdorff and Chamfer distances, and distances of very many pairs.
+        processor_seconds: Processor time that a run will take, that of starting processes included.
+        lines: What is shown: name and text of each line; an empty name goes on with the line before.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -146,77 +159,22 @@ class StudyPlan:
     (('ico/0', 'ico/1', 'reference'), Lattice(xi_max=2.0, M=8), ())
     """
 
+    study: Study
     store: str
+    labels: tuple[str, ...]
+    reference: str
     stored: tuple[str, ...]
     refused: dict[str, str]
     doubtful: dict[str, str]
-    _plan: Plan = field(repr=False)
-    _workers: Workers = field(repr=False)
-    _sizes: dict[str, TaskSizes] = field(repr=False)
-    _forecast: Forecast = field(repr=False)
-
-    @property
-    def seconds(self) -> float:
-        """Time that a run will take on the workers, if they have their cores for themselves.
-
-        It leaves out Hausdorff and Chamfer distances, and distances of very many pairs.
-        """
-        return self._forecast.seconds
-
-    @property
-    def processor_seconds(self) -> float:
-        """Processor time that a run will take, that of starting processes included."""
-        return self._forecast.processor_seconds
-
-    @property
-    def study(self) -> Study:
-        """Study."""
-        return self._plan.study
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Labels of all surfaces, the reference among them."""
-        return tuple(row.label for row in self._plan.rows)
-
-    @property
-    def reference(self) -> str:
-        """Label of the reference."""
-        return self._plan.reference
-
-    @property
-    def memory_bytes(self) -> dict[str, float]:
-        """Projected peak memory of each surface's largest task, by label."""
-        return {label: size.projected_bytes for label, size in self._sizes.items()}
-
-    @property
-    def lattice(self) -> Lattice:
-        """Lattice of all fields."""
-        return self._plan.lattice
-
-    @property
-    def octaves(self) -> int:
-        """Number of octaves that are sampled beyond the lattice."""
-        return 0 if self._plan.tail is None else len(self._plan.tail.octaves)
-
-    @property
-    def dtype(self) -> str:
-        """Type of the fields, "complex128" or "complex64"."""
-        return self._plan.choice.dtype
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Reasons for the lattice, where the study requests an accuracy."""
-        return self._plan.choice.reasons
-
-    @property
-    def similarity(self) -> Similarity:
-        """Similarity from the meshes' own unit of length to the study's."""
-        return self._plan.similarity
-
-    @property
-    def field_bytes(self) -> int:
-        """Bytes of one stored field."""
-        return self._plan.field_bytes
+    lattice: Lattice
+    octaves: int
+    dtype: str
+    similarity: Similarity
+    field_bytes: int
+    memory_bytes: dict[str, float]
+    seconds: float
+    processor_seconds: float
+    lines: tuple[tuple[str, str], ...] = field(repr=False)
 
     @property
     def total_bytes(self) -> int:
@@ -224,88 +182,68 @@ class StudyPlan:
         return self.field_bytes * len(self.labels)
 
     def __str__(self) -> str:
-        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self._lines())
+        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self.lines)
 
     def _repr_html_(self) -> str:
-        return table_html("Plan", self._lines())
+        return table_html("Plan", self.lines)
 
-    def _lines(self) -> Iterator[tuple[str, str]]:
-        study, lattice = self.study, self.lattice
-        orders = ", ".join(f"{order:g}" for order in study.orders)
-        yield "study", study.title
-        families = f"{len(study.families)} famil{'y' if len(study.families) == 1 else 'ies'}"
-        yield "surfaces", f"{len(self.labels)} in {families}, reference {self.reference}"
-        origin = " ".join(f"{x:.9g}" for x in self.similarity.origin)
-        yield "similarity", f"scale {self.similarity.scale:.9g}, origin {origin}"
-        yield (
-            "lattice",
-            f"xi_max {lattice.xi_max:g}, M {lattice.M}, spacing {lattice.spacing:g}, "
-            f"half period {lattice.half_period:g}",
-        )
-        yield "orders", orders
-        yield from self._octave_lines()
-        yield from self._transform_lines()
-        yield "backend", study.backend
-        if study.proximity is not None:
-            yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
-        yield from self._task_lines()
-        yield "storage", f"{format_bytes(self.field_bytes)} per surface, {format_bytes(self.total_bytes)} in all"
-        yield "store", f"{self.store}, {len(self.stored)} of {len(self.labels)} already stored"
-        first, *others = self._forecast.lines
-        yield "time", first
-        yield from (("", line) for line in others)
-        if study.proximity is not None:
-            yield "", "Hausdorff and Chamfer distances take more"
 
-    def _octave_lines(self) -> Iterator[tuple[str, str]]:
-        tail = self._plan.tail
-        if tail is None:
-            return
-        shortest = 1 / (tail.highest_frequency * self.similarity.scale)
+def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
+    """Yield what is shown of a plan whatever computes it."""
+    study, lattice, similarity, tail = plan.study, plan.lattice, plan.similarity, plan.tail
+    yield "study", study.title
+    families = f"{len(study.families)} famil{'y' if len(study.families) == 1 else 'ies'}"
+    yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
+    yield "similarity", f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}"
+    spacing = f"spacing {lattice.spacing:g}, half period {lattice.half_period:g}"
+    yield "lattice", f"xi_max {lattice.xi_max:g}, M {lattice.M}, {spacing}"
+    yield "orders", ", ".join(f"{order:g}" for order in study.orders)
+    if tail is not None:
+        shortest = 1 / (tail.highest_frequency * similarity.scale)
         yield (
             "octaves",
-            f"{self.octaves} beyond the lattice, to |xi| {tail.highest_frequency:.4g}: wavelengths down to "
+            f"{len(tail.octaves)} beyond the lattice, to |xi| {tail.highest_frequency:.4g}: wavelengths down to "
             f"{shortest:.3g} of the files' unit; {tail.size:,} samples",
         )
-        yield "", f"{format_bytes(tail.size * self._plan.item_bytes)} per surface"
-
-    def _transform_lines(self) -> Iterator[tuple[str, str]]:
-        accuracy, transform = self.study.accuracy, self._plan.transform
-        if accuracy is None:
-            yield (
-                "transform",
-                f"eps {transform.eps:g}, {transform.dtype}, quadrature {transform.quadrature.method}",
-            )
-            return
+        yield "", f"{format_bytes(tail.size * plan.item_bytes)} per surface"
+    accuracy, transform = study.accuracy, plan.transform
+    if accuracy is None:
+        yield "transform", f"eps {transform.eps:g}, {transform.dtype}, quadrature {transform.quadrature.method}"
+    else:
         allowed = f"{format_bytes(accuracy.allowed_bytes)} for a transform, M <= {accuracy.largest_intervals}"
-        yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {self.reference}; {allowed}"
-        for reason in self.reasons:
-            yield "chosen", reason
-        yield "transform", f"{self.dtype}, eps and quadrature for each surface from its distance"
+        yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
+        yield from (("chosen", reason) for reason in plan.choice.reasons)
+        yield "transform", f"{plan.choice.dtype}, eps and quadrature for each surface from its distance"
+    yield "backend", study.backend
+    if study.proximity is not None:
+        yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
 
-    def _task_lines(self) -> Iterator[tuple[str, str]]:
-        workers = self._workers
-        gpus = sum(member.backend == "gpu" for member in workers.members)
-        yield (
-            "workers",
-            f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
-            f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
-        )
-        chunks = len(self._plan.blocks)
-        tasks = sum(size.task_count for size in self._sizes.values())
-        yield "tasks", f"{tasks} for {len(self._sizes)} surfaces; chunks of the lattice: {chunks}"
-        if self._sizes:
-            largest, size = max(self._sizes.items(), key=lambda item: item[1].projected_bytes)
-            yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
-        if self.study.pairs == "all":
-            driver_bytes = pairs_bytes(len(self.labels), len(self.study.orders))
-            yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
-        for label, reason in self.refused.items():
-            yield "refused", f"{label}: {reason}"
-        for label, reason in list(self.doubtful.items())[:_MOST_DOUBTS]:
-            yield "doubtful", f"{label}: {reason}"
-        if len(self.doubtful) > _MOST_DOUBTS:
-            yield "doubtful", f"and {len(self.doubtful) - _MOST_DOUBTS} more"
+
+def _task_lines(
+    plan: Plan,
+    workers: Workers,
+    sizes: Mapping[str, TaskSizes],
+    refused: Mapping[str, str],
+    doubtful: Mapping[str, str],
+) -> Iterator[tuple[str, str]]:
+    gpus = sum(member.backend == "gpu" for member in workers.members)
+    yield (
+        "workers",
+        f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
+        f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
+    )
+    tasks = sum(size.task_count for size in sizes.values())
+    yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
+    if sizes:
+        largest, size = max(sizes.items(), key=lambda item: item[1].projected_bytes)
+        yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
+    if plan.study.pairs == "all":
+        driver_bytes = pairs_bytes(len(plan.rows), len(plan.study.orders))
+        yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
+    yield from (("refused", f"{label}: {reason}") for label, reason in refused.items())
+    yield from (("doubtful", f"{label}: {reason}") for label, reason in list(doubtful.items())[:_MOST_DOUBTS])
+    if len(doubtful) > _MOST_DOUBTS:
+        yield "doubtful", f"and {len(doubtful) - _MOST_DOUBTS} more"
 
 
 @dataclass(frozen=True)
@@ -413,15 +351,36 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         for row in study_plan.rows
         if row.label in records and records[row.label].completes(row.key)
     }
+    forecast = Forecast.for_plan(study_plan, stored, workers, client, planning_seconds)
+    doubtful, count = _doubts_of(study_plan), len(study_plan.rows)
+    total_bytes = format_bytes(study_plan.field_bytes * count)
+    first, *others = forecast.lines
+    lines = [
+        *_study_lines(study_plan),
+        *_task_lines(study_plan, workers, sizes, refused, doubtful),
+        ("storage", f"{format_bytes(study_plan.field_bytes)} per surface, {total_bytes} in all"),
+        ("store", f"{location}, {len(stored)} of {count} already stored"),
+        ("time", first),
+        *(("", line) for line in others),
+        *([("", "Hausdorff and Chamfer distances take more")] if study.proximity is not None else []),
+    ]
     return StudyPlan(
+        study=study_plan.study,
         store=str(location),
+        labels=tuple(row.label for row in study_plan.rows),
+        reference=study_plan.reference,
         stored=tuple(stored),
         refused=refused,
-        doubtful=_doubts_of(study_plan),
-        _plan=study_plan,
-        _workers=workers,
-        _sizes=sizes,
-        _forecast=Forecast.for_plan(study_plan, stored, workers, client, planning_seconds),
+        doubtful=doubtful,
+        lattice=study_plan.lattice,
+        octaves=0 if study_plan.tail is None else len(study_plan.tail.octaves),
+        dtype=study_plan.choice.dtype,
+        similarity=study_plan.similarity,
+        field_bytes=study_plan.field_bytes,
+        memory_bytes={label: size.projected_bytes for label, size in sizes.items()},
+        seconds=forecast.seconds,
+        processor_seconds=forecast.processor_seconds,
+        lines=tuple(lines),
     )
 
 
