@@ -40,7 +40,7 @@ _MOST_SAMPLES = 1 << 28
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What plots show of an open store.
+    """The part of an open store that plots show.
 
     Attributes:
         tree: Open store with tables.

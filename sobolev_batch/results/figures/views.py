@@ -430,22 +430,30 @@ def write_witness_plots(
 
 def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:
     """Return a mesh seen from one side, with a panel for each order that was rendered."""
-    columns = min(_PANELS_IN_A_ROW, len(pictures))
-    rows = -(-len(pictures) // columns)
-    _, height, width, _ = pictures.shape
     # Below each panel its colours, above all of them the name of the mesh.
-    panel = min(WIDTH_INCHES / columns, _HEIGHT_INCHES * width / height)
-    own_size = (WIDTH_INCHES, 0.3 + rows * (0.7 + panel * height / width))
-    figure = Figure(figsize=size or own_size, layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels:
-        axes.set_axis_off()
-    for i, (axes, picture) in enumerate(zip(panels, pictures, strict=False)):
-        axes.imshow(picture)
-        _add_colorbar(figure, axes, [view], view.color_limits[i], i)
+    figure, panels = _panels(pictures, size, above=0.3, beside=0.7)
+    for i in range(len(pictures)):
+        _add_colorbar(figure, panels.ravel()[i], [view], view.color_limits[i], i)
     omission = f"{len(pictures)} of {len(view.orders)} orders" if len(pictures) < len(view.orders) else ""
     figure.suptitle("\n".join(filter(None, (escaped(view.label), _seen(view), omission))), fontsize="medium")
     return figure
+
+
+def _panels(
+    pictures: Sequence[np.ndarray] | Pictures, size: Size | None, *, above: float, beside: float
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with pictures beside each other, of a size, or with inches for what is above and in each row."""
+    columns = min(_PANELS_IN_A_ROW, len(pictures))
+    rows = -(-len(pictures) // columns)
+    tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
+    height = min(tallest * WIDTH_INCHES / columns, _HEIGHT_INCHES)
+    figure = Figure(figsize=size or (WIDTH_INCHES, above + rows * (beside + height)), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.ravel():
+        axes.set_axis_off()
+    for axes, picture in zip(panels.ravel(), pictures, strict=False):
+        axes.imshow(picture)
+    return figure, panels
 
 
 def _seen(view: MeshView) -> str:
@@ -456,17 +464,9 @@ def _comparison_figure(
     views: Sequence[MeshView], pictures: Sequence[np.ndarray], total: int, size: Size | None
 ) -> Figure:
     """Return meshes beside each other, with their witness functions of the first order on one scale."""
-    columns = min(_PANELS_IN_A_ROW, len(views))
-    rows = -(-len(views) // columns)
     omission = f"{len(views)} of {total} meshes" if len(views) < total else ""
-    tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
-    own_size = (WIDTH_INCHES, 0.8 + 0.3 * bool(omission) + rows * (0.3 + tallest * WIDTH_INCHES / columns))
-    figure = Figure(figsize=size or own_size, layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.ravel():
-        axes.set_axis_off()
-    for axes, view, picture in zip(panels.ravel(), views, pictures, strict=False):
-        axes.imshow(picture)
+    figure, panels = _panels(pictures, size, above=0.8 + 0.3 * bool(omission), beside=0.3)
+    for axes, view in zip(panels.ravel(), views, strict=False):
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
     if omission:
         figure.suptitle(omission, fontsize="medium")

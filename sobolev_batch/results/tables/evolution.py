@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
 from sobolev_batch.results.store_accessor import StoreAccessor, convergence_at
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import concise, machine_table, printed_table, prose
@@ -71,18 +71,7 @@ def evolution(
     # Distances to a surface that moves are computed for each time.
     convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
     orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
-    meshes = finished_group(tree, "meshes")
-    labels = _labels_by_time(meshes)
-    if not labels:
-        raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
-    if truth is None:
-        labels.pop(reference_of(tree), None)
-    elif truth not in labels:
-        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
-    true_labels = {} if truth is None else labels.pop(truth)
-    for name, by_time in labels.items():
-        if truth is not None and not any(_at(true_labels, time) for time in by_time):
-            raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")
+    labels, true_labels = _labels_by_time(tree, truth)
     complete = set(complete_meshes(tree))
     times = sorted({time for family in labels.values() for time in family})
     shape = (len(labels), len(times), len(orders))
@@ -131,15 +120,27 @@ def format_evolution(
     return "\n\n".join([*sections, prose(_NOTE.format(factor=factor).splitlines(), style)])
 
 
-def _labels_by_time(meshes: xr.Dataset) -> dict[str, dict[float, str]]:
-    """Return the label of each family's mesh at each time."""
+def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dict[float, str]], dict[float, str]]:
+    """Return the label of each family's mesh at each time, and those of the true surface, if that moves."""
     labels: dict[str, dict[float, str]] = {}
-    if "time" not in meshes.coords:
-        return labels
-    for label, family, time in zip(*(meshes[name].values.tolist() for name in ("mesh", "family", "time")), strict=True):
-        if not np.isnan(time):
-            labels.setdefault(family, {})[time] = label
-    return labels
+    if has_times(tree):
+        meshes = finished_group(tree, "meshes")
+        columns = (meshes[name].values.tolist() for name in ("mesh", "family", "time"))
+        for label, family, time in zip(*columns, strict=True):
+            if not np.isnan(time):
+                labels.setdefault(family, {})[time] = label
+    if not labels:
+        raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
+    if truth is None:
+        labels.pop(reference_of(tree), None)
+        return labels, {}
+    if truth not in labels:
+        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
+    true_labels = labels.pop(truth)
+    for name, by_time in labels.items():
+        if not any(_at(true_labels, time) for time in by_time):
+            raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")
+    return labels, true_labels
 
 
 def _at(labels: Mapping[float, str], time: float) -> str | None:

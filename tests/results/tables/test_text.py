@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -15,63 +16,47 @@ _NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("value", "error", "shown"),
+    ("function", "value", "error", "shown"),
     [
-        (0.66889, 0.0213, "0.67 ± 0.03"),
-        (6.299876e-01, 1e-10, "0.6299876 ± 1 × 10⁻¹⁰"),
-        (0.001, 0.005, "0.001 ± 0.005"),
-        (2.6e-9, 9.99e-8, "(3 ± 100) × 10⁻⁹"),
-        (0.2654, 0.0994, "0.3 ± 0.1"),
-        (0.0, 0.0, "0 ± 0"),
-        (0.0, 5.97e-10, "0 ± 6 × 10⁻¹⁰"),
-        (12.0, _NAN, "12.00 ± ?"),
-        (_NAN, 1.0, ""),
-        (0.04733, 4.6e-4, "0.0473 ± 0.0005"),
-        (2.0123e-5, 1.23e-8, "(2.012 ± 0.002) × 10⁻⁵"),
-        (1.84604e-5, 1.1e-12, "1.846040 × 10⁻⁵ ± 2 × 10⁻¹²"),
+        (with_error, 0.66889, 0.0213, "0.67 ± 0.03"),
+        (with_error, 6.299876e-01, 1e-10, "0.6299876 ± 1 × 10⁻¹⁰"),
+        (with_error, 0.001, 0.005, "0.001 ± 0.005"),
+        (with_error, 2.6e-9, 9.99e-8, "(3 ± 100) × 10⁻⁹"),
+        (with_error, 0.2654, 0.0994, "0.3 ± 0.1"),
+        (with_error, 0.0, 0.0, "0 ± 0"),
+        (with_error, 0.0, 5.97e-10, "0 ± 6 × 10⁻¹⁰"),
+        (with_error, 12.0, _NAN, "12.00 ± ?"),
+        (with_error, _NAN, 1.0, ""),
+        (with_error, 2.0123e-5, 1.23e-8, "(2.012 ± 0.002) × 10⁻⁵"),
+        (with_error, 1.84604e-5, 1.1e-12, "1.846040 × 10⁻⁵ ± 2 × 10⁻¹²"),
+        (percent, 9.87, 0.12, "990 % ± 20 %"),
+        (percent, 1.234e-4, 7.2e-7, "0.01234 % ± 0.00008 %"),
+        (percent, 1.2341e-8, 4.4e-12, "(1.2341 ± 0.0005) × 10⁻⁶ %"),
+        (percent, 0.0102, _NAN, "1.020 % ± ?"),
+        (percent, 0.0, 0.0, "0 % ± 0"),
+        (concise, 0.66889, 0.0213, "0.67(3)"),
+        (concise, 0.0992, 0.03, "0.10(3)"),
+        (concise, 9.9996e-3, 9.6e-6, "0.01000(1)"),
+        (concise, 9.9996e-6, 9.6e-9, "1.000(1)e-05"),
+        (concise, 1234.0, 120.0, "1200(200)"),
+        (concise, 53.0, 26.0, "50(30)"),
+        (concise, 53210.0, 26.0, "5.321(3)e+04"),
+        (concise, 0.0, 0.0, "0"),
+        (concise, 0.0, 5.97e-10, "0(6)e-10"),
+        (concise, 1e-12, 5.97e-10, "0(6)e-10"),
+        (concise, 12.0, _NAN, "12.00(?)"),
+        (concise, _NAN, 1.0, ""),
     ],
 )
-def test_errors_decide_on_digits_and_both_have_one_power_of_ten(value: float, error: float, shown: str) -> None:
-    assert with_error(value, error) == shown
-
-
-@pytest.mark.parametrize(
-    ("fraction", "error", "shown"),
-    [
-        (9.87, 0.12, "990 % ± 20 %"),
-        (0.0102, 0.0001, "1.02 % ± 0.01 %"),
-        (1.234e-4, 7.2e-7, "0.01234 % ± 0.00008 %"),
-        (1.2341e-8, 4.4e-12, "(1.2341 ± 0.0005) × 10⁻⁶ %"),
-        (0.0102, _NAN, "1.020 % ± ?"),
-        (0.0, 0.0, "0 % ± 0"),
-    ],
-)
-def test_fractions_in_per_cent(fraction: float, error: float, shown: str) -> None:
-    assert percent(fraction, error) == shown
+def test_errors_decide_on_digits(
+    function: Callable[[float, float], str], value: float, error: float, shown: str
+) -> None:
+    assert function(value, error) == shown
 
 
 def test_bounds_are_rounded_up() -> None:
     assert bound(0.01011) == "1.1 %"
     assert bound(3.1e-13) == "3.1 × 10⁻¹¹ %"
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "shown"),
-    [
-        (0.66889, 0.0213, "0.67(3)"),
-        (0.0992, 0.03, "0.10(3)"),
-        (9.9996e-3, 9.6e-6, "0.01000(1)"),
-        (9.9996e-6, 9.6e-9, "1.000(1)e-05"),
-        (1234.0, 120.0, "1200(200)"),
-        (53.0, 26.0, "50(30)"),
-        (53210.0, 26.0, "5.321(3)e+04"),
-        (0.0, 0.0, "0"),
-        (12.0, _NAN, "12.00(?)"),
-        (_NAN, 1.0, ""),
-    ],
-)
-def test_errors_in_brackets(value: float, error: float, shown: str) -> None:
-    assert concise(value, error) == shown
 
 
 @given(st.floats(1e-12, 1e6), st.floats(1e-12, 10.0))
@@ -101,10 +86,6 @@ def _parsed(text: str) -> tuple[float, float]:
 def _number(text: str) -> float:
     number, _, power = text.partition(" × 10")
     return float(number) * 10.0 ** int(power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or 0)
-
-
-def test_zero_has_its_own_error() -> None:
-    assert concise(0.0, 5.97e-10) == concise(1e-12, 5.97e-10) == "0(6)e-10"
 
 
 NUMBERS = {"order": -2.0, "distance": 0.03, "error": 0.0003, "relative": 0.0102, "relative_error": 0.0001}
