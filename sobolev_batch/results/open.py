@@ -258,7 +258,7 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
         numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
         given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
         raise InputError(f"no size of meshes is named {quoted(x)}; known are {', '.join([*numbers, *given])}")
-    sizes: Reals = frame[x].to_numpy(dtype=np.float64)
+    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
     # A surface in closed form has none.
     return np.where(sizes > 0, sizes, np.nan)
 

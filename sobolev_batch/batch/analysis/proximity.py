@@ -175,7 +175,8 @@ def _dataset(workspace: Workspace) -> xr.Dataset:
         "digest": _digest(workspace),
     }
     variables = {name: ("mesh", values) for name, values in columns.items()}
-    return describe(xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes))
+    table = xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes)
+    return describe(table.set_coords("reason"))
 
 
 def _current(workspace: Workspace) -> tuple[list[str], list[ProximityRecord | None]]:

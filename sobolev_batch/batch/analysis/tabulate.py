@@ -32,8 +32,10 @@ from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 5
+TABLES_VERSION = 6
 
+# Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
+_COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
 # Numbers in the driver's memory for each pair and order, as measured: results, and copies of a table that is written.
 _NUMBERS_OF_A_PAIR = 10
 
@@ -211,8 +213,7 @@ class Results:
             "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference),
         }
         attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
-        table = self._table(columns, "mesh").assign(edge_length=("mesh", sizes))
-        return describe(table.assign_attrs(attributes))
+        return self._table(columns, "mesh").assign_attrs(attributes)
 
     def _sequences(self) -> list[list[int]]:
         """Return the places of the meshes of each family that goes from coarse to fine."""
@@ -226,8 +227,10 @@ class Results:
     def _table(self, columns: Mapping[str, NDArray[Any]], *dimensions: str) -> xr.Dataset:
         """Return values (orders, ...) as variables whose last dimension is the order."""
         variables = {name: ((*dimensions, "order"), np.moveaxis(values, 0, -1)) for name, values in columns.items()}
+        names = [*_COORDINATES, *({"time"} & self.meshes.coords.keys()), *self.meshes.attrs.get("metadata", ())]
+        coordinates = self.meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
         orders = np.array(self.orders, dtype=np.float64)
-        return describe(xr.Dataset(variables, coords={**self.meshes.coords, "order": ("order", orders)}))
+        return describe(xr.Dataset(variables, coords={**coordinates.variables, "order": ("order", orders)}))
 
 
 def _write_tables(workspace: Workspace, results: Results) -> None:
@@ -312,20 +315,24 @@ def _meshes_table(workspace: Workspace) -> xr.Dataset:
         "status": _strings(["missing" if record is None else record.status for record in records]),
         "reason": _strings([record.reason for record in filled]),
     }
+    is_complete = np.array([record.status == "complete" for record in filled])
     for item in fields(Facts):
         values = [getattr(record.facts, item.name) for record in filled]
-        columns[item.name] = _strings(values) if isinstance(item.default, str) else np.array(values)
+        # Nothing is known of a mesh that failed, which is not zero.
+        numbers_or_texts = _strings(values) if isinstance(item.default, str) else np.where(is_complete, values, np.nan)
+        columns[item.name] = numbers_or_texts
     columns["seconds"] = np.array([record.seconds for record in filled])
     for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
-    variables = {name: ("mesh", values) for name, values in columns.items()}
-    metadata = _metadata(rows)
-    coordinates = {"mesh": _strings([row.label for row in rows]), **metadata}
+    columns["mesh"], metadata = _strings([row.label for row in rows]), _metadata(rows)
     times = [row.member.time for row in rows]
     if any(time is not None for time in times):
-        coordinates["time"] = np.array([np.nan if time is None else time for time in times])
-    placed = {name: ("mesh", values) for name, values in coordinates.items()}
-    return describe(xr.Dataset(variables, coords=placed, attrs={"metadata": list(metadata)}))
+        columns["time"] = np.array([np.nan if time is None else time for time in times])
+    variables = {name: ("mesh", values) for name, values in {**columns, **metadata}.items()}
+    table = xr.Dataset(variables, attrs={"metadata": list(metadata)})
+    # Texts have no missing value, which `where` needs of variables that are no coordinates.
+    texts = [name for name, values in columns.items() if values.dtype == object]
+    return describe(table.set_coords([*texts, *_COORDINATES, *({"time"} & columns.keys()), *metadata]))
 
 
 def _metadata(rows: Sequence[Row]) -> dict[str, NDArray[np.generic]]:

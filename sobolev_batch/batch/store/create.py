@@ -35,6 +35,7 @@ from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
@@ -182,7 +183,10 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
             # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
             coordinates="quality",
         ),
-        **dataset_keys("fourier", xr.Dataset({"quality": ("mesh", padded)}, coords={**axes, "mesh": mesh})),
+        **dataset_keys(
+            "fourier",
+            xr.Dataset({"quality": ("mesh", padded)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}),
+        ),
         **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
     }
     if plan.tail is not None:
@@ -198,6 +202,19 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
     store.publish(keys)
     store.documents[""] = _root(_attributes(plan, labels))
+
+
+def _weight_columns(plan: Plan) -> dict[str, tuple[str, NDArray[np.float64], dict[str, str]]]:
+    """Return the weights of samples in the integral over all frequencies: along each axis, and by the shell |k|²."""
+    lattice = plan.lattice
+    radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
+    step = np.ones_like(radii) if plan.tail is None else smooth_step(radii, plan.tail.cutoff)
+    columns = {
+        name.replace("xi", "weight"): (name, weights, {"long_name": f"factor of the weight of a sample, by {name}"})
+        for name, weights in zip(AXES, lattice.axis_weights(lattice.half), strict=True)
+    }
+    meaning = {"long_name": "factor of the weight of a sample, by the shell |k|² of xi = spacing k"}
+    return {**columns, "weight_shell": ("shell", step, meaning)}
 
 
 def _documents_of(keys: dict[str, bytes]) -> dict[str, Any]:

@@ -84,7 +84,7 @@ class StudyMeshes:
         if not triangles:
             raise InputError("a surface that is no mesh has no triangles")
         if triangles > most_triangles:
-            raise InputError(f"it has {triangles:,} triangles; up to {most_triangles:,} are made again")
+            raise InputError(f"it has {triangles:,.0f} triangles; up to {most_triangles:,} are made again")
         own = self.members[label][1].load()
         scaled = self.similarity.apply(own)
         if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():

@@ -320,14 +320,14 @@ def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence
 _COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
 _MESH_COLUMNS = (
     Column("mesh", "mesh", kind="label"),
-    Column("vertices", "vertices", "{:,}".format),
-    Column("triangles", "triangles", "{:,}".format),
+    Column("vertices", "vertices", "{:,.0f}".format),
+    Column("triangles", "triangles", "{:,.0f}".format),
     Column("seconds", "seconds", "{:.2f}".format),
     Column("backend", "backend", kind="text"),
     Column("area", "area", "{:.4g}".format),
-    Column("boundary_edges", "boundary edges", "{:,}".format),
-    Column("nonmanifold_edges", "non-manifold", "{:,}".format),
-    Column("points", "quadrature points", "{:,}".format),
+    Column("boundary_edges", "boundary edges", "{:,.0f}".format),
+    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
+    Column("points", "quadrature points", "{:,.0f}".format),
     Column("worker", "worker", kind="text"),
     Column("finished", "finished, UTC", kind="text"),
 )
@@ -357,7 +357,7 @@ def _summary(meshes: xr.Dataset, convergence: xr.Dataset, orders: tuple[str, ...
     done = int((status[others] == "complete").sum())
     yield "meshes compared", f"{done:,} of {int(others.sum()):,}"
     yield "orders" if len(orders) > 1 else "order", ", ".join(orders) if len(orders) < 5 else f"{len(orders)}"
-    yield "triangles in all", large_count(int(meshes["triangles"].values.sum()))
+    yield "triangles in all", large_count(int(np.nansum(meshes["triangles"].values)))
     yield "computing time", duration(float(np.nansum(meshes["seconds"].values)))
 
 

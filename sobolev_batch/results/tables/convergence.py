@@ -58,6 +58,8 @@ _NUMBERS = (
     "resolved",
     "within",
 )
+# Integers, or missing where a mesh failed.
+_COUNTS = ("triangles", "vertices")
 # Where the study requests them.
 _PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 _NOTE = """\
@@ -172,7 +174,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         row = convergence.sel(order=s)
         numbers = {key: row[key].values[others] for key in _NUMBERS}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
-    frame = pd.concat(frames, ignore_index=True)
+    frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
     kept = ("reference", "rtol", "computed")
     frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
     if known := metadata_of(tree):

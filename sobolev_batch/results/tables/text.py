@@ -313,7 +313,7 @@ class Column:
     def text(self, row: Mapping[Any, Any]) -> str:
         """Return the cell of a row of the frame; it is empty where the value is missing."""
         value = row[self.name]
-        if value is None or (isinstance(value, float) and math.isnan(value)):
+        if value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value)):
             return ""
         return self.format(value, row[self.error]) if self.error else self.format(value)
 

@@ -38,7 +38,8 @@ def test_a_table_of_all_pairs_is_written_array_by_array_within_the_memory_that_a
     count, array_bytes = 1000, 8_000_000
     monkeypatch.setattr(tables, "_LARGEST_CHUNK_BYTES", array_bytes // 16)
     labels = np.array([f"f/{i}" for i in range(count)], dtype=object)
-    meshes = xr.Dataset({"row": ("mesh", np.arange(count))}, coords={"mesh": labels})
+    columns = ("row", "family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
+    meshes = xr.Dataset({name: ("mesh", np.arange(count)) for name in columns}, coords={"mesh": labels})
     store = Store(Location.parse(tmp_path / "store"))
     tracemalloc.start()
     try:
@@ -63,3 +64,21 @@ def test_tables_in_many_chunks_are_those_in_one(
     assert verify(store_path).is_sound
     assert_same_tables(store_path, finished_store)
     assert open_store(store_path)["distances"].sizes["mesh"] == 5
+
+
+def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store_path: Path, threads: Client) -> None:
+    table = small_table()
+    table["family"].append({"name": "lost", "source": "files", "paths": ["nowhere.ply"]})
+    run(Study.from_table(table), store_path, threads)
+    tree = xr.open_datatree(store_path, engine="zarr").load()
+    for group in ("meshes", "norms", "distances", "convergence"):
+        whole = tree[group].to_dataset()
+        small = whole.where(whole["triangles"] < 100, drop=True)
+        assert small["mesh"].values.tolist() == ["ico/0", "ico/1", "reference"]
+        assert small["family"].values.tolist() == ["ico", "ico", "reference"]
+        failed = whole.sel(mesh="lost/nowhere").drop_vars(["rank", "row", "resolved", "within"], errors="ignore")
+        assert failed["status"] == "failed"
+        assert all(values.isnull().all() for values in (*failed.data_vars.values(), failed["vertices"]))
+    smallest = tree["convergence"].to_dataset()["relative"].groupby("family").min()
+    assert smallest["family"].values.tolist() == ["ico", "lost", "reference"]
+    assert smallest.isnull().any("order").values.tolist() == [False, True, False]

@@ -6,16 +6,20 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zarr
+from distributed import Client
 
-from sobolev_batch import StoreError, Study
+from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.spectral.fields import Quality
+from tests.support.repository import blocks
 from tests.support.stores import READER
 from tests.support.studies import small_table
 
@@ -151,3 +155,30 @@ def test_plain_xarray_reads_everything_without_this_package(finished_store: Path
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert 0.003 < float(done.stdout) < 0.006
+
+
+@pytest.mark.parametrize("octaves", [0, 1])
+def test_zarr_and_numpy_alone_compute_norms_and_distances(octaves: int, store_path: Path, threads: Client) -> None:
+    lattice = {"xi_max": 3.0, "M": 16, "octaves": octaves}
+    run(Study.from_table(small_table(lattice=lattice)), store_path, threads)
+    tree = open_store(store_path)
+    (function,) = (block for block in blocks("docs/store.md", "python") if "def squared_norm" in block)
+    names: dict[str, Any] = {}
+    exec(function, names)
+    store, labels = zarr.open_group(str(store_path), mode="r"), Store.open(store_path).labels()
+    for row, record in enumerate(Store.open(store_path).records()):
+        assert record is not None
+        tail = Quality.from_json(record.quality).tail
+        for order in (-10.0, -3.0):
+            place = {"mesh": labels[row], "order": order}
+            norm = tree["norms"]["norm"].sel(place).item()
+            distance = tree["convergence"]["distance"].sel(place).item()
+            # What lies beyond the last octave is an estimate, and no sum.
+            beyond = (
+                [0.0, 0.0]
+                if tail is None
+                else [part.at([order])[0].item() if part else 0.0 for part in (tail.own, tail.difference)]
+            )
+            found = names["squared_norm"](store, row, None, order), names["squared_norm"](store, row, 4, order)
+            assert found[0] == pytest.approx(norm**2 - beyond[0], rel=1e-13)
+            assert found[1] == pytest.approx(distance**2 - beyond[1], rel=1e-11, abs=1e-30)
