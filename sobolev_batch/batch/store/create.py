@@ -78,9 +78,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         return _mended(store, plan, damage)
     if not exists:
         store.location.require_free(besides=LOCK_KEYS)
-        _create(store, plan)
-        return store
-    if store.is_unfinished:
+    if not exists or store.is_unfinished:
         _create(store, plan)
         return store
     attributes, lattice = store.attributes(), _lattice_entry(plan)

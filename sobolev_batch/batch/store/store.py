@@ -29,7 +29,6 @@ from zarr.storage import StorePath
 
 from sobolev_batch.batch.storage.checked import (
     CHANGED,
-    CHECKSUM_BYTES,
     CheckedStore,
     checksum_of,
     largest_chunk_bytes,
@@ -40,7 +39,6 @@ from sobolev_batch.batch.store.records import Record, RunRecord, record_from_tab
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
 
 _log = logging.getLogger(__name__)
 
@@ -151,11 +149,8 @@ class Store:
     def choice(self) -> LatticeChoice:
         """Return the lattice of all fields, with the octaves beside it."""
         study = self.attributes()["study"]
-        if study.get("choice"):
-            return LatticeChoice.from_table(study["choice"], study.get("octaves"))
-        octaves = study.get("octaves")
-        tail = None if octaves is None else TailSampling.from_table(octaves)
-        return LatticeChoice(Lattice(**study["lattice"]), study["dtype"], tail=tail)
+        given = {**study["lattice"], "dtype": study["dtype"], "closest": (), "reasons": (), "basis": ""}
+        return LatticeChoice.from_table(study.get("choice") or given, study.get("octaves"))
 
     @property
     def is_unfinished(self) -> bool:
@@ -283,12 +278,8 @@ class Store:
     def incomplete_chunks(self, name: str, sizes: Mapping[str, int]) -> list[tuple[int, ...]]:
         """Return the indices of an array's chunks that are missing, or of a wrong length by the sizes of its keys."""
         document = self.document(name)
-        expected = 0
         # Strings have no size that is known in advance.
-        if document["data_type"] != "string":
-            length = math.prod(document["chunk_grid"]["configuration"]["chunk_shape"])
-            has_checksum = document["codecs"][-1]["name"] == "crc32c"
-            expected = length * np.dtype(document["data_type"]).itemsize + CHECKSUM_BYTES * has_checksum
+        expected = 0 if document["data_type"] == "string" else largest_chunk_bytes(document)
         stored = {index: sizes.get(key, 0) for key, index in self.chunk_keys(name).items()}
         return [index for index, size in stored.items() if not size or (expected and size != expected)]
 

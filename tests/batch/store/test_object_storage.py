@@ -31,7 +31,7 @@ from sobolev_batch.batch.store.tables import table_attributes, write_table
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import LockError
 from tests.support.commands import STUDY, call, command
-from tests.support.object_storage import BUCKET, IMPATIENT, SECRET, TOKEN, Server, serving, taken_for_s3
+from tests.support.object_storage import BUCKET, SECRET, TOKEN, Server, serving, taken_for_s3
 from tests.support.stores import READER, assert_same
 from tests.support.studies import small_table, variable
 
@@ -243,20 +243,6 @@ def test_permissions_are_checked_before_anything_is_computed(tmp_path: Path) -> 
             assert_refused(("status", there), stranger, "cannot be read: access is denied", tmp_path)
         server.enforce(False)
         assert server.keys("") == before
-
-
-@pytest.mark.all
-def test_a_server_that_goes_away_ends_the_run(study: Study) -> None:
-    def kill(progress: Progress) -> None:
-        if progress.stage == "fields" and progress.done == 1:
-            brief.stop()
-
-    with (
-        serving() as brief,
-        taken_for_s3({**brief.environment(), **IMPATIENT}),
-        pytest.raises(StoreError, match=rf"s3://{BUCKET}/x.zarr: the store cannot be (read|written): .*connect"),
-    ):
-        run(study, f"s3://{BUCKET}/x.zarr", workers=1, on_progress=kill)
 
 
 @pytest.mark.all

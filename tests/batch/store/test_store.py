@@ -32,7 +32,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_fields_that_were_not_computed_are_nan_zeros_are_kept_and_a_flipped_bit_is_named(store_path: Path) -> None:
+def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Path) -> None:
     plan = small_plan()
     store = prepare_store(store_path, plan)
     (place,) = store.places()
@@ -40,12 +40,6 @@ def test_fields_that_were_not_computed_are_nan_zeros_are_kept_and_a_flipped_bit_
     fields = store.read_fields([0, 3], place)
     assert np.isnan(fields[0]).all()
     assert (fields[1] == 0).all()
-    chunk = store_path / "fourier/fourier/c/3/0/0/0"
-    data = bytearray(chunk.read_bytes())
-    data[1000] ^= 4
-    chunk.write_bytes(data)
-    with pytest.raises(StoreError, match="the field of ico/3 is damaged"):
-        store.read_fields([3], place)
 
 
 def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None:
@@ -61,14 +55,6 @@ def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None
     assert found[2].facts.area == 1.5
     assert found[2].completes("key")
     assert not found[2].completes("other")
-
-
-def test_a_record_that_is_none_counts_as_not_there(store_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    store = prepare_store(store_path, small_plan())
-    store.write_record(1, Record("k", "complete"))
-    zarr.open_array(str(store_path), path="records/record", mode="r+")[0] = '{"key": "x"}'
-    assert [record is None for record in store.records()] == [True, False, True, True, True]
-    assert "the record of ico/0 is damaged and counts as not there" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -102,37 +88,12 @@ def test_new_meshes_become_new_rows(store_path: Path) -> None:
     assert [record is None for record in grown.records()] == [False, True, True, True, True, True, True]
 
 
-def test_refuses_places_that_hold_something_else(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("text")
-    with pytest.raises(StoreError, match="it is a file"):
-        prepare_store(tmp_path / "file", small_plan())
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    (folder / "precious.txt").write_text("text")
-    with pytest.raises(StoreError, match="not empty and holds no store"):
-        prepare_store(folder, small_plan())
-    assert snapshot(folder) == {"precious.txt": b"text"}
-    zarr.create_group(str(tmp_path / "other.zarr"))
-    with pytest.raises(StoreError, match="not one of a study"):
-        prepare_store(tmp_path / "other.zarr", small_plan())
-
-
-@pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        ("/proc/results.zarr", r"/proc/results\.zarr: the store cannot be written"),
-        ("{}/file/results.zarr", r"there is no folder .*/file to hold the store; make it first"),
-    ],
-)
-def test_refuses_a_place_that_cannot_be_written(place: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("text")
-    with pytest.raises(StoreError, match=message):
-        prepare_store(place.format(tmp_path), small_plan())
-
-
 def test_opening_what_is_no_store_or_a_newer_one(store_path: Path) -> None:
     with pytest.raises(StoreError, match="it holds no store of a study"):
         Store.open(store_path)
+    zarr.create_group(str(store_path.with_name("other.zarr")))
+    with pytest.raises(StoreError, match="not one of a study"):
+        prepare_store(store_path.with_name("other.zarr"), small_plan())
     prepare_store(store_path, small_plan())
     zarr.open_group(str(store_path), mode="r+").attrs["schema_version"] = 99
     with pytest.raises(StoreError, match="its schema has version 99, this program reads"):
