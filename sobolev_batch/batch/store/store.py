@@ -15,6 +15,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
@@ -305,17 +306,14 @@ class Store:
     def examine_records(self) -> tuple[list[Record | None], dict[int, str]]:
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
         count, damage = self.document(RECORD)["shape"][0], {}
-        try:
-            lines: Sequence[str | DamageError] = self.read_strings(RECORD)
-        except DamageError:
-            # At least one of them; read each by itself to see which.
-            lines = [self._record_line(row) for row in range(count)]
+        lines: Sequence[str | None] = [None] * count
+        # If any is damaged, each is read by itself to see which.
+        with suppress(DamageError):
+            lines = self.read_strings(RECORD)
         records: list[Record | None] = [None] * count
         for row, line in enumerate(lines):
             try:
-                if isinstance(line, DamageError):
-                    raise line
-                records[row] = Record.from_json(line, row)
+                records[row] = Record.from_json(str(self.read(RECORD, row)) if line is None else line, row)
             except DamageError as error:
                 damage[row] = error.what
         return records, damage
@@ -331,21 +329,13 @@ class Store:
 
     def read_record(self, row: int) -> Record | None:
         """Return the completion record of one row, or None if it has none that can be read."""
-        line = self._record_line(row)
-        try:
-            return None if isinstance(line, DamageError) else Record.from_json(line, row)
-        except DamageError:
-            return None
+        with suppress(DamageError):
+            return Record.from_json(str(self.read(RECORD, row)), row)
+        return None
 
     def write_record(self, row: int, record: Record | None) -> None:
         """Write the completion record of a row, or erase it: one chunk, replaced as a whole."""
         self.write(RECORD, row, "" if record is None else record.to_json(row))
-
-    def _record_line(self, row: int) -> str | DamageError:
-        try:
-            return str(self.read(RECORD, row))
-        except DamageError as error:
-            return error
 
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one.

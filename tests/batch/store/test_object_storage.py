@@ -104,7 +104,8 @@ def test_requests_grow_by_eight_for_a_mesh(server: Server, threads: Client, url:
     # The field and its record written, each after a look at the lock; looks for an older record by driver and task;
     # the field read for norms and for pairs.
     assert counts[1] - counts[0] <= 8 * 10 + 4
-    assert counts[0] < 240
+    # Coordinates of tables are 48 of them.
+    assert counts[0] < 290
 
 
 def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
