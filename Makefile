@@ -42,7 +42,7 @@ coverage: $(READY)  ## reported errors against true ones, over hundreds of rando
 	$(BIN)/python -m tests.coverage
 
 soak: $(READY)  ## 2,000 meshes while processes are killed and the storage fails, 30 struck clusters, 1,000 damaged files; two to three hours
-	$(BIN)/python -m tests.soak
+	$(BIN)/python -m tests.soak --sequences 1 --meshes 2000 --strikes 40 --rate 0.05
 	$(BIN)/python -m tests.soak --sequences 30
 	$(BIN)/python -m tests.soak --corruptions 1000
 

@@ -1,4 +1,4 @@
-"""Studies and stores under fire: python -m tests.soak, with --sequences N or --corruptions N."""
+"""Studies and stores under fire: python -m tests.soak --sequences N, or --corruptions N."""
 
 from __future__ import annotations
 
@@ -11,80 +11,54 @@ from tempfile import TemporaryDirectory
 import click
 from tabulate import tabulate
 
-from tests.soak import corruptions, sequences
-from tests.soak.trial import Outcome, soak
+from tests.soak.corruptions import ANSWERS, BAD, WAYS, corruptions
+from tests.soak.strikes import strike_all, strikes_of
 
 
 @click.command()
-@click.option("--meshes", default=2000, show_default=True, help="How many.")
-@click.option("--seed", default=0, show_default=True, help="Of meshes, kills and failing requests.")
-@click.option("--kills", default=40, show_default=True, help="Of workers.")
-@click.option("--driver-kills", default=4, show_default=True, help="Of the process that drives the run.")
-@click.option("--rate", default=0.05, show_default=True, help="Share of the requests to the storage that fail.")
-@click.option(
-    "--sequences", "struck", default=0, help="Instead: so many small studies, each on a cluster that is struck 5 times."
-)
-@click.option("--corruptions", "damaged", default=0, help="Instead: so many damaged files of a finished store.")
-def main(meshes: int, seed: int, kills: int, driver_kills: int, rate: float, struck: int, damaged: int) -> None:
-    """Run a study while processes are killed and the storage fails; status 1 if anything is lost by that."""
+@click.option("--sequences", default=0, help="How many studies, each on a cluster that is struck.")
+@click.option("--meshes", default=60, show_default=True, help="Of each study.")
+@click.option("--strikes", default=5, show_default=True, help="On each study.")
+@click.option("--rate", default=0.0, show_default=True, help="Share of the requests to the storage that fail.")
+@click.option("--corruptions", "damaged", default=0, help="How many damaged files of a finished store.")
+@click.option("--seed", default=0, show_default=True, help="Of strikes, failing requests and damage.")
+def main(sequences: int, meshes: int, strikes: int, rate: float, damaged: int, seed: int) -> None:
+    """Disturb studies and damage stores; status 1 if anything is lost by that, or changes without a word."""
     for talkative in ("distributed", "asyncio"):
         logging.getLogger(talkative).setLevel(logging.CRITICAL)
     with TemporaryDirectory() as folder:
-        if struck:
-            sys.exit(strike(Path(folder), range(seed, seed + struck)))
-        if damaged:
-            sys.exit(damage(Path(folder), damaged, seed))
-        outcome = soak(Path(folder), meshes, seed, kills, driver_kills, rate)
-    shown = [(name, f"{figure:.1f}" if isinstance(figure, float) else f"{figure:,}") for name, figure in rows(outcome)]
-    headers = [f"{meshes:,} meshes, seed {seed}", ""]
-    click.echo(tabulate(shown, headers=headers, disable_numparse=True, colalign=("left", "right")))
-    for difference in outcome.differences:
-        click.echo(f"not the same: {difference}")
-    sys.exit(bool(outcome.differences))
+        is_bad = strike(Path(folder), range(seed, seed + sequences), meshes, strikes, rate) if sequences else False
+        is_bad |= damage(Path(folder), damaged, seed) if damaged else False
+    sys.exit(is_bad)
 
 
-def strike(folder: Path, seeds: range) -> bool:
+def strike(folder: Path, seeds: range, meshes: int, count: int, rate: float) -> bool:
     """Show what came of sequences of strikes, and return whether anything was lost."""
-    outcomes = []
-    plans = {seed: sequences.strikes_of(seed, count=5) for seed in seeds}
-    for seed, sequence in zip(seeds, sequences.strike_all(folder, plans), strict=True):
-        told = ", ".join(f"{one.role} {one.what} at {one.complete}" for one in sequence.strikes)
-        click.echo(f"seed {seed}: {sequence.seconds:.0f} s, {sequence.commands} commands; {told}")
-        for difference in sequence.differences:
+    found, is_bad = Counter[str](), False
+    plans = {seed: strikes_of(seed, count, meshes) for seed in seeds}
+    for seed, outcome in zip(seeds, strike_all(folder, plans, meshes, rate), strict=True):
+        told = ", ".join(f"{one.role} {one.what} at {one.complete}" for one in outcome.strikes)
+        click.echo(f"seed {seed}: {outcome.seconds:.0f} s, {outcome.commands} commands; {told}")
+        for difference in outcome.differences:
             click.echo(f"not the same: {difference}")
-        outcomes.append(sequence)
-    click.echo(tabulate(sorted(sequences.counts(outcomes).items())))
-    click.echo(f"the longest took {max(one.seconds for one in outcomes):.0f} s")
-    return any(one.differences for one in outcomes)
+        found += Counter(f"{one.role} {one.what}" for one in outcome.strikes) + outcome.failures
+        is_bad |= bool(outcome.differences)
+    click.echo(tabulate(sorted(found.items())))
+    return is_bad
 
 
 def damage(folder: Path, count: int, seed: int) -> bool:
     """Show what came of damaged files, and return whether a number changed without a word."""
-    found = []
-    for corruption in corruptions.corruptions(folder, count, seed):
-        found.append(corruption)
+    found, kinds = {way: Counter[str]() for way in WAYS}, Counter[str]()
+    for corruption in corruptions(folder, count, seed):
+        kinds[corruption.kind] += 1
         for way, answer in corruption.answers.items():
-            if answer in corruptions.BAD:
+            found[way][answer] += 1
+            if answer in BAD:
                 click.echo(f"{way}: {answer}: {', '.join(corruption.keys)}, {corruption.kind}")
-    table = [[way, *(answers[answer] for answer in corruptions.ANSWERS)] for way, answers in corruptions.counts(found)]
-    click.echo(tabulate(table, headers=["", *corruptions.ANSWERS]))
-    click.echo(tabulate(sorted(Counter(one.kind for one in found).items())))
-    return any(answer in corruptions.BAD for one in found for answer in one.answers.values())
-
-
-def rows(outcome: Outcome) -> list[tuple[str, int | float]]:
-    """The figures of a trial with their names."""
-    return [
-        ("workers killed", outcome.workers),
-        ("drivers killed", outcome.drivers),
-        ("requests", outcome.requests),
-        *((f"of them failed: {kind}", count) for kind, count in sorted(outcome.failures.items())),
-        ("fields stored once more", outcome.stored_again),
-        ("seconds of the clean run, into a folder", outcome.clean_seconds),
-        ("seconds of the soaked run", outcome.soaked_seconds),
-        ("seconds lost", outcome.soaked_seconds - outcome.clean_seconds),
-        ("differences", len(outcome.differences)),
-    ]
+    click.echo(tabulate([[way, *(found[way][answer] for answer in ANSWERS)] for way in WAYS], headers=["", *ANSWERS]))
+    click.echo(tabulate(sorted(kinds.items())))
+    return any(found[way][answer] for way in WAYS for answer in BAD)
 
 
 if __name__ == "__main__":

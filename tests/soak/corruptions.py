@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import re
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,31 +14,16 @@ import xarray as xr
 
 from sobolev_batch import SobolevBatchError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
-from tests.soak.meshes import write_meshes
+from tests.soak.studies import STUDY, write_meshes
 from tests.support.commands import call
 
-STUDY = """
-[study]
-name = "corruptions"
-[lattice]
-xi_max = 2.0
-M = 10
-octaves = 1
-[norm]
-orders = [-4.0, -2.0]
-pairs = "all"
-[reference]
-source = "sphere"
-[[family]]
-name = "bumpy"
-source = "files"
-paths = ["*.off"]
+_MESHES = 2
+_SPHERES = """
 [[family]]
 name = "ico"
 source = "icosphere"
 levels = [0, 1]
 """
-_MESHES = 2
 BAD = ("silent", "unnamed")
 ANSWERS = ("same", "told", "verified", *BAD)
 # Charts take most of the time. A report reads what the other ways read.
@@ -48,36 +32,20 @@ _REPORTS_EVERY = 5
 _MOMENTS = re.compile(r"\d+(\.\d+)? (s|min|h|seconds|minutes|hours)\b( ago)?|\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d)?\S*")
 
 
-@dataclass(frozen=True)
-class Stores:
-    """Stores that a corruption is made from.
-
-    Attributes:
-        whole: A finished store.
-        earlier: An earlier state of it, before a mesh changed.
-        foreign: A store of the same study with other meshes.
-    """
-
-    whole: Path
-    earlier: Path
-    foreign: Path
-
-    @classmethod
-    def made(cls, folder: Path) -> Stores:
-        """Compute the stores."""
-        stores = cls(folder / "whole.zarr", folder / "earlier.zarr", folder / "foreign.zarr")
-        study = folder / "study.toml"
-        study.write_text(STUDY)
-        chance = np.random.default_rng(0)
-        with local_client(1) as client:
-            write_meshes(folder, range(_MESHES), chance)
-            run(Study.from_toml(study), stores.foreign, client)
-            write_meshes(folder, range(_MESHES), chance)
-            run(Study.from_toml(study), stores.whole, client)
-            shutil.copytree(stores.whole, stores.earlier)
-            write_meshes(folder, range(1), chance)
-            run(Study.from_toml(study), stores.whole, client)
-        return stores
+def finished_stores(folder: Path) -> dict[str, Path]:
+    """Compute a whole store, one of an earlier state before a mesh changed, and a foreign one of other meshes."""
+    stores = {name: folder / f"{name}.zarr" for name in ("whole", "earlier", "foreign")}
+    study = folder / "study.toml"
+    octaves, all_pairs = ("M = 24", "M = 10\noctaves = 1"), ('pairs = "reference"', 'pairs = "all"')
+    study.write_text(STUDY.replace(*octaves).replace(*all_pairs) + _SPHERES)
+    chance = np.random.default_rng(0)
+    with local_client(1) as client:
+        for name, count in (("foreign", _MESHES), ("whole", _MESHES), ("whole", 1)):
+            if stores[name].exists():
+                shutil.copytree(stores[name], stores["earlier"])
+            write_meshes(folder, range(count), chance)
+            run(Study.from_toml(study), stores[name], client)
+    return stores
 
 
 @dataclass(frozen=True)
@@ -99,11 +67,12 @@ class Corruption:
 
 def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
     """Yield so many corruptions of one store."""
-    stores = Stores.made(folder)
+    stores = finished_stores(folder)
+    whole = stores["whole"]
     chance = random.Random(seed)
-    keys = sorted(str(path.relative_to(stores.whole)) for path in stores.whole.rglob("*") if path.is_file())
+    keys = sorted(str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file())
     damaged = folder / "damaged.zarr"
-    shutil.copytree(stores.whole, damaged)
+    shutil.copytree(whole, damaged)
     truths = {name: read(damaged) for name, read in WAYS.items()}
     while count:
         kind = chance.choice(sorted(KINDS))
@@ -119,7 +88,7 @@ def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
             answers = {name: "verified" if answer == "silent" else answer for name, answer in answers.items()}
         yield Corruption(kind, changed, answers)
         shutil.rmtree(damaged)
-        shutil.copytree(stores.whole, damaged)
+        shutil.copytree(whole, damaged)
         count -= 1
 
 
@@ -207,38 +176,37 @@ WAYS: dict[str, Callable[[Path], dict[str, str]]] = {
 }
 
 
-def _rewrite(store: Path, key: str, content: bytes) -> tuple[str, ...]:
-    path = store / key
-    if path.read_bytes() == content:
-        return ()
-    path.write_bytes(content)
-    return (key,)
+# Damages a file of a store, by its key; gives the keys of the files whose content changed.
+_Damage = Callable[[Path, str, Mapping[str, Path], random.Random], tuple[str, ...]]
 
 
-def _flip(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
-    content = bytearray((store / key).read_bytes())
-    content[chance.randrange(len(content))] ^= chance.randrange(1, 256)
-    return _rewrite(store, key, bytes(content))
+def _rewritten(change: Callable[[bytes, random.Random], bytes]) -> _Damage:
+    def damage(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
+        before = (store / key).read_bytes()
+        after = change(before, chance)
+        (store / key).write_bytes(after)
+        return (key,) if after != before else ()
+
+    return damage
 
 
-def _truncate(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
-    content = (store / key).read_bytes()
-    return _rewrite(store, key, content[: chance.randrange(len(content))])
+def _flipped(content: bytes, chance: random.Random) -> bytes:
+    place = chance.randrange(len(content))
+    return content[:place] + bytes([content[place] ^ chance.randrange(1, 256)]) + content[place + 1 :]
 
 
-def _zero(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
-    content = (store / key).read_bytes()
+def _zeroed(content: bytes, chance: random.Random) -> bytes:
     start = chance.randrange(len(content))
     end = chance.randrange(start, len(content)) + 1
-    return _rewrite(store, key, content[:start] + bytes(end - start) + content[end:])
+    return content[:start] + bytes(end - start) + content[end:]
 
 
-def _delete(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+def _delete(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
     (store / key).unlink()
     return (key,)
 
 
-def _swap(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
+def _swap(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
     """Exchange a file with another one, of equal size where there is one."""
     content = (store / key).read_bytes()
     others = [path for path in store.rglob("*") if path.is_file() and path.read_bytes() != content]
@@ -249,25 +217,20 @@ def _swap(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple
     return (key, str(other.relative_to(store)))
 
 
-def _from(state: str) -> Callable[[Path, str, Stores, random.Random], tuple[str, ...]]:
-    def replace(store: Path, key: str, stores: Stores, chance: random.Random) -> tuple[str, ...]:
-        source = getattr(stores, state) / key
-        return _rewrite(store, key, source.read_bytes()) if source.exists() else ()
+def _from(state: str) -> _Damage:
+    def replace(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
+        source = stores[state] / key
+        return _rewritten(lambda *_: source.read_bytes())(store, key, stores, chance) if source.exists() else ()
 
     return replace
 
 
-KINDS: dict[str, Callable[[Path, str, Stores, random.Random], tuple[str, ...]]] = {
-    "byte flipped": _flip,
-    "cut short": _truncate,
-    "stretch zeroed": _zero,
+KINDS: dict[str, _Damage] = {
+    "byte flipped": _rewritten(_flipped),
+    "cut short": _rewritten(lambda content, chance: content[: chance.randrange(len(content))]),
+    "stretch zeroed": _rewritten(_zeroed),
     "deleted": _delete,
     "exchanged with another": _swap,
     "from an earlier state": _from("earlier"),
     "from another store": _from("foreign"),
 }
-
-
-def counts(found: list[Corruption]) -> list[tuple[str, Counter[str]]]:
-    """Count the answers of each way."""
-    return [(way, Counter(one.answers[way] for one in found if way in one.answers)) for way in WAYS]
