@@ -2,18 +2,120 @@
 
 from __future__ import annotations
 
+import ast
+import os
 import random
+import re
+import subprocess
 import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from queue import Queue
 from tempfile import TemporaryDirectory
 
 import click
 
-from tests.mutants.guards import guards
-from tests.mutants.trial import try_all
 from tests.support.repository import ROOT
 
 PATHS = ("sobolev_batch/batch", "sobolev_batch/surfaces/formats", "sobolev_batch/surfaces/sources")
+_IS_CHECK = re.compile("_?(require|check)(_|$)")
+# A mutant that hangs is noticed too.
+_TEST_SECONDS = 300
+# All tests passed, or none exists.
+_PASSED = (0, 5)
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A condition that ends in an exception, or a call that may raise one and does nothing else.
+
+    Attributes:
+        path: Path of the module, from the root of the repository.
+        line: Its first line.
+        text: Its condition or call.
+        start, end: Places of the text in the module, in bytes.
+        replacement: What the text is replaced by.
+    """
+
+    path: str
+    line: int
+    text: str
+    start: int
+    end: int
+    replacement: str
+
+    def taken_out(self, source: bytes) -> bytes:
+        """Return the source of its module without it."""
+        return source[: self.start] + self.replacement.encode() + source[self.end :]
+
+
+def guards_of(source: bytes, path: str) -> Iterator[Guard]:
+    """Yield the guards of a module in the order of its syntax tree."""
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+
+    def guard(node: ast.expr, replacement: str) -> Guard:
+        start = starts[node.lineno - 1] + node.col_offset
+        end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
+        return Guard(path, node.lineno, " ".join(source[start:end].decode().split()), start, end, replacement)
+
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.If) and any(isinstance(statement, ast.Raise) for statement in node.body):
+            yield guard(node.test, "False")
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            function = node.value.func
+            name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+            if _IS_CHECK.match(name):
+                yield guard(node.value, "None")
+
+
+def killer_of(copy: Path, guard: Guard) -> str:
+    """Take a guard out of a copy of the repository, and return the first test that fails; empty if all pass."""
+    module = copy / guard.path
+    source = module.read_bytes()
+    module.write_bytes(guard.taken_out(source))
+    try:
+        return next(filter(None, (_first_failure(copy, tests) for tests in mirrors_of(copy, guard.path))), "")
+    finally:
+        module.write_bytes(source)
+
+
+def mirrors_of(root: Path, path: str) -> list[str]:
+    """Return the tests of a module, those that are nearest to it first: its own, its folder's, and of its layer."""
+    parts = Path(path).with_suffix("").parts[1:]
+    folders = [Path("tests", *parts[:depth]) for depth in range(len(parts) - 1, 0, -1)]
+    nearest = Path("tests", *parts[:-1], f"test_{parts[-1].lstrip('_')}.py")
+    found = [str(test) for test in (nearest, *folders) if (root / test).exists()]
+    return [*found, "tests/faults"] if parts[0] == "batch" else found
+
+
+def _first_failure(copy: Path, tests: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist",
+         "--timeout", str(_TEST_SECONDS), tests],
+        cwd=copy,
+        # Before what is installed, in processes that tests start too.
+        env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+    )  # fmt: skip
+    if done.returncode in _PASSED:
+        return ""
+    failures = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return failures[0].split(" - ")[0] if failures else f"{tests} ended with status {done.returncode}"
+
+
+def _copy(folder: Path) -> Path:
+    """Copy the files of the repository, as they are on the disk."""
+    listed = subprocess.check_output(["git", "ls-files", "-z", "-co", "--exclude-standard"], cwd=ROOT, text=True)
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes((ROOT / name).read_bytes())
+    return folder
 
 
 @click.command()
@@ -23,14 +125,30 @@ PATHS = ("sobolev_batch/batch", "sobolev_batch/surfaces/formats", "sobolev_batch
 @click.option("--jobs", default=2, show_default=True, help="How many at a time.")
 def main(paths: tuple[str, ...], count: int | None, seed: int, jobs: int) -> None:
     """Take guards out of the modules at PATHS; status 1 if the tests pass without one of them."""
-    found = [guard for path in paths or PATHS for guard in guards(ROOT, path)]
+    modules = [
+        module
+        for path in paths or PATHS
+        for module in (sorted((ROOT / path).rglob("*.py")) if (ROOT / path).is_dir() else [ROOT / path])
+    ]
+    found = [guard for module in modules for guard in guards_of(module.read_bytes(), str(module.relative_to(ROOT)))]
     chosen = random.Random(seed).sample(found, min(count or len(found), len(found)))
+    copies: Queue[Path] = Queue()
+
+    def tried(guard: Guard) -> str:
+        copy = copies.get()
+        try:
+            return killer_of(copy, guard)
+        finally:
+            copies.put(copy)
+
     survivors = 0
-    with TemporaryDirectory() as folder:
-        for trial in try_all(ROOT, chosen, Path(folder), jobs):
-            survivors += not trial.killed_by
-            verdict = f"killed by {trial.killed_by}" if trial.killed_by else "SURVIVED"
-            click.echo(f"{trial.guard.path}:{trial.guard.line}: {trial.guard.text}: {verdict}")
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
+        for number in range(jobs):
+            copies.put(_copy(Path(folder, f"copy-{number}")))
+        for guard, killer in zip(chosen, pool.map(tried, chosen), strict=True):
+            survivors += not killer
+            verdict = f"killed by {killer}" if killer else "SURVIVED"
+            click.echo(f"{guard.path}:{guard.line}: {guard.text}: {verdict}")
     click.echo(f"{len(chosen) - survivors} of {len(chosen)} guards are held by a test")
     sys.exit(bool(survivors))
 

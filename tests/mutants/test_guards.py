@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutants.guards import guards_of
-from tests.mutants.trial import mirrors_of, try_one
+from tests.mutants.__main__ import guards_of, killer_of, mirrors_of
 
 SOURCE = b'''"""Roots."""
 
@@ -62,6 +61,6 @@ def test_a_guard_without_a_test_survives(tmp_path: Path) -> None:
     name = "package/layer/roots.py"
     assert mirrors_of(tmp_path, name) == ["tests/layer/test_roots.py", "tests/layer"]
     held, _, unheld = sorted(guards_of(SOURCE, name), key=lambda guard: guard.line)
-    assert try_one(tmp_path, held).killed_by == "FAILED tests/layer/test_roots.py::test_root"
-    assert try_one(tmp_path, unheld).killed_by == ""
+    assert killer_of(tmp_path, held) == "FAILED tests/layer/test_roots.py::test_root"
+    assert killer_of(tmp_path, unheld) == ""
     assert module.read_bytes() == SOURCE
