@@ -14,12 +14,12 @@ import inspect
 import os
 import re
 import stat
-from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 from fsspec import available_protocols
 from zarr.abc.store import ByteRequest
@@ -30,8 +30,6 @@ from zarr.storage import FsspecStore, LocalStore
 
 from sobolev_batch.errors import DamageError, SobolevBatchError, StoreError
 
-T = TypeVar("T")
-
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
 _BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
@@ -41,11 +39,7 @@ _PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
 # A run that cannot go on should say so within a minute.
 _ANSWER_SECONDS = 30.0
 _SLOWEST_BYTES_PER_SECOND = 500_000
-# s3fs requests the size of every key first, to read ranges of 50 MB of larger ones at once.
-_RANGE_BYTES = 50 << 20
-# Another attempt would not change these answers.
 _ABSENT = (FileNotFoundError, NotADirectoryError)
-_FINAL = (PermissionError, *_ABSENT)
 
 
 @dataclass(frozen=True)
@@ -364,24 +358,9 @@ for _name, _method in inspect.getmembers(LocalStore, inspect.isfunction):
         setattr(FolderStore, _name, _checked(_method))
 
 
-async def _twice(attempt: Callable[[], Awaitable[T]], size_bytes: int = 0, final: Any = _FINAL) -> T:
-    """Make a request of the driver, and once more if it fails; then, or after a while, raise the first failure.
-
-    The drivers repeat most requests several times, but not a range whose transfer breaks off, nor an upload whose last
-    answer was lost. Keys are written whole, so writing one again is safe.
-    """
-    failure: Exception = TimeoutError()
-    try:
-        async with asyncio.timeout(_ANSWER_SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND):
-            try:
-                return await attempt()
-            except final:
-                raise
-            except Exception as error:
-                failure = error
-                return await attempt()
-    except TimeoutError:
-        raise failure from None
+def _in_time(size_bytes: int = 0) -> asyncio.Timeout:
+    """Return the limit of a request and of all its repetitions by the driver."""
+    return asyncio.timeout(_ANSWER_SECONDS + size_bytes / _SLOWEST_BYTES_PER_SECOND)
 
 
 class RemoteStore(FsspecStore):
@@ -392,48 +371,49 @@ class RemoteStore(FsspecStore):
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key or of a range of it, or None if it does not exist."""
         with _absence_ignored():
-            return await _twice(partial(super().get, key, prototype, byte_range), self.largest_bytes)
+            async with _in_time(self.largest_bytes):
+                return await super().get(key, prototype, byte_range)
         return None
 
     async def set(self, key: str, value: Buffer, byte_range: tuple[int, int] | None = None) -> None:
         """Replace a key."""
-        await _twice(partial(super().set, key, value, byte_range), len(value), PermissionError)
+        async with _in_time(len(value)):
+            await super().set(key, value, byte_range)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
         """Write a key by a conditional request."""
         with suppress(FileExistsError):
-            async with asyncio.timeout(_ANSWER_SECONDS):
+            async with _in_time():
                 await self.fs._pipe_file(f"{self.path}/{key}", value.to_bytes(), mode="create")
 
     async def delete(self, key: str) -> None:
         """Remove a key if it exists."""
         with _absence_ignored():
-            async with asyncio.timeout(_ANSWER_SECONDS):
+            async with _in_time():
                 await self.fs._rm_file(f"{self.path}/{key}")
 
     async def delete_dir(self, prefix: str) -> None:
         """Remove all keys below a prefix."""
         path = f"{self.path}/{prefix}"
-
-        async def remove() -> None:
-            await self.fs._rm(path, recursive=True)
-            # A server may remove some of them only; s3fs does not check.
-            if remaining := await self.fs._find(path):
-                raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
-
         with _absence_ignored():
-            await _twice(remove)
+            async with _in_time():
+                # A server may remove some of them only, and s3fs neither checks nor repeats.
+                for _ in range(2):
+                    await self.fs._rm(path, recursive=True)
+                    if not (remaining := await self.fs._find(path)):
+                        return
+                raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
 
     async def names(self) -> frozenset[str]:
         """Return the names of keys at the first level."""
-        async with asyncio.timeout(_ANSWER_SECONDS):
+        async with _in_time():
             # The name alone may stand for a folder that was emptied; only existing keys are listed.
             paths = await self.fs._ls(self.path, detail=False) if await self.fs._exists(self.path) else ()
         return frozenset(path.rstrip("/").rpartition("/")[2] for path in paths)
 
     async def sizes(self, prefix: str) -> dict[str, int]:
         """Return the sizes of all keys below a prefix."""
-        async with asyncio.timeout(_ANSWER_SECONDS):
+        async with _in_time():
             entries = await self.fs._find(f"{self.path}/{prefix}", detail=True)
         return {path.removeprefix(f"{self.path}/"): entry["size"] for path, entry in entries.items()}
 
@@ -443,7 +423,8 @@ def _remote_store(url: str, scheme: str, largest_bytes: int) -> RemoteStore:
     """Return the store at a URL, whose connections all threads share: fsspec would open others for each of them."""
     # fsspec remembers listings, but other processes write to the same store.
     options: dict[str, Any] = {"use_listings_cache": False}
-    if scheme in ("s3", "s3a") and largest_bytes <= _RANGE_BYTES:
+    if scheme in ("s3", "s3a"):
+        # Otherwise s3fs requests the size of each key first, and does not repeat a range that breaks off.
         options["max_concurrency"] = 1
     try:
         store = RemoteStore.from_url(url, options, allowed_exceptions=())

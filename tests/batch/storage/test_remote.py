@@ -97,24 +97,10 @@ def test_what_fails_once_is_done_again(storage: Server, location: Location, kind
     assert storage.failures()[kind] - before == (1 if kind == "kept" else 6)
 
 
-def got(location: Location, key: str, largest_bytes: int = 0) -> bytes | None:
+def got(location: Location, key: str) -> bytes | None:
     """A key as zarr reads it."""
-    found = sync(location.zarr_store(largest_bytes).get(key, default_buffer_prototype()))
+    found = sync(location.zarr_store().get(key, default_buffer_prototype()))
     return None if found is None else found.to_bytes()
-
-
-def test_a_part_of_a_large_key_that_breaks_off_is_read_again(
-    storage: Server, location: Location, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("s3fs.S3FileSystem.default_block_size", len(DOCUMENT) // 4)
-    location.write({"a": DOCUMENT})
-    storage.rule = Rule(1.0, ("truncated",), most=1)
-    before = len(storage.requests())
-    assert got(location, "a", largest_bytes=100 << 20) == DOCUMENT
-    requests = storage.requests()[before:]
-    assert sum(request.failure == "truncated" for request in requests) == 1
-    # Each time a look at its size, and four parts.
-    assert 6 <= len(requests) <= 10
 
 
 @pytest.mark.slow
