@@ -55,7 +55,7 @@ def differences(ours: Location, theirs: Location) -> Iterator[str]:
     if store.labels() != right.labels():
         yield "the meshes are not the same"
         return
-    (place,) = right.block_slices()
+    (place,) = right.places()
     for row, (label, record) in enumerate(zip(store.labels(), store.records(), strict=True)):
         if record is None or record.status != "complete":
             yield f"{label}: {record.reason if record else 'missing'}"
