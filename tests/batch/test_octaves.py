@@ -16,22 +16,7 @@ from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from sobolev_batch import (
-    InputError,
-    Sphere,
-    StoreError,
-    Study,
-    distance,
-    icosphere,
-    inner_product,
-    norm,
-    open_store,
-    plan,
-    plot,
-    report,
-    run,
-    verify,
-)
+import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
 from tests.faults.test_damage import delete, flip, swap_octaves, truncate
 from tests.support.studies import small_table, variable
@@ -39,7 +24,7 @@ from tests.support.studies import small_table, variable
 Reals = NDArray[np.float64]
 
 ORDERS = (-0.8, -1.5, -2.0)
-BALL = Sphere(0.9)
+BALL = sb.Sphere(0.9)
 LEVELS = [1, 2]
 
 
@@ -57,7 +42,7 @@ def asking(rtol: float = 5e-2, **changes: Any) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def octave_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("octaves") / "store.zarr"
-    run(Study.from_table(asking()), path, client)
+    sb.run(sb.Study.from_table(asking()), path, client)
     return path
 
 
@@ -68,13 +53,13 @@ def store(octave_store: Path, store_path: Path) -> Path:
 
 
 def test_distances_are_as_accurate_as_asked_and_their_errors_hold(octave_store: Path) -> None:
-    convergence = open_store(octave_store)["convergence"].to_dataset().drop_sel(mesh="reference")
+    convergence = sb.open_store(octave_store)["convergence"].to_dataset().drop_sel(mesh="reference")
     assert convergence["within"].all()
     ball = convergence.sel(mesh="ball/sphere")
-    exact = distance(Sphere(), BALL, ORDERS)["distance"].values
+    exact = sb.distance(sb.Sphere(), BALL, ORDERS)["distance"].values
     assert (np.abs(ball["distance"].values - exact) <= ball["error"].values).all()
     for level in LEVELS:
-        other = distance(icosphere(level), Sphere(), ORDERS, rtol=2e-2, seed=7)
+        other = sb.distance(sb.icosphere(level), sb.Sphere(), ORDERS, rtol=2e-2, seed=7)
         here = convergence.sel(mesh=f"ico/{level}")
         gap = np.abs(here["distance"].values - other["distance"].values)
         assert (gap <= here["error"].values + other["error"].values).all()
@@ -84,35 +69,35 @@ def test_distances_are_as_accurate_as_asked_and_their_errors_hold(octave_store: 
 
 
 def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> None:
-    tree = open_store(octave_store)
-    for label, sphere in (("reference", Sphere()), ("ball/sphere", BALL)):
+    tree = sb.open_store(octave_store)
+    for label, sphere in (("reference", sb.Sphere()), ("ball/sphere", BALL)):
         found = tree["norms"].to_dataset().sel(mesh=label)
-        exact = norm(sphere, ORDERS)["norm"].values
+        exact = sb.norm(sphere, ORDERS)["norm"].values
         assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
         assert (found["error"].values < 0.05 * exact).all()
     pair = tree["distances"].to_dataset().sel(mesh="ball/sphere", other="ico/2")
     swapped = tree["distances"].to_dataset().sel(mesh="ico/2", other="ball/sphere")
-    alone = distance(icosphere(2), BALL, ORDERS, rtol=2e-2, seed=3)
+    alone = sb.distance(sb.icosphere(2), BALL, ORDERS, rtol=2e-2, seed=3)
     assert (np.abs(pair["distance"] - alone["distance"].values) <= pair["error"] + alone["error"].values).all()
     for name in ("distance", "error", "statistical"):
         assert np.array_equal(pair[name], swapped[name])
     # The ball is shrunk: <a - b, b> / ||b|| by the closed forms of spheres.
-    exact_norm = norm(Sphere(), ORDERS)["norm"].values
-    area = np.abs(inner_product(BALL, Sphere(), ORDERS)["inner_product"].values - exact_norm**2) / exact_norm
+    exact_norm = sb.norm(sb.Sphere(), ORDERS)["norm"].values
+    area = np.abs(sb.inner_product(BALL, sb.Sphere(), ORDERS)["inner_product"].values - exact_norm**2) / exact_norm
     found = tree["convergence"].to_dataset().sel(mesh="ball/sphere")
     assert found["area_part"].values == pytest.approx(area, rel=0.05)
     assert (found["area_part"] ** 2 + found["shape_part"] ** 2).values == pytest.approx(found["distance"].values ** 2)
 
 
 def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave_store: Path) -> None:
-    axes = plot(octave_store, "energy")
+    axes = sb.plot(octave_store, "energy")
     (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["limit", "ico", "ball"]
     energies = np.asarray(axes.lines[-1].get_xydata())[:, 1]
     radii = np.linspace(0, 200, 200_001)[1:]
     difference = 2 / radii * (np.sin(2 * np.pi * radii) - BALL.radius * np.sin(2 * np.pi * BALL.radius * radii))
     exact = 4 * np.pi * radii**2 * difference**2 / (8 * np.pi * (1 + BALL.radius**2))
-    octaves = open_store(octave_store).attrs["study"]["octaves"]
+    octaves = sb.open_store(octave_store).attrs["study"]["octaves"]
     ends = octaves["cutoff"] * 2.0 ** (np.arange(len(energies)) - (len(energies) - 1 - len(octaves["octaves"])))
     inner = np.zeros_like(radii)
     for end, energy in zip(ends, energies, strict=True):
@@ -146,7 +131,7 @@ def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> Non
     for order in (-0.8, -1.0, -2.0):
         tail = (octaves["weight"].values * lengths**order * of_reference).sum()
         inside = (inner * (1 + square) ** order).sum()
-        exact = norm(Sphere(), order)["norm"].item() ** 2
+        exact = sb.norm(sb.Sphere(), order)["norm"].item() ** 2
         # At -0.8 some hundredths lie beyond the last octave.
         assert inside + tail == pytest.approx(exact, rel={-0.8: 5e-2, -1.0: 5e-3, -2.0: 1e-3}[order])
         assert tail > (0.1 * exact if order >= -1 else 0)
@@ -156,18 +141,18 @@ def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> Non
 
 
 def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Path, client: Client) -> None:
-    before = open_store(store)["octaves"].to_dataset().load()
-    summary = run(Study.from_table(asking()), store, client)
+    before = sb.open_store(store)["octaves"].to_dataset().load()
+    summary = sb.run(sb.Study.from_table(asking()), store, client)
     assert summary.computed == ()
     more = asking()
     more["family"][0]["levels"] = [0, *LEVELS]
-    summary = run(Study.from_table(more), store, client)
+    summary = sb.run(sb.Study.from_table(more), store, client)
     assert summary.computed == ("ico/0",)
-    after = open_store(store)["octaves"].to_dataset().load()
+    after = sb.open_store(store)["octaves"].to_dataset().load()
     assert np.array_equal(after.xi_x, before.xi_x)
     assert np.array_equal(after.octaves.sel(mesh=before.mesh), before.octaves)
-    found = variable(open_store(store), "convergence", "distance").sel(mesh="ico/0").values
-    other = distance(icosphere(0), Sphere(), ORDERS, rtol=2e-2)
+    found = variable(sb.open_store(store), "convergence", "distance").sel(mesh="ico/0").values
+    other = sb.distance(sb.icosphere(0), sb.Sphere(), ORDERS, rtol=2e-2)
     assert found == pytest.approx(other["distance"].values, rel=0.05)
 
 
@@ -177,12 +162,12 @@ def test_damaged_octaves_are_named_and_computed_again(
 ) -> None:
     row = Store.open(store).labels().index("ico/2")
     damage(store / f"octaves/octaves/c/{row}/0")
-    found = verify(store)
+    found = sb.verify(store)
     assert set(found.fields) == {"ico/2"}
-    summary = run(Study.from_table(asking()), store, client)
+    summary = sb.run(sb.Study.from_table(asking()), store, client)
     assert summary.computed == ("ico/2",)
-    assert verify(store).is_sound
-    fresh, whole = (open_store(path)["convergence"]["distance"].values for path in (store, octave_store))
+    assert sb.verify(store).is_sound
+    fresh, whole = (sb.open_store(path)["convergence"]["distance"].values for path in (store, octave_store))
     assert fresh == pytest.approx(whole, rel=1e-9, nan_ok=True)
 
 
@@ -192,26 +177,26 @@ def test_damaged_octaves_are_found_by_the_reduction_too(store: Path, client: Cli
     # Another order asks for new tables.
     table = asking()
     table["norm"]["orders"] = [*ORDERS, -2.5]
-    assert "ico/2" in run(Study.from_table(table), store, client).computed
-    assert verify(store).is_sound
+    assert "ico/2" in sb.run(sb.Study.from_table(table), store, client).computed
+    assert sb.verify(store).is_sound
 
 
 @pytest.mark.parametrize("name", ["weight", "mesh"])
 def test_damaged_frequencies_and_labels_are_named_and_written_again(name: str, store: Path, client: Client) -> None:
-    before = open_store(store)["octaves"].to_dataset()[name].values
+    before = sb.open_store(store)["octaves"].to_dataset()[name].values
     flip(next((store / f"octaves/{name}/c").rglob("[0-9]")))
-    assert set(verify(store).tables) == {f"octaves/{name}"}
-    run(Study.from_table(asking()), store, client)
-    assert verify(store).is_sound
-    assert np.array_equal(open_store(store)["octaves"].to_dataset()[name].values, before)
+    assert set(sb.verify(store).tables) == {f"octaves/{name}"}
+    sb.run(sb.Study.from_table(asking()), store, client)
+    assert sb.verify(store).is_sound
+    assert np.array_equal(sb.open_store(store)["octaves"].to_dataset()[name].values, before)
 
 
 def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client) -> None:
     stored = Store.open(store)
     stored.write("octaves/xi_x", ..., np.asarray(stored.read("octaves/xi_x", ...)) + 1.0)
     stored.consolidate()
-    with pytest.raises(StoreError, match="sampled at other frequencies"):
-        run(Study.from_table(asking()), store, client)
+    with pytest.raises(sb.StoreError, match="sampled at other frequencies"):
+        sb.run(sb.Study.from_table(asking()), store, client)
 
 
 def with_lattice(octaves: int) -> dict[str, Any]:
@@ -223,11 +208,11 @@ def with_lattice(octaves: int) -> dict[str, Any]:
 def test_octaves_beyond_a_given_lattice_lower_its_errors(client: Client, tmp_path: Path) -> None:
     datasets = {}
     for octaves in (0, 4):
-        run(Study.from_table(with_lattice(octaves)), tmp_path / f"{octaves}.zarr", client)
-        datasets[octaves] = open_store(tmp_path / f"{octaves}.zarr")["convergence"].to_dataset()
-    assert "octaves" not in open_store(tmp_path / "0.zarr")
+        sb.run(sb.Study.from_table(with_lattice(octaves)), tmp_path / f"{octaves}.zarr", client)
+        datasets[octaves] = sb.open_store(tmp_path / f"{octaves}.zarr")["convergence"].to_dataset()
+    assert "octaves" not in sb.open_store(tmp_path / "0.zarr")
     for level in (1, 2, 3):
-        exact = distance(icosphere(level), Sphere(), [-1.5, -2.0], rtol=5e-3)
+        exact = sb.distance(sb.icosphere(level), sb.Sphere(), [-1.5, -2.0], rtol=5e-3)
         errors = []
         for dataset in datasets.values():
             here = dataset.sel(mesh=f"ico/{level}")
@@ -235,14 +220,14 @@ def test_octaves_beyond_a_given_lattice_lower_its_errors(client: Client, tmp_pat
             assert (gap <= here["error"].values + exact["error"].values).all()
             errors.append(here["error"].values / here["distance"].values)
         assert (errors[1] < errors[0] / 5).all()
-    with pytest.raises(StoreError, match=r"octaves: 4, not none"):
-        run(Study.from_table(with_lattice(0)), tmp_path / "4.zarr", client)
+    with pytest.raises(sb.StoreError, match=r"octaves: 4, not none"):
+        sb.run(sb.Study.from_table(with_lattice(0)), tmp_path / "4.zarr", client)
 
 
 def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -> None:
     families = [{"name": name, "source": "icosphere", "levels": [1]} for name in ("ico", "copy")]
-    run(Study.from_table({**with_lattice(2), "family": families}), store_path, client)
-    pair = open_store(store_path)["distances"].to_dataset().sel(mesh="ico/1", other="copy/1")
+    sb.run(sb.Study.from_table({**with_lattice(2), "family": families}), store_path, client)
+    pair = sb.open_store(store_path)["distances"].to_dataset().sel(mesh="ico/1", other="copy/1")
     assert (pair["distance"] == 0).all()
     assert (pair["error"] < 1e-6).all()
 
@@ -250,34 +235,34 @@ def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -
 def test_octaves_are_the_same_in_a_task_of_their_own(client: Client, tmp_path: Path) -> None:
     # Small chunks: several blocks, and a task for the octaves of each mesh.
     table = {**with_lattice(2), "family": [{"name": "ico", "source": "icosphere", "levels": [2]}]}
-    study = Study.from_table(table)
-    run(study, tmp_path / "whole.zarr", client)
-    run(replace(study, largest_chunk_bytes=1 << 17), tmp_path / "blocks.zarr", client)
-    whole, blocks = (open_store(tmp_path / name) for name in ("whole.zarr", "blocks.zarr"))
+    study = sb.Study.from_table(table)
+    sb.run(study, tmp_path / "whole.zarr", client)
+    sb.run(replace(study, largest_chunk_bytes=1 << 17), tmp_path / "blocks.zarr", client)
+    whole, blocks = (sb.open_store(tmp_path / name) for name in ("whole.zarr", "blocks.zarr"))
     assert np.array_equal(variable(whole, "octaves", "octaves"), variable(blocks, "octaves", "octaves"))
     found, expected = (variable(tree, "convergence", "distance").values for tree in (blocks, whole))
     assert found == pytest.approx(expected, rel=1e-8, nan_ok=True)
-    assert verify(tmp_path / "blocks.zarr").is_sound
+    assert sb.verify(tmp_path / "blocks.zarr").is_sound
 
 
 def test_a_plan_and_a_report_show_octaves(octave_store: Path, tmp_path: Path) -> None:
-    found = plan(Study.from_table(asking()), octave_store)
+    found = sb.plan(sb.Study.from_table(asking()), octave_store)
     text = str(found)
-    samples = open_store(octave_store)["octaves"].sizes["sample"]
-    assert found.octaves == len(open_store(octave_store).attrs["study"]["octaves"]["octaves"])
+    samples = sb.open_store(octave_store)["octaves"].sizes["sample"]
+    assert found.octaves == len(sb.open_store(octave_store).attrs["study"]["octaves"]["octaves"])
     assert f"octaves:       {found.octaves} beyond the lattice" in text
     assert f"{samples:,} samples" in text
     assert "nothing is missing" in text
     assert found.field_bytes == found.lattice.half.size * 8 + samples * 8 or found.dtype == "complex128"
     assert len(found.stored) == 4
-    page = report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
+    page = sb.report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{found.octaves} beyond the lattice, at random frequencies" in page
 
 
 def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> None:
-    tree = open_store(octave_store)
+    tree = sb.open_store(octave_store)
     found = tree.sobolev.distance("ball/sphere", "reference", [-1.0, -1.5])
-    exact = distance(Sphere(), BALL, [-1.0, -1.5])["distance"].values
+    exact = sb.distance(sb.Sphere(), BALL, [-1.0, -1.5])["distance"].values
     assert (np.abs(found["distance"].values - exact) <= found["error"].values).all()
     assert (found["error"].values < 0.1 * exact).all()
     stored = tree["convergence"].to_dataset().sel(mesh="ball/sphere", order=-1.5)
@@ -288,19 +273,19 @@ def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> N
     assert single["distance"].dims == ()
     assert single["distance"].item() == pytest.approx(pair["distance"].item(), rel=1e-6)
     norms = tree.sobolev.norm("ball/sphere", -0.9)
-    assert abs(norms["norm"].item() - norm(BALL, -0.9)["norm"].item()) <= norms["error"].item()
-    with pytest.raises(InputError, match="no mesh 'ico/9' with a field"):
+    assert abs(norms["norm"].item() - sb.norm(BALL, -0.9)["norm"].item()) <= norms["error"].item()
+    with pytest.raises(sb.InputError, match="no mesh 'ico/9' with a field"):
         tree.sobolev.norm("ico/9", -2.0)
 
 
 def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> None:
-    tree = open_store(octave_store)
+    tree = sb.open_store(octave_store)
     bands = tree.sobolev.spectrum("ball/sphere", None, [-1.0, -2.0])
     # A sphere's energy is 2 area sin²(2πr), half of that twice on average.
     assert bands.attrs["energy_limit"] == pytest.approx(2 * BALL.area, rel=1e-3)
     outer = bands["energy"].values[-3:]
     assert outer == pytest.approx(2 * BALL.area, rel=0.15)
-    exact = norm(BALL, -2.0)["norm"].item() ** 2
+    exact = sb.norm(BALL, -2.0)["norm"].item() ** 2
     assert bands["squared"].sel(order=-2.0).sum().item() == pytest.approx(exact, rel=1e-3)
     assert bands["share"].sum("band").values == pytest.approx(1)
     assert (bands["lower"].values[1:] == bands["upper"].values[:-1]).all()

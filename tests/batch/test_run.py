@@ -10,18 +10,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import (
-    Mesh,
-    Sphere,
-    StoreError,
-    Study,
-    distance,
-    fourier_transform,
-    icosphere,
-    open_store,
-    proportion,
-    run,
-)
+import sobolev_batch as sb
 from sobolev_batch.batch.analysis import tabulate
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.mesh_files import off
@@ -29,26 +18,26 @@ from tests.support.studies import SMALL_LATTICE, small_table, variable
 
 
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
-    tree = open_store(finished_store)
-    study = Study.from_table(small_table())
-    sphere = fourier_transform(Sphere(), SMALL_LATTICE)
+    tree = sb.open_store(finished_store)
+    study = sb.Study.from_table(small_table())
+    sphere = sb.fourier_transform(sb.Sphere(), SMALL_LATTICE)
     for level in range(4):
         field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars(["mesh", "quality"])
-        expected = fourier_transform(icosphere(level), SMALL_LATTICE, threads=1)
+        expected = sb.fourier_transform(sb.icosphere(level), SMALL_LATTICE, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
-        assert found == pytest.approx(distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
-        split = proportion(expected, sphere, study.orders)
+        assert found == pytest.approx(sb.distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
+        split = sb.proportion(expected, sphere, study.orders)
         for name in ("area_part", "shape_part"):
             stored_part = variable(tree, "convergence", name).sel(mesh=f"ico/{level}").values
             assert stored_part == pytest.approx(split[name].values, rel=1e-8)
         # A field straight from the store serves as an argument too.
-        assert distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
+        assert sb.distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
     matrix = variable(tree, "distances", "distance").sel(order=-10.0).values
     assert np.array_equal(matrix, matrix.T)
     assert (matrix.diagonal() == 0).all()
-    a, b = (fourier_transform(icosphere(level), SMALL_LATTICE) for level in (2, 3))
-    assert matrix[2, 3] == pytest.approx(distance(a, b, -10.0)["distance"].item(), rel=1e-9)
+    a, b = (sb.fourier_transform(sb.icosphere(level), SMALL_LATTICE) for level in (2, 3))
+    assert matrix[2, 3] == pytest.approx(sb.distance(a, b, -10.0)["distance"].item(), rel=1e-9)
     convergence = tree["convergence"].to_dataset()
     rates = convergence.sel(order=-3.0)["rate"].values
     assert np.isnan(rates[[0, 4]]).all()
@@ -60,23 +49,23 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     assert np.array_equal(parts, convergence["error"])
     # The same errors from the stored field as from one that was just computed.
     field = variable(tree, "fourier", "fourier").sel(mesh="ico/3")
-    fresh = distance(
-        fourier_transform(icosphere(3), SMALL_LATTICE, threads=1, order=study.orders), sphere, study.orders
+    fresh = sb.distance(
+        sb.fourier_transform(sb.icosphere(3), SMALL_LATTICE, threads=1, order=study.orders), sphere, study.orders
     )
-    stored = distance(field, variable(tree, "fourier", "fourier").sel(mesh="reference"), study.orders)
+    stored = sb.distance(field, variable(tree, "fourier", "fourier").sel(mesh="reference"), study.orders)
     for name in ("truncation", "aliasing"):
         assert stored[name].values == pytest.approx(fresh[name].values, rel=1e-6)
     assert stored["discretisation"].values == pytest.approx(fresh["discretisation"].values, rel=0.1)
     # All pairs know their errors too, about as well as pair by pair.
-    pair = distance(a, b, study.orders)
+    pair = sb.distance(a, b, study.orders)
     ours = tree["distances"].to_dataset().sel(mesh="ico/2", other="ico/3")
     assert ours["error"].values == pytest.approx(pair["error"].values, rel=0.3)
 
 
 def test_mesh_facts_are_recorded(finished_store: Path) -> None:
-    meshes = open_store(finished_store)["meshes"].to_dataset()
+    meshes = sb.open_store(finished_store)["meshes"].to_dataset()
     row = meshes.sel(mesh="ico/2")
-    mesh = icosphere(2)
+    mesh = sb.icosphere(2)
     assert row["triangles"].item() == 320
     assert row["vertices"].item() == 162
     assert row["area"].item() == pytest.approx(mesh.area)
@@ -88,12 +77,12 @@ def test_mesh_facts_are_recorded(finished_store: Path) -> None:
     assert meshes["level"].values.tolist() == [0, 1, 2, 3, -1]
 
 
-def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study: Study, store_path: Path) -> None:
+def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study: sb.Study, store_path: Path) -> None:
     def stamps() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for path in (store_path / "fourier" / "fourier" / "c").rglob("*")}
 
     steps: list[Progress] = []
-    first = run(study, store_path, client, on_progress=steps.append)
+    first = sb.run(study, store_path, client, on_progress=steps.append)
     assert len(first.computed) == 5
     assert first.reused == ()
     assert steps[0].stage == "cluster"
@@ -104,27 +93,27 @@ def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study:
     assert reduction[-1].done == reduction[-1].total > 0
     before = stamps()
     steps.clear()
-    second = run(study, store_path, client, on_progress=steps.append)
+    second = sb.run(study, store_path, client, on_progress=steps.append)
     assert second.computed == ()
     assert second.reused == first.computed
     assert steps == []
     assert stamps() == before
-    with pytest.raises(StoreError, match="another study"):
-        run(Study.from_table(small_table(study={"name": "other"})), store_path, client)
+    with pytest.raises(sb.StoreError, match="another study"):
+        sb.run(sb.Study.from_table(small_table(study={"name": "other"})), store_path, client)
     assert stamps() == before
 
 
 def test_tables_of_an_older_version_are_made_anew(
-    client: Client, study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
+    client: Client, study: sb.Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(tabulate, "TABLES_VERSION", tabulate.TABLES_VERSION - 1)
-        run(study, store_path, client)
+        sb.run(study, store_path, client)
     steps: list[Progress] = []
-    assert run(study, store_path, client, on_progress=steps.append).computed == ()
+    assert sb.run(study, store_path, client, on_progress=steps.append).computed == ()
     assert {step.stage for step in steps} >= {"reduction"}
     steps.clear()
-    run(study, store_path, client, on_progress=steps.append)
+    sb.run(study, store_path, client, on_progress=steps.append)
     assert steps == []
 
 
@@ -133,41 +122,41 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     (tmp_path / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
     trimesh.creation.box((9.0, 1.0, 1.0)).export(tmp_path / "large.off")
     family = [{"name": "f", "source": "files", "paths": ["*.off", "missing.ply"]}]
-    study = Study.from_table(small_table(family=family), folder=tmp_path)
-    summary = run(study, store_path, client)
+    study = sb.Study.from_table(small_table(family=family), folder=tmp_path)
+    summary = sb.run(study, store_path, client)
     assert summary.computed == ("f/good", "reference")
     assert set(summary.failed) == {"f/bad", "f/large", "f/missing"}
     assert "1 of 3 vertices have NaN" in summary.failed["f/bad"]
     assert "holds only |coordinate| <" in summary.failed["f/large"]
     assert "cannot be read" in summary.failed["f/missing"]
-    tree = open_store(store_path)
+    tree = sb.open_store(store_path)
     assert np.isnan(variable(tree, "convergence", "distance").sel(mesh=["f/bad", "f/large", "f/missing"]).values).all()
     assert np.isfinite(variable(tree, "convergence", "distance").sel(mesh="f/good").values).all()
     assert np.isnan(variable(tree, "distances", "distance").sel(mesh="f/good", other="f/bad").values).all()
     assert variable(tree, "meshes", "status").sel(mesh="f/bad").item() == "failed"
     # Mended, it is computed, and nothing else is.
     trimesh.creation.box().export(tmp_path / "bad.off")
-    assert run(study, store_path, client).computed == ("f/bad",)
+    assert sb.run(study, store_path, client).computed == ("f/bad",)
 
 
 def test_meshes_added_to_a_study_join_its_store(client: Client, store_path: Path) -> None:
     table = small_table(lattice={"xi_max": 3.0, "M": 40})
-    run(Study.from_table(table), store_path, client)
+    sb.run(sb.Study.from_table(table), store_path, client)
     more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
-    summary = run(Study.from_table({**table, "family": more}), store_path, client)
+    summary = sb.run(sb.Study.from_table({**table, "family": more}), store_path, client)
     assert summary.computed == ("late/sphere",)
-    tree = open_store(store_path)
+    tree = sb.open_store(store_path)
     assert variable(tree, "convergence", "distance").sizes["mesh"] == 6
-    exact = distance(Sphere(0.5), Sphere(), -10.0)["distance"].item()
+    exact = sb.distance(sb.Sphere(0.5), sb.Sphere(), -10.0)["distance"].item()
     found = variable(tree, "convergence", "distance").sel(mesh="late/sphere", order=-10.0).item()
     assert found == pytest.approx(exact, rel=1e-6)
 
 
-def test_lattices_of_several_chunks(client: Client, study: Study, finished_store: Path, store_path: Path) -> None:
-    run(replace(study, largest_chunk_bytes=8_000), store_path, client)
+def test_lattices_of_several_chunks(client: Client, study: sb.Study, finished_store: Path, store_path: Path) -> None:
+    sb.run(replace(study, largest_chunk_bytes=8_000), store_path, client)
     chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))
     assert len(chunks) > 1
-    blocks, whole = open_store(store_path), open_store(finished_store)
+    blocks, whole = sb.open_store(store_path), sb.open_store(finished_store)
     assert np.allclose(
         variable(blocks, "fourier", "fourier").values, variable(whole, "fourier", "fourier").values, rtol=0, atol=1e-8
     )
@@ -179,24 +168,24 @@ def test_lattices_of_several_chunks(client: Client, study: Study, finished_store
 
 def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
     table = small_table(norm={"orders": [-10.0, -3.0], "pairs": "reference"})
-    run(Study.from_table(table), store_path, client)
-    found = variable(open_store(store_path), "distances", "distance")
+    sb.run(sb.Study.from_table(table), store_path, client)
+    found = variable(sb.open_store(store_path), "distances", "distance")
     assert found["other"].values.tolist() == ["reference"]
-    whole = variable(open_store(finished_store), "distances", "distance").sel(other=["reference"])
+    whole = variable(sb.open_store(finished_store), "distances", "distance").sel(other=["reference"])
     assert np.allclose(found.to_numpy(), whole.to_numpy(), rtol=1e-12, atol=0)
 
 
 def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path: Path) -> None:
-    mesh = icosphere(2)
+    mesh = sb.icosphere(2)
     for name, factor in (("a", 1.0), ("b", 1.0 + 1e-7)):
-        moved = Mesh(mesh.vertices * np.array([factor, 1, 1]), mesh.triangles)
+        moved = sb.Mesh(mesh.vertices * np.array([factor, 1, 1]), mesh.triangles)
         (tmp_path / f"{name}.off").write_bytes(off(moved.vertices, moved.triangles.tolist()))
     family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
     table = small_table(family=family, transform={"eps": 1e-13}, norm={"orders": [-3.0]})
-    run(Study.from_table(table, folder=tmp_path), store_path, client)
-    found = variable(open_store(store_path), "distances", "distance").sel(mesh="f/a", other="f/b", order=-3.0).item()
+    sb.run(sb.Study.from_table(table, folder=tmp_path), store_path, client)
+    found = variable(sb.open_store(store_path), "distances", "distance").sel(mesh="f/a", other="f/b", order=-3.0).item()
     # Twins apart by 1e-7 against the same pair apart by 1e-4, where nothing cancels.
-    lattice = Study.from_table(table).lattice
-    wide = Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)
-    expected = 1e-3 * distance(mesh, wide, -3.0, lattice=lattice)["distance"].item()
+    lattice = sb.Study.from_table(table).lattice
+    wide = sb.Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)
+    expected = 1e-3 * sb.distance(mesh, wide, -3.0, lattice=lattice)["distance"].item()
     assert found == pytest.approx(expected, rel=1e-3)

@@ -10,7 +10,7 @@ import pytest
 import tomli_w
 from distributed import Client
 
-from sobolev_batch import ClusterError, Study, StudyCollection, StudyError, submit
+import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
@@ -74,9 +74,9 @@ def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -
         {"name": "ball", "reference": {"source": "sphere"}},
         {"name": "gone", "reference": {"source": "files", "paths": ["no.ply"]}},
     ]
-    collection = StudyCollection.from_table(small_table(object=objects), folder=tmp_path)
+    collection = sb.StudyCollection.from_table(small_table(object=objects), folder=tmp_path)
     store, address = tmp_path / "all.zarr", client.scheduler.address
-    submission = submit(collection, store, client)
+    submission = sb.submit(collection, store, client)
     assert (submission.surfaces, submission.missing) == (5, 5)
     assert submission.objects["ball"].store == str(store / "ball")
     assert list(submission.refused) == ["gone"]
@@ -98,10 +98,10 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(
     tmp_path: Path, store_path: Path, threads: Client
 ) -> None:
     table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
-    with pytest.raises(StudyError, match="matches no file"):
-        submit(Study.from_table(table, folder=tmp_path), store_path, threads)
-    with pytest.raises(ClusterError, match="requests backend 'gpu'"):
-        submit(Study.from_table(small_table(transform={"backend": "gpu"})), store_path, threads)
+    with pytest.raises(sb.StudyError, match="matches no file"):
+        sb.submit(sb.Study.from_table(table, folder=tmp_path), store_path, threads)
+    with pytest.raises(sb.ClusterError, match="requests backend 'gpu'"):
+        sb.submit(sb.Study.from_table(small_table(transform={"backend": "gpu"})), store_path, threads)
     assert not store_path.exists()
 
 
@@ -128,10 +128,10 @@ def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, st
     mesh.write_text("OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n3 0 2 3\n3 1 2 3\n")
     table = small_table(reference={"source": "files", "paths": ["mesh.off"]})
     with tcp_cluster([]) as (address, _), remote_client(address) as client:
-        study = Study.from_table(table, folder=mesh.parent)
+        study = sb.Study.from_table(table, folder=mesh.parent)
         # Holds the only thread until the file is gone.
         blocked = client.submit(_remove, str(mesh), pure=False, priority=10)
-        submit(study, store_path, client)
+        sb.submit(study, store_path, client)
         blocked.result()
         followed = call("status", store_path, "--follow")
     assert followed.returncode == 1

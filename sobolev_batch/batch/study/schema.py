@@ -48,15 +48,12 @@ from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_sourc
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
 
-# Deeper tables and longer texts are mistakes, or made to keep the validation busy.
+# Deeper tables are mistakes.
 _DEEPEST = 20
-_LONGEST_TEXT = 10_000
 _MOST_ORDERS, _MOST_OBJECTS = 100, 1000
 MOST_OCTAVES = 24
-# Larger study files are mistakes, or made to keep the parser busy.
+# Larger study files are mistakes.
 _LARGEST_FILE_BYTES = 4 << 20
-# The range of TOML's integers.
-_LARGEST_INTEGER = (1 << 63) - 1
 # Most refusals of one study; longer keys are not compared with others.
 _MOST_OFFENDERS, _LONGEST_KEY = 10, 40
 # Sections that are lists.
@@ -203,8 +200,8 @@ def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, .
         ValueError: A name is unknown, or a mesh is made from itself.
     """
     if isinstance(table, str):
-        if table in above:
-            raise ValueError(f"the mesh {quoted(table)} is made from itself")
+        if table in above or len(above) > _DEEPEST:
+            raise ValueError(f"the mesh {quoted(table)} is made from itself, or from too many others")
         if table not in meshes:
             known = known_names(table, meshes) if meshes else "the study has no section [mesh.NAME]"
             raise ValueError(f"no mesh is named {quoted(table)}; {known}")
@@ -213,7 +210,8 @@ def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, .
         return table
     if "source" not in table and isinstance(table.get("mesh"), str):
         named = with_named_meshes(table["mesh"], meshes, above)
-        return {**named, **{key: value for key, value in table.items() if key != "mesh"}}
+        others = {key: value for key, value in table.items() if key != "mesh"}
+        return {**named, **others} if isinstance(named, dict) else named
     try:
         fields = source_type_of(table.get("source")).model_fields
     except StudyError:
@@ -373,10 +371,6 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
         return value.isoformat()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, str) and len(value) > _LONGEST_TEXT:
-        raise StudyError(f"{_dotted(key)}: at most {_LONGEST_TEXT} characters are allowed, found {len(value)}")
-    if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-        raise StudyError(f"{_dotted(key)}: integers go up to {_LARGEST_INTEGER}, found {quoted(value)}")
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
@@ -398,7 +392,8 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
             messages.append(f"{name} is missing")
         elif kind == "value_error":
             said, value = str(item["ctx"]["error"]), _value_at(values, key)
-            found = "" if isinstance(value, Mapping) or "found " in said else f", found {shown_value(value)}"
+            is_said = isinstance(value, Mapping) or "found " in said or shown_value(value) in said
+            found = "" if is_said else f", found {shown_value(value)}"
             messages.append(": ".join(filter(None, (name, said + found))))
         # Wrong entries are not counted; the list may be long enough with them.
         elif kind != "too_short" or len(_value_at(values, key)) < item["ctx"]["min_length"]:
@@ -464,9 +459,9 @@ def _value_at(values: Any, key: Key) -> Any:
 
 def _known_keys(values: Mapping[str, Any], key: Key) -> Iterable[str]:
     """Return the keys that the table at a key may have."""
-    table = _value_at(values, key)
     if not key:
         return StudyDocument.model_fields
+    table = with_named_meshes(_value_at(values, key), values.get("mesh", {}))
     if "source" not in table:
         return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":

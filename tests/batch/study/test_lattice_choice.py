@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import AccuracyError, Lattice, Sphere, Study, distance, icosphere, open_store, run
+import sobolev_batch as sb
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study import lattice_choice as search_module
@@ -28,20 +28,20 @@ RTOL = 5e-4
 original = run_pilot
 
 
-def asking(rtol: float = RTOL, **changes: Any) -> Study:
+def asking(rtol: float = RTOL, **changes: Any) -> sb.Study:
     table = small_table(accuracy={"rtol": rtol}, norm={"orders": [-10.0, -4.0]}, **changes)
     del table["lattice"]
-    return Study.from_table(table)
+    return sb.Study.from_table(table)
 
 
 def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client, store_path: Path) -> None:
-    run(asking(), store_path, client)
-    tree = open_store(store_path)
+    sb.run(asking(), store_path, client)
+    tree = sb.open_store(store_path)
     convergence = tree["convergence"].to_dataset().drop_sel(mesh="reference")
     assert convergence["within"].all()
     assert (convergence["error"] <= RTOL * convergence["distance"]).all()
     for level in range(4):
-        truth = distance(icosphere(level), Sphere(), [-10.0, -4.0], rtol=1e-5)
+        truth = sb.distance(sb.icosphere(level), sb.Sphere(), [-10.0, -4.0], rtol=1e-5)
         here = convergence.sel(mesh=f"ico/{level}")
         assert (
             np.abs(here["distance"].values - truth["distance"].values) <= here["error"] + truth["error"].values
@@ -51,47 +51,47 @@ def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client,
 
 
 def test_the_choice_is_kept_when_meshes_are_added(client: Client, store_path: Path, tmp_path: Path) -> None:
-    run(asking(), store_path, client)
+    sb.run(asking(), store_path, client)
     first = stored_choice(store_path)
     more = [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3, 4]}]
-    summary = run(asking(family=more), store_path, client)
+    summary = sb.run(asking(family=more), store_path, client)
     assert summary.computed == ("ico/4",)
     assert stored_choice(store_path) == first
-    assert run(asking(family=more), store_path, client).computed == ()
+    assert sb.run(asking(family=more), store_path, client).computed == ()
     # A mesh that reaches further hears what to do.
     trimesh.creation.box(extents=(20.0, 1.0, 1.0)).export(tmp_path / "far.off")
     far = {"name": "far", "source": "files", "paths": [str(tmp_path / "far.off")]}
-    summary = run(asking(family=[*more, far]), store_path, client)
+    summary = sb.run(asking(family=[*more, far]), store_path, client)
     assert set(summary.failed) == {"far/far"}
     assert "that reach less far. Is this one in the same unit of length?" in summary.failed["far/far"]
 
 
 @pytest.mark.all
 def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:
-    run(asking(), store_path, client)
+    sb.run(asking(), store_path, client)
     first = stored_choice(store_path)
-    summary = run(asking(1e-4), store_path, client)
+    summary = sb.run(asking(1e-4), store_path, client)
     second = stored_choice(store_path)
     assert first is not None
     assert second is not None
     assert len(summary.computed) == 5
     assert second.lattice.xi_max > first.lattice.xi_max
-    assert variable(open_store(store_path), "fourier", "fourier").shape[1:] == second.lattice.shape
-    assert variable(open_store(store_path), "convergence", "within").all()
+    assert variable(sb.open_store(store_path), "fourier", "fourier").shape[1:] == second.lattice.shape
+    assert variable(sb.open_store(store_path), "convergence", "within").all()
 
 
 def test_a_lattice_that_turns_out_too_small_grows(
     client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = make_plan(asking()).choice
-    small = Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
+    small = sb.Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
     monkeypatch.setattr(search_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=small))
-    summary = run(asking(), store_path, client)
+    summary = sb.run(asking(), store_path, client)
     grown = stored_choice(store_path)
     assert grown is not None
     assert "grown" in grown.reasons[-1]
     assert grown.lattice.xi_max > small.xi_max
-    assert variable(open_store(store_path), "convergence", "within").all()
+    assert variable(sb.open_store(store_path), "convergence", "within").all()
     assert len(summary.computed) == 5
 
 
@@ -100,26 +100,26 @@ def test_what_falls_short_in_the_end_is_marked(
 ) -> None:
     monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
     monkeypatch.setattr(
-        search_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=Lattice(1.2, 12))
+        search_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=sb.Lattice(1.2, 12))
     )
-    run(asking(), store_path, client)
-    convergence = open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/1", order=-4.0)
+    sb.run(asking(), store_path, client)
+    convergence = sb.open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/1", order=-4.0)
     assert not convergence["within"].item()
-    line = next(line for line in format_table(open_store(store_path)).splitlines() if line.startswith("ico/1"))
+    line = next(line for line in format_table(sb.open_store(store_path)).splitlines() if line.startswith("ico/1"))
     assert "!" in line or "*" in line
 
 
 def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client, store_path: Path) -> None:
     table = small_table(accuracy={"rtol": 1e-7, "memory": "700MB"}, norm={"orders": [-2.0]})
     del table["lattice"]
-    with pytest.raises(AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2 within .* can be reached"):
-        run(Study.from_table(table), store_path, client)
+    with pytest.raises(sb.AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2 .* can be reached"):
+        sb.run(sb.Study.from_table(table), store_path, client)
     assert not store_path.exists()
 
 
 def test_growth_goes_by_what_is_short() -> None:
     accuracy, orders = Accuracy(1e-3), (-4.0,)
-    choice = LatticeChoice(Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
+    choice = LatticeChoice(sb.Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
 
     def grown(truncation: float, aliasing: float, discretisation: float = 0.0) -> LatticeChoice | None:
         parts = [np.array([[value]]) for value in (1.0, truncation, aliasing, discretisation)]
@@ -140,7 +140,7 @@ def test_growth_goes_by_what_is_short() -> None:
 
 def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Path) -> None:
     study = asking(reference={"source": "family", "family": "ico", "member": "3"})
-    run(study, store_path, client)
-    convergence = open_store(store_path)["convergence"].to_dataset()
+    sb.run(study, store_path, client)
+    convergence = sb.open_store(store_path)["convergence"].to_dataset()
     assert convergence["within"].sel(mesh=["ico/0", "ico/1", "ico/2"]).all()
     assert (convergence["distance"].sel(mesh="ico/3") == 0).all()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import Ellipsoid, Interval, ParametrisedSurface, Study, Torus, fourier_transform, open_store, run
+import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
@@ -52,20 +52,20 @@ def egg_table(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("table", "levels", "unit"),
     # The reference's bounding sphere becomes the unit sphere at the origin.
-    [(torus_table(), 4, Torus(2.0 / 2.8, 0.8 / 2.8)), (egg_table(), 5, Ellipsoid((1.0, 0.7, 0.4)))],
+    [(torus_table(), 4, sb.Torus(2.0 / 2.8, 0.8 / 2.8)), (egg_table(), 5, sb.Ellipsoid((1.0, 0.7, 0.4)))],
     ids=["torus", "ellipsoid"],
 )
 def test_refinements_converge_with_second_order(
-    threads: Client, store_path: Path, table: dict[str, Any], levels: int, unit: Torus | Ellipsoid
+    threads: Client, store_path: Path, table: dict[str, Any], levels: int, unit: sb.Torus | sb.Ellipsoid
 ) -> None:
-    study = Study.from_table(table)
-    summary = run(study, store_path, threads)
+    study = sb.Study.from_table(table)
+    summary = sb.run(study, store_path, threads)
     assert len(summary.computed) == levels + 1
     assert not summary.failed
-    tree = open_store(store_path)
+    tree = sb.open_store(store_path)
     stored = variable(tree, "fourier", "fourier").sel(mesh="reference")
     assert study.lattice is not None
-    expected = fourier_transform(unit, study.lattice, threads=1, order=study.orders)
+    expected = sb.fourier_transform(unit, study.lattice, threads=1, order=study.orders)
     assert np.abs(stored.values - expected.values).max() < 1e-8 * unit.area
     convergence = tree["convergence"].to_dataset()
     for order in (-3.0, -5.0):
@@ -87,9 +87,9 @@ def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
     table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
     del table["lattice"]
     family = [{"name": "grid", "source": "torus", **RING, "levels": [1, 2]}]
-    summary = run(Study.from_table({**table, "family": family}), store_path, threads)
+    summary = sb.run(sb.Study.from_table({**table, "family": family}), store_path, threads)
     assert not summary.failed
-    found = open_store(store_path)["convergence"].to_dataset().isel(order=0)
+    found = sb.open_store(store_path)["convergence"].to_dataset().isel(order=0)
     assert found["within"].values[:2].all()
     assert (found["error"].values[:2] <= 1e-2 * found["distance"].values[:2]).all()
     assert found["distance"].values[0] / found["distance"].values[1] == pytest.approx(4.0, rel=0.05)
@@ -98,14 +98,14 @@ def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
 @pytest.mark.slow
 def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_path: Path) -> None:
     family = [{"name": "grid", "source": "torus", **RING, "levels": [1]}]
-    study = Study.from_table(torus_table(family=family))
-    run(study, tmp_path / "whole.zarr", threads)
+    study = sb.Study.from_table(torus_table(family=family))
+    sb.run(study, tmp_path / "whole.zarr", threads)
     study = replace(study, largest_chunk_bytes=20_000)
     assert len(make_plan(study).blocks) > 3
-    run(study, tmp_path / "blocks.zarr", threads)
-    whole, blocks = (open_store(tmp_path / f"{name}.zarr") for name in ("whole", "blocks"))
+    sb.run(study, tmp_path / "blocks.zarr", threads)
+    whole, blocks = (sb.open_store(tmp_path / f"{name}.zarr") for name in ("whole", "blocks"))
     first, second = (variable(tree, "fourier", "fourier").sel(mesh="reference").values for tree in (whole, blocks))
-    assert np.abs(first - second).max() < 1e-8 * Torus(2.0, 0.8).area
+    assert np.abs(first - second).max() < 1e-8 * sb.Torus(2.0, 0.8).area
     errors = [tree["norms"].to_dataset()["discretisation"].sel(mesh="reference").values for tree in (whole, blocks)]
     assert errors[0] == pytest.approx(errors[1], rel=3.0)
 
@@ -115,18 +115,18 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sobolev_batch.spectral.quadrature.smooth.MOST_NODES", 1 << 14)
-    side = Interval(-0.9, 1.0)
-    rough = ParametrisedSurface(roof, side, side, roof_derivatives)
+    side = sb.Interval(-0.9, 1.0)
+    rough = sb.ParametrisedSurface(roof, side, side, roof_derivatives)
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]
-    study = Study.from_table(torus_table(family=family))
+    study = sb.Study.from_table(torus_table(family=family))
     member = SurfaceMember("own", -1, rough, {"test": 1})
     object.__setattr__(study, "reference", SimpleNamespace(members=lambda folder: (member,)))
-    summary = run(study, store_path, threads)
+    summary = sb.run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
 
 
 def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
-    similarity = make_plan(Study.from_table(torus_table())).similarity
+    similarity = make_plan(sb.Study.from_table(torus_table())).similarity
     assert (similarity.scale, similarity.origin) == (1 / 2.8, (5.0, 0.0, 1.0))
-    assert make_plan(Study.from_table(egg_table())).similarity.scale == 0.5
+    assert make_plan(sb.Study.from_table(egg_table())).similarity.scale == 0.5
