@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array, vstack
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import Complexes, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.quadrature.meshes import RuleAssignment, TriangleBatch, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
@@ -61,8 +61,8 @@ class MeshTransform:
         cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU
     ) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
-        rules = RuleAssignment.for_mesh(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
-        of_vertices, of_areas = zip(*(_node_matrices(mesh, batch) for batch in rules.batches()), strict=True)
+        uses = assign_rules(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
+        of_vertices, of_areas = zip(*(_node_matrices(mesh, use) for use in uses), strict=True)
         triangles = np.asarray(mesh.triangles, dtype=np.int64)
         return cls(
             triangles,
@@ -187,25 +187,25 @@ def _whole(half: Complexes) -> Complexes:
     return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
 
 
-def _node_matrices(mesh: Mesh, batch: TriangleBatch) -> tuple[csr_array, csr_array]:
+def _node_matrices(mesh: Mesh, use: RuleUse) -> tuple[csr_array, csr_array]:
     """Return the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
-    triangles = np.asarray(mesh.triangles[batch.members], dtype=np.int64)
-    barycentric, weights = batch.rule.barycentric, batch.rule.weights
-    if not batch.splits and batch.rule is corner_rule():
+    triangles = np.asarray(mesh.triangles[use.members], dtype=np.int64)
+    barycentric, weights = use.rule.barycentric, use.rule.weights
+    if not use.splits and use.rule is corner_rule():
         used, nodes = np.unique(triangles, return_inverse=True)
         of_vertices = np.arange(len(used)), used, np.ones(len(used))
-    elif not batch.splits and batch.rule is midpoint_rule():
+    elif not use.splits and use.rule is midpoint_rule():
         edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
         used, nodes = np.unique(edges, axis=0, return_inverse=True)
         of_vertices = np.repeat(np.arange(len(used)), 2), used.ravel(), np.full(2 * len(used), 0.5)
     else:
-        for _ in range(batch.splits):
+        for _ in range(use.splits):
             barycentric = np.concatenate([barycentric @ quarter for quarter in _QUARTERS])
             weights = np.tile(weights / 4, 4)
         nodes = np.arange(len(weights) * len(triangles), dtype=np.int64)
         columns = np.repeat(triangles, len(weights), axis=0).ravel()
         of_vertices = np.repeat(nodes, 3), columns, np.tile(barycentric, (len(triangles), 1)).ravel()
-    of_areas = nodes.ravel(), np.repeat(batch.members, len(weights)), np.tile(weights, len(triangles))
+    of_areas = nodes.ravel(), np.repeat(use.members.astype(np.int64), len(weights)), np.tile(weights, len(triangles))
     return _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
 
 

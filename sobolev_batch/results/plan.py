@@ -208,7 +208,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
         yield "", f"{format_bytes(tail.size * plan.item_bytes)} per surface"
     accuracy, transform = study.accuracy, plan.transform
     if accuracy is None:
-        yield "transform", f"eps {transform.eps:g}, {transform.dtype}, quadrature {transform.quadrature.method}"
+        yield "transform", f"eps {transform.eps:g}, {transform.dtype}, quadrature {transform.quadrature}"
     else:
         allowed = f"{format_bytes(accuracy.allowed_bytes)} for a transform, M <= {accuracy.largest_intervals}"
         yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"

@@ -17,7 +17,6 @@ from sobolev_batch.spectral.lattice import AXES, Block, Lattice
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, norms_of_checks, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.transform.settings import (
     ON_CPU,
@@ -180,7 +179,7 @@ def fourier_transform(
     >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
     12.5664
     """
-    settings = TransformSettings(eps, dtype, Quadrature(quadrature))
+    settings = TransformSettings(eps, dtype, quadrature)
     execution = Execution(backend_named(backend), thread_count(threads))
     field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution)
     attributes = {
@@ -190,7 +189,7 @@ def fourier_transform(
         "xi_max": lattice.xi_max,
         "M": lattice.M,
         "eps": settings.eps,
-        "quadrature": settings.quadrature.method,
+        "quadrature": settings.quadrature,
         "quality": field.quality.to_json(),
         "backend": field.backend,
     }

@@ -13,7 +13,7 @@ from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
 
 WORKFLOW = Path(__file__).parents[2] / "workflows/cortex.toml"
@@ -32,7 +32,7 @@ def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:
     assert isinstance(whole, sb.Mesh)
     assert isinstance(coarse, sb.Mesh)
     similarity = sb.Similarity.to_unit_ball(whole)
-    rule = Quadrature(2)
+    rule = 2
     plans = (kind_of(similarity.apply(surface)).plan(1.0, 1e-9, rule) for surface in (coarse, whole))
     first, second = (list(plan.batches(1 << 20)) for plan in plans)
     return first, second

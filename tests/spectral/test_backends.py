@@ -30,7 +30,7 @@ from sobolev_batch.spectral.backends import (
 )
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
+from sobolev_batch.spectral.quadrature.meshes import assign_rules
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import Transformed, transform_block
@@ -70,13 +70,13 @@ def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, toleranc
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("quadrature", ["auto", "gauss8", 7])
 def test_the_fake_agrees_with_the_processor(name: str, quadrature: str | int) -> None:
-    mesh, settings = MESHES[name], TransformSettings(1e-13, quadrature=Quadrature(quadrature))
+    mesh, settings = MESHES[name], TransformSettings(1e-13, quadrature=quadrature)
     assert_agree(on(Device().backend(), mesh, settings), on(CPU, mesh, settings), mesh)
 
 
 def test_every_kind_of_rule_agrees() -> None:
     mesh, settings = uneven(), TransformSettings(1e-13, tolerance=1e-2)
-    uses = RuleAssignment.for_mesh(mesh, LATTICE.highest_frequency, 1e-2, settings.quadrature).uses
+    uses = assign_rules(mesh, LATTICE.highest_frequency, 1e-2, settings.quadrature)
     kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
     found = {"split" if use.splits else kinds.get(use.rule, "interior") for use in uses}
     assert found == {"corners", "midpoints", "interior", "split"}

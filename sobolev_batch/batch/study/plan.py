@@ -243,7 +243,7 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
-        "transform": [study.transform.eps, choice.dtype, study.transform.quadrature.method],
+        "transform": [study.transform.eps, choice.dtype, study.transform.quadrature],
         "numerics": NUMERICS_VERSION,
         # The target of a field follows from its distance to the reference.
         "accuracy": choice.basis,

@@ -35,7 +35,6 @@ from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
@@ -160,7 +159,7 @@ class _TransformSection(Section):
     backend: Backends = "auto"
 
     def settings(self) -> TransformSettings:
-        return TransformSettings(self.eps, self.dtype or "complex128", Quadrature(self.quadrature))
+        return TransformSettings(self.eps, self.dtype or "complex128", self.quadrature)
 
 
 class _ScalingSection(Section):

@@ -269,7 +269,7 @@ def _as_meshes(
 def _triangulated(surface: Smooth, cutoff: float) -> Mesh:
     """Return a mesh of a smooth surface that is fine beside it and beside the wavelength at a cutoff."""
     try:
-        counts = resolution_of(surface, cutoff, _TRIANGULATION_TOLERANCE).counts
+        counts, _ = resolution_of(surface, cutoff, _TRIANGULATION_TOLERANCE)
     except InputError:
         counts = (_MOST_CELLS, _MOST_CELLS)
     cells = (min(_CELLS_PER_NODE * count, _MOST_CELLS) for count in counts)

@@ -5,6 +5,7 @@ A further kind of surface is one more class here.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,20 +21,18 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import CPU, Backend
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.spectral.quadrature.meshes import (
-    AUTO,
-    Faces,
-    Quadrature,
-    RuleAssignment,
+    RuleUse,
     WeightedPoints,
+    assign_rules,
     loosest_tolerance,
     weight_masses,
 )
-from sobolev_batch.spectral.quadrature.smooth import Resolution, exact_values, resolution_of
+from sobolev_batch.spectral.quadrature.smooth import exact_values, resolution_of
 from sobolev_batch.spectral.spheres import sphere_block, sphere_transform
 from sobolev_batch.spectral.triangles import exact_transform, sampled_transform
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.smooth import Counts, Smooth
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -59,15 +58,15 @@ class SurfaceKind(ABC):
         highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
         tolerance: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
             surfaces observe it.
-        quadrature: Method to choose the rules of triangles.
+        quadrature: Method to choose the rules of triangles: see `fixed_rule`.
     """
 
     surface: Any
     highest_frequency: float = 0.0
     tolerance: float = 0.0
-    quadrature: Quadrature = AUTO
+    quadrature: str | int = "auto"
 
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: Quadrature = AUTO) -> Self:
+    def plan(self, highest_frequency: float, tolerance: float, quadrature: str | int = "auto") -> Self:
         """Return the surface with points up to a frequency; see the attributes."""
         return replace(self, highest_frequency=highest_frequency, tolerance=tolerance, quadrature=quadrature)
 
@@ -137,9 +136,9 @@ class SurfaceKind(ABC):
 
 class _Triangles(SurfaceKind):
     @cached_property
-    def assignment(self) -> RuleAssignment:
-        """Rules of the triangles, which take two bytes for each."""
-        return RuleAssignment.for_mesh(self.surface, self.highest_frequency, self.tolerance, self.quadrature)
+    def uses(self) -> tuple[RuleUse, ...]:
+        """Rules of the triangles, which take four bytes for each."""
+        return assign_rules(self.surface, self.highest_frequency, self.tolerance, self.quadrature)
 
     @property
     def triangles(self) -> int:
@@ -151,32 +150,29 @@ class _Triangles(SurfaceKind):
 
     @property
     def expected_points(self) -> float:
-        return sum((use.expected_points for use in self.assignment.uses), 0.0)
+        return sum((use.expected_points for use in self.uses), 0.0)
 
     @property
     def largest_points(self) -> int:
-        return sum(use.largest_points for use in self.assignment.uses)
+        return sum(use.largest_points for use in self.uses)
 
     @property
     def lowest_degree(self) -> int:
-        return min(use.rule.degree for use in self.assignment.uses)
+        return min(use.rule.degree for use in self.uses)
 
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         # Nodes are merged within a batch of triangles: these are large where nodes are shared.
-        triangles = [
-            batch
-            for whole in self.assignment.batches()
-            for batch in whole.split(capacity // (2 if whole.rule.sharing > 1 else 8))
-        ]
+        triangles = [batch for use in self.uses for batch in use.split(capacity // (2 if use.rule.sharing > 1 else 8))]
         ends = np.cumsum([batch.largest_points for batch in triangles])
         total = int(ends[-1])
         count = -(-total // (capacity - max(batch.largest_points for batch in triangles)))
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
         # number by at most one batch of triangles.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
-        faces = Faces.uploaded(self.surface, backend)
+        mesh = self.surface
+        arrays = backend.upload(mesh.vertices), backend.upload(mesh.triangles), backend.upload(mesh.areas)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
-            yield WeightedPoints.concatenated([batch.points(faces, backend) for _, batch in group])
+            yield WeightedPoints.concatenated([batch.points(arrays, backend) for _, batch in group])
 
     def exact_values(self, frequencies: Reals) -> Complexes:
         return exact_transform(self.surface, frequencies)
@@ -193,26 +189,26 @@ class _Parametrised(SurfaceKind):
     lowest_degree = _SMOOTH_DEGREE
 
     @property
-    def resolution(self) -> Resolution:
+    def resolution(self) -> tuple[Counts, float]:
         """Nodes along both parameters, and the change of the transform when they are doubled."""
         return resolution_of(self.surface, self.highest_frequency, self.tolerance)
 
     @property
     def expected_points(self) -> float:
-        return float(self.resolution.size)
+        return float(self.largest_points)
 
     @property
     def largest_points(self) -> int:
-        return self.resolution.size
+        return math.prod(self.resolution[0])
 
     @property
     def change(self) -> float:
-        return self.resolution.change
+        return self.resolution[1]
 
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         gathered: list[WeightedPoints] = []
         count = 0
-        for coordinates, weights in self.surface.nodes(self.resolution.counts, min(capacity, _NODES)):
+        for coordinates, weights in self.surface.nodes(self.resolution[0], min(capacity, _NODES)):
             if count + len(weights) > capacity:
                 yield WeightedPoints.concatenated(gathered)
                 gathered, count = [], 0

@@ -6,7 +6,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,8 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
 _Corners = tuple[Array, Array, Array]
+# Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
+FaceArrays = tuple[Array, Array, Array]
 
 # Triangles at a time: keeps the temporaries with a mid-sized rule near 50 MB.
 _TRIANGLES = 1 << 17
@@ -59,12 +60,11 @@ class WeightedPoints:
         )
 
 
-@dataclass(frozen=True)
-class Quadrature:
-    """A method to choose the rules of triangles.
+def fixed_rule(quadrature: str | int) -> TriangleRule | None:
+    """Return the rule that a method prescribes for all triangles, or None if the rule depends on their size.
 
-    Attributes:
-        method: "auto" gives every triangle the cheapest rule that keeps the tolerance at all frequencies of the
+    Args:
+        quadrature: "auto" gives every triangle the cheapest rule that keeps the tolerance at all frequencies of the
             lattice, and splits triangles that are too large for any rule. An integer from 1 to 50 is the degree
             of one symmetric rule with interior nodes for all triangles. "gauss8" is the 64-point product rule of
             K. Koga's paper. Parametrised surfaces ignore the method.
@@ -72,164 +72,67 @@ class Quadrature:
     Raises:
         InputError: Any other method.
     """
-
-    method: str | int = "auto"
-
-    def __post_init__(self) -> None:
-        if isinstance(self.method, bool) or (
-            self.method not in ("auto", "gauss8")
-            and not (isinstance(self.method, int) and 1 <= self.method <= HIGHEST_DEGREE)
-        ):
-            raise InputError(
-                f"quadrature must be 'auto', 'gauss8' or a degree from 1 to {HIGHEST_DEGREE}, found {self.method!r}"
-            )
-
-    @property
-    def fixed_rule(self) -> TriangleRule | None:
-        """Rule of all triangles, or None if it depends on their size."""
-        if self.method == "gauss8":
-            return gauss_rule(8)
-        return symmetric_rule(self.method) if isinstance(self.method, int) else None
+    if quadrature == "auto":
+        return None
+    if quadrature == "gauss8":
+        return gauss_rule(8)
+    if isinstance(quadrature, int) and not isinstance(quadrature, bool) and 1 <= quadrature <= HIGHEST_DEGREE:
+        return symmetric_rule(quadrature)
+    raise InputError(
+        f"quadrature must be 'auto', 'gauss8' or a degree from 1 to {HIGHEST_DEGREE}, found {quadrature!r}"
+    )
 
 
-AUTO = Quadrature()
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RuleUse:
-    """Use of a rule in a mesh.
+    """Triangles of a mesh that share a rule, each to be split into 4^splits similar ones.
 
     Attributes:
-        rule: Rule for each of the similar triangles that a triangle is split into.
-        splits: Number of times that edges are halved: a triangle becomes 4^splits similar ones.
-        count: Number of triangles, before they are split.
+        rule: Rule for each similar triangle.
+        splits: Number of times that edges are halved.
+        members: uint32 (k,), the triangles.
+        path: Quarter of the quarter ... of each triangle that is meant; empty for the whole triangle.
     """
 
     rule: TriangleRule
     splits: int
-    count: int
+    members: NDArray[np.uint32]
+    path: tuple[int, ...] = ()
 
     @property
     def largest_points(self) -> int:
         """Number of points, before shared ones are merged."""
-        return self.count * self.rule.size << 2 * self.splits
+        return len(self.members) * self.rule.size << 2 * self.splits
 
     @property
     def expected_points(self) -> float:
         """Number of points of a closed mesh, after shared ones are merged."""
         return self.largest_points / (1 if self.splits else self.rule.sharing)
 
-
-@dataclass(frozen=True, eq=False)
-class RuleAssignment:
-    """The rules of the triangles of a mesh.
-
-    Attributes:
-        uses: Rules in use.
-        codes: uint16 (m,), the use of each triangle as an index; None if there is but one.
-    """
-
-    uses: tuple[RuleUse, ...]
-    codes: NDArray[np.uint16] | None = None
-
-    @classmethod
-    def for_mesh(cls, mesh: Mesh, highest_frequency: float, tolerance: float, quadrature: Quadrature) -> RuleAssignment:
-        """Return the rules that keep a tolerance up to a frequency, or those that the method prescribes."""
-        triangles = len(mesh.triangles)
-        fixed = quadrature.fixed_rule
-        if fixed is not None:
-            return cls((RuleUse(fixed, 0, triangles),))
-        rules, ranges = rule_ranges(tolerance)
-        wavenumber = 2 * np.pi * highest_frequency
-        radii = mesh.centroid_radii
-        splits, choice = choose_rules(wavenumber * np.array([radii.min(), radii.max()]), ranges)
-        if splits[0] == splits[1] and choice[0] == choice[1]:
-            return cls((RuleUse(rules[choice[0]], int(splits[0]), triangles),))
-        # Meshes have tens of millions of triangles: two bytes for each are kept, and temporaries are small.
-        keys = np.empty(triangles, dtype=np.uint16)
-        counts = np.zeros((int(splits[1]) + 1) * len(rules), dtype=np.int64)
-        for first in range(0, triangles, _TRIANGLES):
-            splits, choice = choose_rules(wavenumber * radii[first : first + _TRIANGLES], ranges)
-            key = splits * len(rules) + choice
-            counts += np.bincount(key, minlength=len(counts))
-            keys[first : first + _TRIANGLES] = key
-        used = np.flatnonzero(counts)
-        code_of = np.zeros(len(counts), dtype=np.uint16)
-        code_of[used] = np.arange(len(used))
-        uses = tuple(RuleUse(rules[key % len(rules)], int(key // len(rules)), int(counts[key])) for key in used)
-        return cls(uses, code_of[keys])
-
-    def batches(self) -> Iterator[TriangleBatch]:
-        """Yield the triangles of each use."""
-        for code, use in enumerate(self.uses):
-            members = np.arange(use.count) if self.codes is None else np.flatnonzero(self.codes == code)
-            yield TriangleBatch(use.rule, use.splits, members)
-
-
-@dataclass(frozen=True, eq=False)
-class Faces:
-    """The arrays of a mesh on a backend.
-
-    Attributes:
-        vertices: float64 (n, 3), in units of length.
-        triangles: int64 (m, 3).
-        areas: float64 (m,), in squared units of length.
-    """
-
-    vertices: Array
-    triangles: Array
-    areas: Array
-
-    @classmethod
-    def uploaded(cls, mesh: Mesh, backend: Backend) -> Faces:
-        """Return the arrays of a mesh, uploaded."""
-        return cls(*map(backend.upload, (mesh.vertices, mesh.triangles, mesh.areas)))
-
-
-@dataclass(frozen=True, eq=False)
-class TriangleBatch:
-    """Triangles that share a rule, each to be split into 4^splits similar ones.
-
-    Attributes:
-        rule: Rule for each similar triangle.
-        splits: Number of times that edges are halved.
-        members: int64 (k,), the triangles.
-        path: Quarter of the quarter ... of each triangle that is meant; empty for the whole triangle.
-    """
-
-    rule: TriangleRule
-    splits: int
-    members: NDArray[np.int64]
-    path: tuple[int, ...] = ()
-
-    @cached_property
-    def largest_points(self) -> int:
-        """Number of points, before shared ones are merged."""
-        return len(self.members) * self.rule.size << 2 * self.splits
-
-    def split(self, largest: int) -> Iterator[TriangleBatch]:
-        """Yield batches of at most ``largest`` points, or of one triangle without splits."""
+    def split(self, largest: int) -> Iterator[RuleUse]:
+        """Yield parts of at most ``largest`` points, or of one triangle without splits."""
         points_each = self.rule.size << 2 * self.splits
         if points_each > largest and self.splits:
             for quarter in range(4):
-                yield from TriangleBatch(self.rule, self.splits - 1, self.members, (*self.path, quarter)).split(largest)
+                yield from RuleUse(self.rule, self.splits - 1, self.members, (*self.path, quarter)).split(largest)
             return
         count = largest // points_each
         step = max(1, count if self.rule.sharing > 1 else min(_TRIANGLES, count))
         for first in range(0, len(self.members), step):
-            yield TriangleBatch(self.rule, self.splits, self.members[first : first + step], self.path)
+            yield RuleUse(self.rule, self.splits, self.members[first : first + step], self.path)
 
-    def points(self, faces: Faces, backend: Backend) -> WeightedPoints:
-        """Return the points, on the backend of the faces."""
-        members = backend.upload(self.members)
-        unsplit = not (self.splits or self.path)
-        if self.rule is corner_rule() and unsplit:
-            return WeightedPoints(*merged_corners(faces, members))
-        if self.rule is midpoint_rule() and unsplit:
-            return WeightedPoints(*merged_midpoints(faces, members))
-        triangles = faces.triangles[members]
-        a, b, c = (faces.vertices[triangles[:, corner]] for corner in range(3))
-        areas = faces.areas[members] / 4 ** len(self.path)
+    def points(self, mesh: FaceArrays, backend: Backend) -> WeightedPoints:
+        """Return the points, on the backend of the mesh's arrays."""
+        vertices, all_triangles, all_areas = mesh
+        members = backend.upload(self.members.astype(np.int64))
+        if not (self.splits or self.path):
+            if self.rule is corner_rule():
+                return WeightedPoints(*merged_corners(mesh, members))
+            if self.rule is midpoint_rule():
+                return WeightedPoints(*merged_midpoints(mesh, members))
+        triangles = all_triangles[members]
+        a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+        areas = all_areas[members] / 4 ** len(self.path)
         for quarter in self.path:
             a, b, c = _quarters((a, b, c))[quarter]
         for _ in range(self.splits):
@@ -241,6 +144,27 @@ class TriangleBatch:
             combine(rule.barycentric, np.stack([a[:, axis], b[:, axis], c[:, axis]]), out=coordinates[axis])
         weights = np.asarray(rule.weights, like=areas)[:, None] * areas
         return WeightedPoints(coordinates.reshape(3, -1), weights.ravel())
+
+
+def assign_rules(
+    mesh: Mesh, highest_frequency: float, tolerance: float, quadrature: str | int = "auto"
+) -> tuple[RuleUse, ...]:
+    """Return the rules of all triangles: those that keep a tolerance up to a frequency, or the prescribed one."""
+    fixed = fixed_rule(quadrature)
+    if fixed is not None:
+        return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
+    rules, ranges = rule_ranges(tolerance)
+    sizes = mesh.centroid_radii
+    # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
+    keys = np.empty(len(sizes), dtype=np.uint16)
+    for first in range(0, len(sizes), _TRIANGLES):
+        batch = slice(first, first + _TRIANGLES)
+        splits, choice = choose_rules(2 * np.pi * highest_frequency * sizes[batch], ranges)
+        keys[batch] = splits * len(rules) + choice
+    return tuple(
+        RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
+        for key in np.unique(keys).tolist()
+    )
 
 
 def choose_rules(sizes: Reals, ranges: Reals) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -263,25 +187,27 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
 
 
-def merged_corners(mesh: Faces | Mesh, members: Array) -> tuple[Array, Array]:
+def merged_corners(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
     """Return the corners of some triangles, each with a third of the areas that meet there.
 
     Returns:
         Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
     """
-    thirds = np.repeat(mesh.areas[members] / 3, 3)
-    weights = np.bincount(mesh.triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
+    vertices, triangles, areas = mesh
+    thirds = np.repeat(areas[members] / 3, 3)
+    weights = np.bincount(triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
     corners = np.flatnonzero(weights)
-    return np.ascontiguousarray(mesh.vertices[corners].T, like=weights), weights[corners]
+    return np.ascontiguousarray(vertices[corners].T, like=weights), weights[corners]
 
 
-def merged_midpoints(mesh: Faces | Mesh, members: Array) -> tuple[Array, Array]:
+def merged_midpoints(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
     """Return the edge midpoints of some triangles, each with a third of the areas that meet there.
 
     Returns:
         Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
     """
-    triangles, vertices = mesh.triangles[members], mesh.vertices
+    vertices, triangles, areas = mesh
+    triangles = triangles[members]
     triangle_bits = len(triangles).bit_length()
     if 2 * len(vertices).bit_length() + triangle_bits > _BITS:
         used, triangles = np.unique(triangles, return_inverse=True)
@@ -297,7 +223,7 @@ def merged_midpoints(mesh: Faces | Mesh, members: Array) -> tuple[Array, Array]:
         row |= numbers
     ordered = edges.ravel()
     ordered.sort()
-    thirds = (mesh.areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
+    thirds = (areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
     ordered >>= triangle_bits
     is_first = np.empty(len(ordered), dtype=bool, like=ordered)
     is_first[:1] = True
@@ -332,66 +258,54 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
         orders: Orders s.
         norms: Largest norm of the error at each order (orders,).
     """
-    sizes = SizeHistogram.from_mesh(mesh)
+    classes = size_classes(mesh)
     decades = math.log10(_LOOSEST_TOLERANCE / FINEST_TOLERANCE)
     tolerances = _LOOSEST_TOLERANCE * 10 ** -np.linspace(0, decades, round(decades * _STEPS_PER_DECADE) + 1)
 
     def suffices(tolerance: float) -> bool:
-        return bool(np.all(sizes.quadrature_error(lattice, orders, float(tolerance)) <= norms))
+        return bool(np.all(quadrature_error(classes, lattice, orders, float(tolerance)) <= norms))
 
     # The finest one where none suffices.
     return float(tolerances[bisect_left(tolerances[:-1], True, key=suffices)])
 
 
-@dataclass(frozen=True, eq=False)
-class SizeHistogram:
-    """Triangles of a mesh, counted in classes of similar size.
+def size_classes(mesh: Mesh) -> Reals:
+    """Return the triangles of a mesh in classes of similar size, (4, classes).
 
-    Attributes:
-        smallest: Least centroid radius of each class, in units of length.
-        largest: Greatest centroid radius of each class.
-        areas: Sum of the areas in each class.
-        squares: Sum of the squared areas in each class.
+    The rows are the least and the greatest centroid radius of each class, in units of length, and the sums of the
+    areas and of the squared areas in it.
     """
+    radii, areas = mesh.centroid_radii, mesh.areas
+    largest = float(radii.max())
+    smallest = max(float(radii.min()), 1e-6 * largest)
+    count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
+    edges = np.geomspace(smallest, largest, count + 1)
+    classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
+    return np.stack(
+        [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
+    )
 
-    smallest: Reals
-    largest: Reals
-    areas: Reals
-    squares: Reals
 
-    @classmethod
-    def from_mesh(cls, mesh: Mesh) -> SizeHistogram:
-        """Return the histogram of a mesh."""
-        radii, areas = mesh.centroid_radii, mesh.areas
-        largest = float(radii.max())
-        smallest = max(float(radii.min()), 1e-6 * largest)
-        count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
-        edges = np.geomspace(smallest, largest, count + 1)
-        classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
-        sums = [np.bincount(classes, values, count).astype(np.float64, copy=False) for values in (areas, areas * areas)]
-        return cls(edges[:-1], edges[1:], *sums)
+def quadrature_error(classes: Reals, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float) -> Reals:
+    """Predict the norm of the quadrature's part of a field's error (orders,), from the `size_classes` of a mesh.
 
-    def quadrature_error(self, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float) -> Reals:
-        """Predict the norm of the quadrature's part of a field's error (orders,).
-
-        The even parts of the triangles' errors add up like the surface's transform itself, whose
-        energy on |ξ| = r is area² near zero and area / (2π r²) on average far out. The odd parts add
-        up like random numbers.
-        """
-        rules, ranges = rule_ranges(tolerance)
-        # The rule for the smallest of a class, applied to the largest of it: never less than the truth.
-        splits, choice = choose_rules(2 * np.pi * lattice.highest_frequency * self.smallest, ranges)
-        radii = _radii(lattice)
-        phases = 2 * np.pi * radii[:, None] * (self.largest / 2.0**splits)
-        even, odd = np.empty_like(phases), np.empty_like(phases)
-        for rule in np.unique(choice):
-            members = choice == rule
-            even[:, members], odd[:, members] = _interpolated_errors(rules[rule], phases[:, members])
-        area = self.areas.sum()
-        coherence = np.minimum(1.0, 1 / (2 * np.pi * radii**2 * area))
-        energy = (even @ self.areas) ** 2 * coherence
-        energy += (even**2 + (_ODD_REMAINDER * odd) ** 2) @ (self.squares / 4.0**splits)
-        return np.asarray(np.sqrt(radial_integrals(energy, radii, orders)))
+    The even parts of the triangles' errors add up like the surface's transform itself, whose energy on |ξ| = r is
+    area² near zero and area / (2π r²) on average far out. The odd parts add up like random numbers.
+    """
+    smallest, largest, areas, squares = classes
+    rules, ranges = rule_ranges(tolerance)
+    # The rule for the smallest of a class, applied to the largest of it: never less than the truth.
+    splits, choice = choose_rules(2 * np.pi * lattice.highest_frequency * smallest, ranges)
+    radii = _radii(lattice)
+    phases = 2 * np.pi * radii[:, None] * (largest / 2.0**splits)
+    even, odd = np.empty_like(phases), np.empty_like(phases)
+    for rule in np.unique(choice):
+        members = choice == rule
+        even[:, members], odd[:, members] = _interpolated_errors(rules[rule], phases[:, members])
+    coherence = np.minimum(1.0, 1 / (2 * np.pi * radii**2 * areas.sum()))
+    energy = (even @ areas) ** 2 * coherence
+    energy += (even**2 + (_ODD_REMAINDER * odd) ** 2) @ (squares / 4.0**splits)
+    return np.asarray(np.sqrt(_radial_integrals(energy, radii, orders)))
 
 
 def _interpolated_errors(rule: TriangleRule, phases: Reals) -> tuple[Reals, Reals]:
@@ -410,10 +324,10 @@ def _radii(lattice: FrequencyLattice) -> Reals:
 
 def weight_masses(lattice: FrequencyLattice, orders: Sequence[float]) -> Reals:
     """Return ∫ (1+|ξ|²)^s over the range of a lattice (orders,)."""
-    return radial_integrals(np.ones(_RADII), _radii(lattice), orders)
+    return _radial_integrals(np.ones(_RADII), _radii(lattice), orders)
 
 
-def radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> Reals:
+def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> Reals:
     """Return ∫ (1+r²)^s energy(r) 4πr² dr by the midpoint rule (orders,)."""
     step = radii[1] - radii[0]
     return np.array([np.sum((1 + radii**2) ** order * energy * 4 * np.pi * radii**2) * step for order in orders])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -36,29 +35,8 @@ _PAIRS = 1 << 18
 _EXACT_CHANGE, _MOST_EXACT_NODES = 1e-12, 1 << 19
 
 
-@dataclass(frozen=True)
-class Resolution:
-    """The nodes of a quadrature rule and their accuracy.
-
-    Attributes:
-        counts: Nodes along u and v.
-        change: Change of the transform when the nodes are doubled along u, plus that along v, over the area: the
-            largest one over the probe frequencies.
-        converged: True if the change is within the tolerance.
-    """
-
-    counts: Counts
-    change: float
-    converged: bool
-
-    @property
-    def size(self) -> int:
-        """Number of nodes."""
-        return math.prod(self.counts)
-
-
 @lru_cache(maxsize=16)
-def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -> Resolution:
+def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -> tuple[Counts, float]:
     """Return the nodes that the transform of a surface takes up to a frequency.
 
     Args:
@@ -66,17 +44,20 @@ def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -
         highest_frequency: Largest |ξ|, in cycles per unit length.
         tolerance: Largest change when the nodes are doubled, relative to the area; clipped to 1e-13 to 1e-4.
 
+    Returns:
+        Nodes along u and v, and the change of the transform when they are doubled along u, plus that along v, over
+        the area: the largest one over the probe frequencies.
+
     Raises:
         InputError: More than 4,194,304 nodes would be needed, or 2,048 along a parameter that is not periodic: the
             parametrisation is not smooth, or the surface is large or thin compared with the wavelength.
     """
     tolerance = min(max(tolerance, FINEST_CHANGE), COARSEST_CHANGE)
-    resolution = _refined(surface, highest_frequency, tolerance, MOST_NODES)
-    if not resolution.converged:
+    (u, v), change = _refined(surface, highest_frequency, tolerance, MOST_NODES)
+    if change > tolerance:
         progress = "it would take more to begin with"
-        if math.isfinite(resolution.change):
-            u, v = resolution.counts
-            progress = f"with {u} x {v} it still changes by {resolution.change:.2g} of the area"
+        if math.isfinite(change):
+            progress = f"with {u} x {v} it still changes by {change:.2g} of the area"
         raise InputError(
             f"the transform of the parametrised surface up to |xi| = {highest_frequency:.4g} is not settled to "
             f"{tolerance:.2g} of its area with {MOST_NODES} nodes, the most that are tried ({MOST_GAUSS_NODES} along a "
@@ -84,7 +65,7 @@ def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -
             "unmarked period), or the surface is large or thin beside the shortest wavelength; lower xi_max, or allow "
             "a larger eps"
         )
-    return resolution
+    return (u, v), change
 
 
 def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Complexes:
@@ -124,26 +105,31 @@ def exact_values(surface: Smooth, frequencies: Reals) -> Complexes:
 
 @lru_cache(maxsize=16)
 def _exact_counts(surface: Smooth, highest: float) -> Counts:
-    return doubled(_refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES).counts)
+    counts, _ = _refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)
+    return doubled(counts)
 
 
-def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> Resolution:
-    """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many."""
+def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
+    """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many.
+
+    Returns:
+        What `resolution_of` does; the change is infinite if even the first nodes are too many.
+    """
     counts = _first_counts(surface, highest)
     if _too_many(surface, counts, most):
-        return Resolution(counts, math.inf, False)
+        return counts, math.inf
     frequencies = highest * _unit_frequencies()
     values = direct_transform(surface, counts, frequencies)
     while True:
         finer = [direct_transform(surface, more, frequencies) for more in _finer(counts)]
         changes = [float(np.abs(more - values).max()) / surface.area for more in finer]
         if sum(changes) <= tolerance:
-            return Resolution(counts, sum(changes), True)
+            return counts, sum(changes)
         coarse = [change > tolerance / 2 for change in changes]
         twice = doubled(counts)
         larger = (twice[0] if coarse[0] else counts[0], twice[1] if coarse[1] else counts[1])
         if _too_many(surface, larger, most):
-            return Resolution(counts, sum(changes), False)
+            return counts, sum(changes)
         counts = larger
         values = finer[coarse.index(True)] if sum(coarse) == 1 else direct_transform(surface, counts, frequencies)
 

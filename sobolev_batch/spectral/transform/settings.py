@@ -18,7 +18,7 @@ from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends import CPU, Backend, ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
-from sobolev_batch.spectral.quadrature.meshes import AUTO, Quadrature, weight_masses
+from sobolev_batch.spectral.quadrature.meshes import fixed_rule, weight_masses
 from sobolev_batch.spectral.transform.memory import DEFAULT_BATCH
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -38,24 +38,24 @@ class TransformSettings:
         eps: Accuracy of a field relative to the surface's area; by default 1e-9 in complex128 and 1e-6 in
             complex64.
         dtype: "complex128" or "complex64".
-        quadrature: Rules for triangles.
+        quadrature: Rules for triangles: see `fixed_rule`.
         tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
             parametrised surface, relative to the whole area; eps by default.
 
     Raises:
-        InputError: An unknown dtype, or an eps that it cannot reach.
+        InputError: An unknown dtype or quadrature, or an eps that the dtype cannot reach.
     """
 
     eps: float
     dtype: ComplexDtype
-    quadrature: Quadrature
+    quadrature: str | int
     tolerance: float
 
     def __init__(
         self,
         eps: float | None = None,
         dtype: ComplexDtype = "complex128",
-        quadrature: Quadrature = AUTO,
+        quadrature: str | int = "auto",
         tolerance: float | None = None,
     ) -> None:
         if dtype not in get_args(ComplexDtype):
@@ -63,6 +63,7 @@ class TransformSettings:
         eps = DEFAULT_EPS[dtype] if eps is None else float(eps)
         if not FINEST_EPS[dtype] <= eps <= COARSEST_EPS:
             raise InputError(f"eps must lie between {FINEST_EPS[dtype]:g} and {COARSEST_EPS:g} in {dtype}, found {eps}")
+        fixed_rule(quadrature)
         object.__setattr__(self, "eps", eps)
         object.__setattr__(self, "dtype", dtype)
         object.__setattr__(self, "quadrature", quadrature)

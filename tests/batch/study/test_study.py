@@ -62,7 +62,7 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert study.orders == (-2.0, -3.5)
     assert study.pairs == "reference"
     assert (study.transform.eps, study.transform.dtype) == (1e-6, "complex64")
-    assert study.transform.quadrature.method == 5
+    assert study.transform.quadrature == 5
     assert study.scaling == Similarity(0.5)
     assert [family.name for family in study.families] == ["ico", "thin"]
     assert study.folder == tmp_path

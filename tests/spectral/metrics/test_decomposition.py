@@ -13,7 +13,6 @@ from scipy.integrate import quad
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, proportion
 from sobolev_batch.spectral import fields as operands
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from sobolev_batch.spectral.spheres import sphere_inner_product
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -94,7 +93,7 @@ def share_in_the_limit(mesh: Mesh, radius: float, order: float) -> float:
     """
     lack = 1 - mesh.area / Sphere(radius).area
     inside, weights = 0.0, 0.0
-    for batch in kind_of(mesh).plan(1.0, 1e-9, Quadrature(8)).batches(1 << 20):
+    for batch in kind_of(mesh).plan(1.0, 1e-9, 8).batches(1 << 20):
         inside += batch.weights @ (radius - np.linalg.norm(batch.coordinates, axis=0))
         weights += batch.weights.sum()
     displacement = inside / weights

@@ -20,7 +20,6 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -56,7 +55,7 @@ def test_distance_against_the_matern_kernel_in_real_space() -> None:
     shrunk = type(BOX)(0.8 * BOX.vertices, BOX.triangles)
     points, weights = [], []
     for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in kind_of(mesh).plan(1.0, 1e-9, Quadrature(22)).batches(1 << 20):
+        for batch in kind_of(mesh).plan(1.0, 1e-9, 22).batches(1 << 20):
             points.append(batch.coordinates.T)
             weights.append(sign * batch.weights)
     x, w = np.concatenate(points), np.concatenate(weights)

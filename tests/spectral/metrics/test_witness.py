@@ -25,7 +25,7 @@ from sobolev_batch import (
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.memory import Batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -130,7 +130,7 @@ def test_is_the_difference_smoothed_by_the_matern_kernel() -> None:
     points = np.random.default_rng(7).uniform(-1, 1, (9, 3))
     expected = np.zeros(len(points))
     for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in kind_of(mesh).plan(1.0, 1e-9, Quadrature(22)).batches(1 << 20):
+        for batch in kind_of(mesh).plan(1.0, 1e-9, 22).batches(1 << 20):
             r = np.linalg.norm(points[:, None] - batch.coordinates.T, axis=2)
             kernel = 2 * np.pi**power / gamma(power) * r ** (power - 1.5) * kv(1.5 - power, 2 * np.pi * r)
             expected += sign * kernel @ batch.weights

@@ -9,9 +9,9 @@ import pytest
 
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, Torus, fourier_transform, icosphere
 from sobolev_batch.spectral.fields import compute_field
-from sobolev_batch.spectral.quadrature import meshes
+from sobolev_batch.spectral.quadrature import kinds, meshes
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, RuleAssignment
+from sobolev_batch.spectral.quadrature.meshes import RuleUse, assign_rules
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -20,7 +20,7 @@ from tests.support.shapes import CENTRED_BOX as BOX
 @pytest.mark.parametrize("method", ["auto", "gauss8", 1, 7, 50])
 @pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
 def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
-    batches = list(kind_of(BOX).plan(8.0, 1e-10, Quadrature(method)).batches(capacity))
+    batches = list(kind_of(BOX).plan(8.0, 1e-10, method).batches(capacity))
     assert max(len(batch.weights) for batch in batches) <= capacity
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
@@ -40,7 +40,7 @@ def test_batches_are_nearly_equal() -> None:
 
 
 def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
-    batches = kind_of(mesh).plan(8.66, tolerance, Quadrature(method)).batches(1 << 22)
+    batches = kind_of(mesh).plan(8.66, tolerance, method).batches(1 << 22)
     return sum(len(batch.weights) for batch in batches) / len(mesh.triangles)
 
 
@@ -56,7 +56,7 @@ def test_small_triangles_get_few_points() -> None:
 @pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
 @pytest.mark.parametrize("method", ["auto", 7])
 def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
-    plan = kind_of(surface).plan(8.66, 1e-2, Quadrature(method))
+    plan = kind_of(surface).plan(8.66, 1e-2, method)
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
     assert plan.expected_points == pytest.approx(count, rel=0.05)
     assert count <= plan.largest_points
@@ -78,30 +78,25 @@ def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> No
 def test_the_rules_of_a_field_are_chosen_once(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, lattice = icosphere(4), Lattice(5.0, 32)
     calls: list[int] = []
-    choose = RuleAssignment.for_mesh
 
-    def counted(*arguments: Any) -> RuleAssignment:
+    def counted(*arguments: Any) -> tuple[RuleUse, ...]:
         calls.append(1)
-        return choose(*arguments)
+        return assign_rules(*arguments)
 
-    monkeypatch.setattr(RuleAssignment, "for_mesh", counted)
+    monkeypatch.setattr(kinds, "assign_rules", counted)
     # Little memory: the points are counted, then made, and the probe asks for the lowest degree.
     compute_field(mesh, lattice, TransformSettings(), [-2.0], Execution(allowed_bytes=1.2e7))
     assert len(calls) == 1
 
 
-def test_a_plan_holds_two_bytes_for_each_triangle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_holds_four_bytes_for_each_triangle(monkeypatch: pytest.MonkeyPatch) -> None:
     sphere = icosphere(5)
     mesh = Mesh(sphere.vertices * np.where(sphere.vertices[:, 2:] > 0.2, 1.0, 0.02), sphere.triangles)
-    whole = RuleAssignment.for_mesh(mesh, 8.66, 1e-9, Quadrature())
+    whole = assign_rules(mesh, 8.66, 1e-9)
     monkeypatch.setattr(meshes, "_TRIANGLES", 1000)
-    assignment = RuleAssignment.for_mesh(mesh, 8.66, 1e-9, Quadrature())
-    assert assignment.uses == whole.uses
-    assert assignment.codes is not None
-    assert whole.codes is not None
-    assert np.array_equal(assignment.codes, whole.codes)
-    assert len(assignment.uses) > 2
-    assert assignment.codes.nbytes == 2 * len(mesh.triangles)
-    members = [batch.members for batch in assignment.batches()]
-    assert np.array_equal(np.sort(np.concatenate(members)), np.arange(len(mesh.triangles)))
-    assert [len(chosen) for chosen in members] == [use.count for use in assignment.uses]
+    uses = assign_rules(mesh, 8.66, 1e-9)
+    assert [(use.rule, use.splits, *use.members) for use in uses] == [(u.rule, u.splits, *u.members) for u in whole]
+    assert len(uses) > 2
+    members = np.concatenate([use.members for use in uses])
+    assert np.array_equal(np.sort(members), np.arange(len(mesh.triangles)))
+    assert members.nbytes == 4 * len(mesh.triangles)

@@ -12,7 +12,7 @@ import trimesh
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, SizeHistogram
+from sobolev_batch.spectral.quadrature.meshes import quadrature_error, size_classes
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import ErrorTarget, TransformSettings, choose_settings, permits_single
 from sobolev_batch.spectral.transform.transform import transform_block
@@ -71,7 +71,7 @@ def test_forecast_of_the_quadrature_is_near_the_truth_on_fine_meshes() -> None:
         settings = TransformSettings(1e-13, tolerance=tolerance)
         transformed = transform_block(mesh, lattice, lattice.half, settings)
         true = norm(exact.copy(data=transformed.values - exact.values), orders)["norm"].values
-        forecast = SizeHistogram.from_mesh(mesh).quadrature_error(lattice, orders, tolerance)
+        forecast = quadrature_error(size_classes(mesh), lattice, orders, tolerance)
         assert (forecast > 0.5 * true).all()
         assert (forecast < 15 * true).all()
 
@@ -130,4 +130,4 @@ def test_refuses_other_precisions() -> None:
 @pytest.mark.parametrize("method", ["gauss9", 0, 51, True, 2.5, None])
 def test_refuses_other_methods_of_quadrature(method: object) -> None:
     with pytest.raises(InputError, match="quadrature must be"):
-        Quadrature(method)  # type: ignore[arg-type]
+        TransformSettings(quadrature=method)  # type: ignore[arg-type]

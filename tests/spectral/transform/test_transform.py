@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.quadrature.meshes import Quadrature, WeightedPoints
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
@@ -223,7 +223,7 @@ def test_the_papers_quadrature_stays_available() -> None:
     lattice, mesh = Lattice(5.0, 32), icosphere(4)
     paper = fourier_transform(mesh, lattice, 1e-12, quadrature="gauss8")
     assert np.abs(paper - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
-    settings = TransformSettings(1e-6, quadrature=Quadrature("gauss8"))
+    settings = TransformSettings(1e-6, quadrature="gauss8")
     assert transform_block(mesh, lattice, lattice.half, settings).points == 64 * 5120
 
 
