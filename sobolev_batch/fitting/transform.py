@@ -134,7 +134,7 @@ class MeshTransform:
         x, y, z = np.ix_(axis, axis, axis)
         spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
         points = nodes.coordinates
-        plan = backend.evaluation_plan(backend.costs.with_oversampling(spec, points.shape[1]))
+        plan = backend.plan(backend.costs.with_oversampling(spec, points.shape[1]), adjoint=True)
         # setpts keeps references, not copies: the angles live until both functions are evaluated.
         angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
         plan.setpts(*angles)

@@ -11,17 +11,17 @@ import importlib
 import logging
 import math
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Self
 
 import finufft
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import BackendError, InputError, one_line
 
@@ -32,6 +32,12 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 # NumPy's or CuPy's; CuPy has no types.
 Array = Any
 Shape = tuple[int, int, int]
+
+# Points of one NUFFT: two million take 0.3 GB with their strengths and sorting, and make the FFT a small part of
+# the time.
+DEFAULT_BATCH = 1 << 21
+# The widest kernel of FINUFFT and cuFINUFFT: a grid has at least twice as many cells along each axis.
+WIDEST_KERNEL = 16
 
 
 def combine(coefficients: NDArray[np.float64], rows: Array, out: Array | None = None) -> Array:
@@ -85,6 +91,7 @@ class NufftSpec:
         dtype: Type of strengths and modes.
         oversampling: Ratio of the fine grid to the modes along each axis; None for the fastest one.
         threads: Threads on the processor.
+        batch: Largest number of points at a time.
     """
 
     shape: Shape
@@ -92,6 +99,7 @@ class NufftSpec:
     dtype: ComplexDtype = "complex128"
     oversampling: float | None = None
     threads: int = 1
+    batch: int = DEFAULT_BATCH
 
     @property
     def size(self) -> int:
@@ -107,6 +115,24 @@ class NufftSpec:
     def real_dtype(self) -> type[np.float32 | np.float64]:
         """Type of the points' coordinates."""
         return np.float32 if self.dtype == "complex64" else np.float64
+
+
+@dataclass(frozen=True)
+class Workload:
+    """The points to transform.
+
+    Attributes:
+        points: Expected number of points.
+        largest_points: Bound on the number of points, before shared ones are merged.
+        triangles: Number of triangles.
+        fill: Fraction of the lattice's period that the bounding box fills, by volume. At a useful aliasing error it is
+            far less than the usual one.
+    """
+
+    points: float = math.inf
+    largest_points: float = math.inf
+    triangles: int = 0
+    fill: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -160,6 +186,36 @@ class Costs:
         width = math.ceil(-math.log(eps) / (math.pi * math.sqrt(1 - 1 / sigma)))
         return self.spread_nanoseconds + self.spread_cell_nanoseconds * width**3
 
+    def grid_cells(self, spec: NufftSpec, workload: Workload) -> int:
+        """Return the number of cells of the largest fine grid that may be used."""
+        # More points favour more oversampling, never less.
+        spec = self.with_oversampling(spec, min(spec.batch, workload.largest_points))
+        return math.prod(_grid_length(modes, spec.oversampling or 2.0) for modes in spec.shape)
+
+    def projected_bytes(self, spec: NufftSpec, workload: Workload) -> int:
+        """Return an upper estimate of the memory of NUFFTs, without the result and the mesh."""
+        grids = 1 + self.work_grids + (workload.fill if self.copies_grid else 0)
+        samples = self.grid_cells(spec, workload) * grids + spec.size
+        points = min(spec.batch, workload.largest_points) * self.point_bytes
+        triangles = workload.triangles * self.triangle_bytes
+        return math.ceil(samples * spec.item_bytes + points) + triangles + self.fixed_bytes
+
+    def projected_nanoseconds(self, spec: NufftSpec, shape: Shape, workload: Workload) -> float:
+        """Return the predicted time for a block of some shape, whose sub-blocks have the shape of the NUFFTs."""
+        sigma = spec.oversampling or max(self.finest_eps[spec.dtype])
+        blocks = math.prod(math.ceil(whole / step) for whole, step in zip(shape, spec.shape, strict=True))
+        batches = math.ceil(max(workload.points, 1) / spec.batch)
+        each_point = self.point_nanoseconds + blocks * self.spreading_nanoseconds(sigma, spec.eps)
+        cells = self.grid_cells(spec, workload)
+        return workload.points * each_point + batches * blocks * cells * self.fft_cell_nanoseconds
+
+
+@lru_cache(maxsize=1 << 14)
+def _grid_length(modes: int, sigma: float) -> int:
+    """Return the cells of the fine grid along an axis: even, with no prime factor above 5, as FINUFFT takes them."""
+    least = max(math.ceil(sigma * modes), 2 * WIDEST_KERNEL)
+    return 2 * int(next_fast_len(-(-least // 2), real=True))
+
 
 CPU_COSTS = Costs(
     finest_eps={
@@ -197,17 +253,74 @@ GPU_COSTS = Costs(
 
 
 INSTALL = "pip install 'sobolev-batch[gpu]'"
-
 # cuFINUFFT is linked against the first two, and CuPy compiles with the third. cuFINUFFT's wheel neither declares them
 # nor finds them where pip puts them: they must be in the process before it is imported.
 _LIBRARIES = {"cudart": "the CUDA runtime", "cufft": "cuFFT", "nvrtc": "the CUDA compiler NVRTC"}
 # Values of cudaError_t.
 _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
+# Two threads cannot share a plan, and each of two transforms would find half of the memory.
+_DEVICE = threading.RLock()
+
+_log = logging.getLogger(__name__)
+
+
+class Backend:
+    """The processor with FINUFFT; a `Gpu` is another one.
+
+    Attributes:
+        name: "cpu" or "gpu".
+        library: Name of the NUFFT library.
+        costs: Costs of that library.
+    """
+
+    name: ClassVar[Literal["cpu", "gpu"]] = "cpu"
+    library: ClassVar[Literal["finufft", "cufinufft"]] = "finufft"
+    costs: ClassVar[Costs] = CPU_COSTS
+
+    def upload(self, array: Array) -> Array:
+        """Return an array of the host as an array of this backend."""
+        return array
+
+    def download(self, array: Array) -> Array:
+        """Return an array of this backend as an array of the host, once it is computed."""
+        return array
+
+    def plan(self, spec: NufftSpec, *, adjoint: bool = False) -> Any:
+        """Return a plan of the library: its `setpts` takes angles, its `execute` the strengths of the points.
+
+        It is of type 1 with the sign -1; the adjoint is of type 2 with the sign +1 and takes the coefficients of the
+        modes. The modes of an axis of n samples start at -(n // 2). A plan keeps references to angles, not copies.
+
+        Args:
+            spec: Specification with its oversampling set.
+            adjoint: True for the adjoint.
+
+        Raises:
+            RuntimeError: cuFINUFFT failed to make it; it does not say why.
+        """
+        # FINUFFT warns of thread counts and of tolerances, which are checked before.
+        return finufft.Plan(
+            2 if adjoint else 1,
+            spec.shape,
+            eps=spec.eps,
+            isign=1 if adjoint else -1,
+            dtype=spec.dtype,
+            modeord=0,
+            nthreads=spec.threads,
+            upsampfac=spec.oversampling,
+            showwarn=0,
+        )
+
+    def __reduce__(self) -> str | tuple[object, ...]:
+        return "CPU"
+
+
+CPU = Backend()
 
 
 @dataclass(frozen=True, eq=False)
-class Cuda:
-    """The loaded libraries.
+class Gpu(Backend):
+    """The first device that CUDA shows; `gpu_backend` returns it.
 
     Attributes:
         cupy: Module.
@@ -215,45 +328,100 @@ class Cuda:
         runtime: CUDA runtime of cuFINUFFT; CuPy has one of its own.
     """
 
+    name: ClassVar[Literal["cpu", "gpu"]] = "gpu"
+    library: ClassVar[Literal["finufft", "cufinufft"]] = "cufinufft"
+    costs: ClassVar[Costs] = GPU_COSTS
+
     cupy: Any
     cufinufft: Any
     runtime: Any
 
-    def last_error(self) -> int:
-        """Return the last error of cuFINUFFT's runtime, and reset it."""
-        return int(self.runtime.cudaGetLastError())
+    @classmethod
+    def load(cls) -> Self:
+        """Load all libraries and look for a device.
+
+        Raises:
+            BackendError: A library, the driver or the device is missing; the message says what to do.
+        """
+        pathfinder = _module("cuda.pathfinder", "cuda-pathfinder")
+        runtime: Any = None
+        for name, title in _LIBRARIES.items():
+            try:
+                library = pathfinder.load_nvidia_dynamic_lib(name)
+            except RuntimeError as error:  # pathfinder's errors derive from it
+                raise BackendError(
+                    f"no GPU: {title} ({name}) is not installed or cannot be loaded: {INSTALL}"
+                ) from error
+            runtime = runtime or ctypes.CDLL(library.abs_path)
+        cupy = _module("cupy", "CuPy")
+        cufinufft = _module("cufinufft", "cuFINUFFT")
+        _require_device(cupy)
+        return cls(cupy, cufinufft, runtime)
+
+    @property
+    def description(self) -> str:
+        """Name and memory of the device."""
+        properties = self.cupy.cuda.runtime.getDeviceProperties(0)
+        return f"{properties['name'].decode()}, {properties['totalGlobalMem'] / 1e9:.3g} GB"
+
+    @property
+    def free_bytes(self) -> int:
+        """Device memory that a transform may take, including what CuPy keeps of freed arrays."""
+        cupy = self.cupy
+        return int(cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes())
+
+    @contextmanager
+    def work(self) -> Iterator[None]:
+        """Reserve the device for one thread, and select it with its default stream."""
+        with _DEVICE, self.cupy.cuda.Device(0), self.cupy.cuda.Stream.null:
+            yield
+
+    def release_memory(self, projected_bytes: float) -> None:
+        """Give back what CuPy keeps of freed arrays if less is free: cuFINUFFT allocates outside of CuPy's pool."""
+        if self.cupy.cuda.runtime.memGetInfo()[0] < projected_bytes:
+            self.cupy.get_default_memory_pool().free_all_blocks()
 
     def is_out_of_memory(self, error: BaseException) -> bool:
         """Return True if device memory was too little, which cuFINUFFT itself does not report."""
         if isinstance(error, self.cupy.cuda.memory.OutOfMemoryError):
             return True
-        return _OUT_OF_MEMORY in (getattr(error, "status", None), self.last_error())
+        return _OUT_OF_MEMORY in (getattr(error, "status", None), self.runtime.cudaGetLastError())
 
-    def plan(self, *args: Any, **options: Any) -> Any:
-        """Return a plan of cuFINUFFT."""
-        # A plan takes an error that an earlier one left behind for its own.
-        self.last_error()
-        return _plan_class(self.cufinufft)(*args, **options)
+    def upload(self, array: Array) -> Array:
+        """Return a copy in device memory."""
+        return self.cupy.asarray(array)
 
+    def download(self, array: Array) -> Array:
+        """Return a copy on the host, once everything before it is computed."""
+        return self.cupy.asnumpy(array)
 
-def load_cuda() -> Cuda:
-    """Load all libraries and look for a device.
+    def plan(self, spec: NufftSpec, *, adjoint: bool = False) -> Any:
+        """Return a plan of cuFINUFFT with all of its options set; see `Backend.plan`."""
+        # A plan takes an error that an earlier one left behind for its own: asking for it resets it.
+        self.runtime.cudaGetLastError()
+        # The defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac automatic.
+        return _plan_class(self.cufinufft)(
+            2 if adjoint else 1,
+            spec.shape,
+            n_trans=1,
+            eps=spec.eps,
+            isign=1 if adjoint else -1,
+            dtype=spec.dtype,
+            modeord=0,
+            upsampfac=spec.oversampling,
+            gpu_method=0,  # shared memory where the kernel's width leaves room for it, else global memory
+            gpu_sort=1,
+            gpu_kerevalmeth=1,
+            gpu_maxsubprobsize=1024,
+            gpu_maxbatchsize=1,
+            gpu_spreadinterponly=0,
+            gpu_device_id=0,
+            gpu_stream=0,
+            debug=0,
+        )
 
-    Raises:
-        BackendError: A library, the driver or the device is missing; the message says what to do.
-    """
-    pathfinder = _module("cuda.pathfinder", "cuda-pathfinder")
-    runtime: Any = None
-    for name, title in _LIBRARIES.items():
-        try:
-            library = pathfinder.load_nvidia_dynamic_lib(name)
-        except RuntimeError as error:  # pathfinder's errors derive from it
-            raise BackendError(f"no GPU: {title} ({name}) is not installed or cannot be loaded: {INSTALL}") from error
-        runtime = runtime or ctypes.CDLL(library.abs_path)
-    cupy = _module("cupy", "CuPy")
-    cufinufft = _module("cufinufft", "cuFINUFFT")
-    _require_device(cupy)
-    return Cuda(cupy, cufinufft, runtime)
+    def __reduce__(self) -> tuple[object, ...]:
+        return gpu_backend, ()
 
 
 def _module(name: str, title: str) -> ModuleType:
@@ -295,180 +463,6 @@ def _plan_class(cufinufft: Any) -> Any:
     return Plan
 
 
-_log = logging.getLogger(__name__)
-
-# Two threads cannot share a plan, and each of two transforms would find half of the memory.
-_DEVICE = threading.RLock()
-
-
-class NufftPlan(Protocol):
-    """A plan in three dimensions, as finufft and cufinufft make it."""
-
-    def setpts(self, x: Array, y: Array, z: Array) -> None:
-        """Set the angles of the points; the plan keeps references, not copies."""
-
-    def execute(self, data: Array) -> Array:
-        """Transform the strengths of the points (type 1) or the coefficients of the modes (type 2)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Backend(ABC):
-    """A processor or GPU with its NUFFT library.
-
-    Attributes:
-        name: "cpu" or "gpu".
-        library: Name of the NUFFT library.
-        costs: Costs of that library.
-    """
-
-    name: Literal["cpu", "gpu"]
-    library: Literal["finufft", "cufinufft"]
-    costs: Costs
-
-    @abstractmethod
-    def upload(self, array: Array) -> Array:
-        """Return an array of the host as an array of this backend."""
-
-    @abstractmethod
-    def download(self, array: Array) -> Array:
-        """Return an array of this backend as an array of the host, once it is computed."""
-
-    @abstractmethod
-    def plan(self, spec: NufftSpec) -> NufftPlan:
-        """Return a type-1 plan with the sign -1; the modes of an axis of n samples start at -(n // 2).
-
-        Args:
-            spec: Specification with its oversampling set.
-        """
-
-    @abstractmethod
-    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
-        """Return a type-2 plan with the sign +1, the adjoint of `plan`."""
-
-
-class _Cpu(Backend):
-    def upload(self, array: Array) -> Array:
-        return array
-
-    def download(self, array: Array) -> Array:
-        return array
-
-    def plan(self, spec: NufftSpec) -> NufftPlan:
-        return _finufft_plan(1, -1, spec)
-
-    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
-        return _finufft_plan(2, 1, spec)
-
-    def __reduce__(self) -> str:
-        return "CPU"
-
-
-@dataclass(frozen=True, eq=False)
-class Gpu(Backend):
-    """The first device that CUDA shows; `gpu_backend` returns it.
-
-    Attributes:
-        libraries: Libraries that it calls.
-    """
-
-    libraries: Cuda
-
-    @property
-    def description(self) -> str:
-        """Name and memory of the device."""
-        properties = self.libraries.cupy.cuda.runtime.getDeviceProperties(0)
-        return f"{properties['name'].decode()}, {properties['totalGlobalMem'] / 1e9:.3g} GB"
-
-    @property
-    def free_bytes(self) -> int:
-        """Device memory that a transform may take, including what CuPy keeps of freed arrays."""
-        cupy = self.libraries.cupy
-        return int(cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes())
-
-    @contextmanager
-    def work(self) -> Iterator[None]:
-        """Reserve the device for one thread, and select it with its default stream."""
-        cupy = self.libraries.cupy
-        with _DEVICE, cupy.cuda.Device(0), cupy.cuda.Stream.null:
-            yield
-
-    def release_memory(self, projected_bytes: float) -> None:
-        """Give back what CuPy keeps of freed arrays if less is free: cuFINUFFT allocates outside of CuPy's pool."""
-        cupy = self.libraries.cupy
-        if cupy.cuda.runtime.memGetInfo()[0] < projected_bytes:
-            cupy.get_default_memory_pool().free_all_blocks()
-
-    def upload(self, array: Array) -> Array:
-        """Return a copy in device memory."""
-        return self.libraries.cupy.asarray(array)
-
-    def download(self, array: Array) -> Array:
-        """Return a copy on the host, once everything before it is computed."""
-        return self.libraries.cupy.asnumpy(array)
-
-    def plan(self, spec: NufftSpec) -> NufftPlan:
-        """Return a type-1 plan of cuFINUFFT.
-
-        Raises:
-            RuntimeError: cuFINUFFT failed to make it; it does not say why.
-        """
-        return self._cufinufft_plan(1, -1, spec)
-
-    def evaluation_plan(self, spec: NufftSpec) -> NufftPlan:
-        """Return a type-2 plan of cuFINUFFT.
-
-        Raises:
-            RuntimeError: See `plan`.
-        """
-        return self._cufinufft_plan(2, 1, spec)
-
-    def _cufinufft_plan(self, nufft_type: int, sign: int, spec: NufftSpec) -> NufftPlan:
-        """Return a plan of cuFINUFFT with all of its options set."""
-        # The defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac automatic.
-        plan: NufftPlan = self.libraries.plan(
-            nufft_type,
-            spec.shape,
-            n_trans=1,
-            eps=spec.eps,
-            isign=sign,
-            dtype=spec.dtype,
-            modeord=0,
-            upsampfac=spec.oversampling,
-            gpu_method=0,  # shared memory where the kernel's width leaves room for it, else global memory
-            gpu_sort=1,
-            gpu_kerevalmeth=1,
-            gpu_maxsubprobsize=1024,
-            gpu_maxbatchsize=1,
-            gpu_spreadinterponly=0,
-            gpu_device_id=0,
-            gpu_stream=0,
-            debug=0,
-        )
-        return plan
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return gpu_backend, ()
-
-
-CPU: Backend = _Cpu("cpu", "finufft", CPU_COSTS)
-
-
-def _finufft_plan(nufft_type: int, sign: int, spec: NufftSpec) -> NufftPlan:
-    # FINUFFT warns of thread counts and of tolerances, which are checked before.
-    plan: NufftPlan = finufft.Plan(
-        nufft_type,
-        spec.shape,
-        eps=spec.eps,
-        isign=sign,
-        dtype=spec.dtype,
-        modeord=0,
-        nthreads=spec.threads,
-        upsampfac=spec.oversampling,
-        showwarn=0,
-    )
-    return plan
-
-
 @cache
 def gpu_backend() -> Gpu:
     """Return the GPU, once it has passed a trial.
@@ -479,7 +473,7 @@ def gpu_backend() -> Gpu:
     Raises:
         BackendError: No usable GPU; the message says why, and what to do.
     """
-    backend = Gpu("gpu", "cufinufft", GPU_COSTS, load_cuda())
+    backend = Gpu.load()
     try_out(backend)
     return backend
 

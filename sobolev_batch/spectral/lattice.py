@@ -64,16 +64,23 @@ class Block:
             shape[axis] = math.ceil(shape[axis] / math.ceil(shape[axis] / longest))
             if math.prod(shape) <= largest_size:
                 break
-        return tuple(self._blocks((shape[0], shape[1], shape[2])))
+        tiles = self.tiles((shape[0], shape[1], shape[2]))
+        return tuple(
+            Block(tile.start, (x.stop - x.start, y.stop - y.start, z.stop - z.start)) for tile, (x, y, z) in tiles
+        )
 
-    def _blocks(self, shape: tuple[int, int, int]) -> Iterator[Block]:
-        starts = [range(0, total, step) for total, step in zip(self.shape, shape, strict=True)]
-        for offsets in product(*starts):
-            i, j, k = (
-                (first + offset, min(step, total - offset))
-                for first, offset, step, total in zip(self.start, offsets, shape, self.shape, strict=True)
+    def tiles(self, shape: tuple[int, int, int]) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
+        """Yield blocks of one shape that cover this one, each with its slices of an array of this one.
+
+        Those at the high ends may extend beyond it.
+        """
+        for offsets in product(*(range(0, count, step) for count, step in zip(self.shape, shape, strict=True))):
+            i, j, k = (first + offset for first, offset in zip(self.start, offsets, strict=True))
+            x, y, z = (
+                slice(offset, min(offset + step, count))
+                for offset, step, count in zip(offsets, shape, self.shape, strict=True)
             )
-            yield Block((i[0], j[0], k[0]), (i[1], j[1], k[1]))
+            yield Block((i, j, k), shape), (x, y, z)
 
     def place_in(self, whole: Block) -> tuple[slice, slice, slice]:
         """Return the slices of this block in an array of a larger one."""

@@ -317,7 +317,7 @@ def test_says_in_one_line_what_is_missing(
 
     monkeypatch.setattr(backends, "importlib", SimpleNamespace(import_module=import_module))
     with pytest.raises(BackendError, match=message):
-        backends.load_cuda()
+        Gpu.load()
 
 
 # The real libraries, without a device.
@@ -407,13 +407,13 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> Non
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     code = """
 from sobolev_batch.spectral import backends
-from sobolev_batch.spectral.backends import GPU_COSTS, Gpu, NufftSpec
+from sobolev_batch.spectral.backends import Gpu, NufftSpec
 backends._require_device = lambda cupy: None
-backend = Gpu("gpu", "cufinufft", GPU_COSTS, backends.load_cuda())
+backend = Gpu.load()
 try:
     backend.plan(NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
 except RuntimeError as error:
-    print(error, backend.libraries.is_out_of_memory(error))
+    print(error, backend.is_out_of_memory(error))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "Error creating plan. False\n"
@@ -425,9 +425,9 @@ def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
     pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     code = """
 from sobolev_batch import BackendError
-from sobolev_batch.spectral import backends
+from sobolev_batch.spectral.backends import Gpu
 try:
-    backends.load_cuda()
+    Gpu.load()
 except BackendError:
     pass
 from cufinufft._cufinufft import NufftOpts
@@ -471,7 +471,7 @@ def test_a_gpu_agrees_in_parts(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_gpu_out_of_memory_falls_back(gpu: Gpu) -> None:
-    pool = gpu.libraries.cupy.get_default_memory_pool()
+    pool = gpu.cupy.get_default_memory_pool()
     pool.free_all_blocks()
     pool.set_limit(size=1 << 16)
     try:

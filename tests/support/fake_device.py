@@ -19,7 +19,7 @@ import finufft
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sobolev_batch.spectral.backends import GPU_COSTS, Cuda, Gpu
+from sobolev_batch.spectral.backends import Gpu
 
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:
 # with like= NumPy passes on a keyword that CuPy's do not know.
@@ -120,7 +120,7 @@ class Device:
         calls = {"asarray": self.upload, "asnumpy": lambda array: array.host.copy()}
         cupy = SimpleNamespace(cuda=cuda, get_default_memory_pool=lambda: pool, **calls)
         plan = SimpleNamespace(Plan=type("Plan", (_Plan,), {"device": self}))
-        return Gpu("gpu", "cufinufft", GPU_COSTS, Cuda(cupy, plan, SimpleNamespace(cudaGetLastError=self.forget)))
+        return Gpu(cupy, plan, SimpleNamespace(cudaGetLastError=self.forget))
 
 
 def _attribute(name: str) -> Any:

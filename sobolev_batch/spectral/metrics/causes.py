@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.spectral.backends import CPU, ComplexDtype, NufftSpec
+from sobolev_batch.spectral.backends import CPU, ComplexDtype, NufftSpec, Workload
 from sobolev_batch.spectral.fields import (
     BLOCK_SAMPLES,
     OperandLike,
@@ -35,10 +35,9 @@ from sobolev_batch.spectral.metrics.datasets import (
     order_axis,
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_volumes
-from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, thread_count
-from sobolev_batch.spectral.transform.transform import require_points_inside
+from sobolev_batch.spectral.transform.transform import fastest_spec, require_points_inside
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
@@ -343,12 +342,12 @@ def _block_values(
     coefficients = np.empty((len(weights.orders), *block.shape), dtype=settings.dtype)
     for row, weight in zip(coefficients, weights.per_shell, strict=True):
         np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-    batching = Batching(NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads))
+    spec = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads)
     if execution.allowed_bytes is not None:
         count = coordinates.shape[1]
         allowed_bytes = (1 - _BLOCK_FRACTION) * execution.allowed_bytes
-        batching = fastest_batching(batching, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
-    return evaluate_at(coordinates, coefficients, lattice, block, batching)
+        spec = fastest_spec(spec, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
+    return evaluate_at(coordinates, coefficients, lattice, block, spec)
 
 
 def _coordinates(points: ArrayLike) -> Reals:

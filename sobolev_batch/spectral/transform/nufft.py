@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,12 @@ from sobolev_batch.spectral.backends import (
     Backend,
     ComplexDtype,
     Complexes,
-    NufftPlan,
     NufftSpec,
     combine,
     cosine_and_sine,
 )
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
-from sobolev_batch.spectral.transform.memory import Batching, sub_blocks
 
 
 def transform_points(
@@ -44,7 +43,7 @@ def transform_points(
     on an exponential of semicircle kernel" (2019), doi:10.1137/18M120885X.
     """
     scale = 2 * np.pi * lattice.spacing
-    plan: NufftPlan | None = None
+    plan: Any = None
     total: Array | None = None
     count = 0
     for points in batches:
@@ -57,7 +56,7 @@ def transform_points(
         folded = angles - 2 * np.pi * np.rint(angles / (2 * np.pi)) if lattice.tolerates_images else angles
         # setpts keeps references, not copies: the angles live until execute has returned.
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype, like=row) for row in folded))
-        for sub_block, (x, y, z) in sub_blocks(block, spec.shape):
+        for sub_block, (x, y, z) in block.tiles(spec.shape):
             values = plan.execute(
                 _shifted_strengths(points.weights, angles, _first_mode(sub_block, lattice), spec.dtype)
             )
@@ -77,7 +76,7 @@ def transform_points(
 
 
 def evaluate_at(
-    coordinates: NDArray[np.float64], coefficients: Complexes, lattice: Lattice, block: Block, batching: Batching
+    coordinates: NDArray[np.float64], coefficients: Complexes, lattice: Lattice, block: Block, spec: NufftSpec
 ) -> NDArray[np.float64]:
     """Return Re Σ_ξ c(ξ) exp(+2πi ξ·x_j) over the frequencies ξ of a block, by a type-2 nonuniform FFT.
 
@@ -87,7 +86,7 @@ def evaluate_at(
         coefficients: c, complex (m, *block.shape), for m sums over the same frequencies.
         lattice: Lattice of the frequencies.
         block: Block of the coefficients; sums over several blocks add up.
-        batching: NUFFTs to use. Their eps is relative to Σ|c|; the error is a small multiple of it.
+        spec: NUFFT to use, as for `transform_points`. Its eps is relative to Σ|c|; the error is a small multiple of it.
 
     Returns:
         float64 (m, n).
@@ -96,15 +95,15 @@ def evaluate_at(
     """
     count = coordinates.shape[1]
     values = np.zeros((len(coefficients), count))
-    spec = CPU.costs.with_oversampling(batching.spec, count)
-    plan = CPU.evaluation_plan(spec)
+    spec = CPU.costs.with_oversampling(spec, count)
+    plan = CPU.plan(spec, adjoint=True)
     scale = 2 * np.pi * lattice.spacing
-    for first in range(0, count, batching.batch):
-        batch = slice(first, min(first + batching.batch, count))
+    for first in range(0, count, spec.batch):
+        batch = slice(first, min(first + spec.batch, count))
         angles = scale * coordinates[:, batch]
         ones = np.ones(angles.shape[1])
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype) for row in angles))
-        for sub_block, (x, y, z) in sub_blocks(block, spec.shape):
+        for sub_block, (x, y, z) in block.tiles(spec.shape):
             # The conjugates of these phase shifts move the window of modes to the sub-block.
             shifts = _shifted_strengths(ones, angles, _first_mode(sub_block, lattice), spec.dtype)
             for i, whole in enumerate(coefficients):

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.spectral.backends import CPU, Backend, ComplexDtype
+from sobolev_batch.spectral.backends import CPU, DEFAULT_BATCH, Backend, ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.quadrature.meshes import fixed_rule, weight_masses
-from sobolev_batch.spectral.transform.memory import DEFAULT_BATCH
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}

@@ -1,21 +1,35 @@
-"""The Fourier transform of a surface on a block of the lattice, by a closed form or by a NUFFT, and its time."""
+"""The Fourier transform of a surface on a block of the lattice, by a closed form or by a NUFFT; its memory and time."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
+from bisect import bisect_left
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError, one_line
-from sobolev_batch.spectral.backends import CPU, CPU_COSTS, Backend, ComplexDtype, Complexes, Gpu, NufftSpec
+from sobolev_batch.spectral.backends import (
+    CPU,
+    CPU_COSTS,
+    WIDEST_KERNEL,
+    Backend,
+    ComplexDtype,
+    Complexes,
+    Costs,
+    Gpu,
+    NufftSpec,
+    Shape,
+    Workload,
+)
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
-from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
@@ -25,6 +39,8 @@ from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 # computed again instead of being compared with new ones.
 NUMERICS_VERSION = 3
 
+# The smallest batch holds eight node sets of the largest triangle rule.
+_SMALLEST_BATCH = 1 << 12
 # Samples of a closed form at a time: temporaries of the whole block would take several times its size.
 _SAMPLES = 1 << 18
 # The fraction of a GPU's free memory that a transform plans with, and the number of attempts, each with half of it.
@@ -83,7 +99,7 @@ def transform_block(
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
     task = _QuadratureTransform(plan or settings.plan(surface, lattice), lattice, block, settings, execution, fill)
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
-    batching = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
+    spec = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
     failure = ""
     if isinstance(execution.backend, Gpu):
         transformed = task.on_gpu(execution.backend)
@@ -92,7 +108,67 @@ def transform_block(
         library = execution.backend.library
         _log.warning("%s: %s; the processor computes it instead", library, transformed)
         failure = f" after {library}: {transformed}"
-    return task.compute(CPU, batching, failure)
+    return task.compute(CPU, spec, failure)
+
+
+def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_bytes: float) -> NufftSpec:
+    """Return the sub-blocks, batches and oversampling that are predicted to be the fastest within the allowed memory.
+
+    If the whole block fits, nothing is subdivided or prescribed: the values are then those of unlimited memory.
+
+    Args:
+        whole: NUFFT with the shape of the block and the largest allowed batch.
+        workload: Points to transform.
+        costs: Costs of the library.
+        allowed_bytes: Memory that the transform may take, without the result and the mesh.
+
+    Raises:
+        InputError: Nothing fits; the message names the smallest memory that works.
+    """
+
+    def fits(spec: NufftSpec) -> bool:
+        if costs.grid_cells(spec, workload) > costs.largest_grid:
+            return False
+        return costs.projected_bytes(spec, workload) <= allowed_bytes
+
+    if fits(whole):
+        return whole
+    candidates: list[NufftSpec] = []
+    least_bytes = math.inf
+    batches = [whole.batch]
+    while batches[-1] // 2 >= _SMALLEST_BATCH:
+        batches.append(batches[-1] // 2)
+    for batch, sigma in product(batches, costs.oversamplings(whole)):
+        smaller = [
+            replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in sub_shapes(whole.shape, sigma)
+        ]
+        # Ever smaller sub-blocks take ever less memory: the first that fits is the largest.
+        first = bisect_left(smaller, True, key=fits)
+        if first < len(smaller):
+            candidates.append(smaller[first])
+        else:
+            least_bytes = min(least_bytes, costs.projected_bytes(smaller[-1], workload))
+    if not candidates:
+        raise InputError(
+            f"{allowed_bytes / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, whole.shape))} "
+            f"samples: give at least {math.ceil(least_bytes / 1e5) / 10:.4g} MB besides the result and the mesh"
+        )
+    return min(candidates, key=lambda spec: costs.projected_nanoseconds(spec, whole.shape, workload))
+
+
+def sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
+    """Yield shapes of sub-blocks, from the whole block down to where smaller ones save nothing."""
+    counts = [1, 1, 1]
+    lengths = list(shape)
+    while True:
+        yield lengths[0], lengths[1], lengths[2]
+        axis = max(range(3), key=lengths.__getitem__)
+        if lengths[axis] * sigma <= 2 * WIDEST_KERNEL:
+            return
+        before = lengths[axis]
+        while lengths[axis] == before:
+            counts[axis] += 1
+            lengths[axis] = math.ceil(shape[axis] / counts[axis])
 
 
 def projected_bytes(
@@ -110,11 +186,11 @@ def projected_bytes(
         execution: Allowed memory and batch.
         triangles: Number of triangles of the mesh, at some bytes each while its rule is chosen.
     """
-    whole = Batching(NufftSpec(block.shape, settings.eps, settings.dtype), execution.batch)
-    needed: float = whole.projected_bytes(Workload(triangles=triangles), CPU.costs)
+    whole = NufftSpec(block.shape, settings.eps, settings.dtype, batch=execution.batch)
+    needed: float = CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
     if execution.allowed_bytes is not None:
         needed = min(needed, execution.allowed_bytes)
-    return block.size * whole.spec.item_bytes + math.ceil(needed)
+    return block.size * whole.item_bytes + math.ceil(needed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,29 +209,31 @@ class _QuadratureTransform:
     fill: float
 
     @property
-    def whole(self) -> Batching:
-        """Batching without sub-blocks."""
+    def whole(self) -> NufftSpec:
+        """NUFFT of the whole block."""
         settings, execution = self.settings, self.execution
-        spec = NufftSpec(self.block.shape, settings.eps, settings.dtype, threads=execution.threads)
-        return Batching(spec, execution.batch)
+        return NufftSpec(
+            self.block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch
+        )
 
-    def fitting(self, backend: Backend, allowed_bytes: float) -> tuple[Batching, int]:
-        """Return the fastest batching within the allowed memory, and the memory that it takes.
+    def fitting(self, backend: Backend, allowed_bytes: float) -> tuple[NufftSpec, int]:
+        """Return the fastest NUFFTs within the allowed memory, and the memory that they take.
 
         Raises:
             InputError: The memory is too little.
         """
         workload = Workload(triangles=self.plan.triangles, fill=self.fill)
-        if self.whole.projected_bytes(workload, backend.costs) > allowed_bytes:
+        costs = backend.costs
+        if costs.projected_bytes(self.whole, workload) > allowed_bytes:
             # Only now do the points need counting.
             workload = replace(workload, points=self.plan.expected_points, largest_points=self.plan.largest_points)
-        batching = fastest_batching(self.whole, workload, backend.costs, allowed_bytes)
-        return batching, batching.projected_bytes(workload, backend.costs)
+        spec = fastest_spec(self.whole, workload, costs, allowed_bytes)
+        return spec, costs.projected_bytes(spec, workload)
 
-    def compute(self, backend: Backend, batching: Batching, failure: str = "") -> Transformed:
+    def compute(self, backend: Backend, spec: NufftSpec, failure: str = "") -> Transformed:
         """Return the transform, computed by one backend."""
-        batches = self.plan.batches(batching.batch, backend)
-        values, points = transform_points(batches, self.lattice, self.block, batching.spec, backend)
+        batches = self.plan.batches(spec.batch, backend)
+        values, points = transform_points(batches, self.lattice, self.block, spec, backend)
         return Transformed(backend.download(values), points, backend.library + failure)
 
     def on_gpu(self, gpu: Gpu) -> Transformed | str:
@@ -163,23 +241,23 @@ class _QuadratureTransform:
         try:
             with gpu.work():
                 return self._attempts_on(gpu)
-        except InputError:  # no batching is small enough
+        except InputError:  # nothing is small enough
             return _OUT_OF_MEMORY
         except Exception as error:
             return one_line(error)[:200]
 
     def _attempts_on(self, gpu: Gpu) -> Transformed | str:
         """Compute on a GPU; if memory is too little after all, try again with half as much."""
-        allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - self.block.size * self.whole.spec.item_bytes
+        allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - self.block.size * self.whole.item_bytes
         for _ in range(_ATTEMPTS):
-            batching, projected = self.fitting(gpu, allowed_bytes)
+            spec, projected = self.fitting(gpu, allowed_bytes)
             gpu.release_memory(projected)
             try:
-                return self.compute(gpu, batching)
+                return self.compute(gpu, spec)
             except Exception as error:
                 # cuFINUFFT says of a failure only where it happened, and nothing if cuFFT ran out of memory.
                 unexplained = type(error) is RuntimeError and projected > allowed_bytes / 2
-                if not (gpu.libraries.is_out_of_memory(error) or unexplained):
+                if not (gpu.is_out_of_memory(error) or unexplained):
                     raise
             allowed_bytes = min(allowed_bytes, projected) / 2
             _log.warning("%s: %s; trying again with %.3g MB", gpu.library, _OUT_OF_MEMORY, allowed_bytes / 1e6)
@@ -244,7 +322,7 @@ def field_seconds(triangles: int, area: float, lattice: Lattice, settings: Trans
     """
     spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
     workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
-    return _NANO * Batching(spec).projected_nanoseconds(spec.shape, workload, CPU_COSTS)
+    return _NANO * CPU_COSTS.projected_nanoseconds(spec, spec.shape, workload)
 
 
 @lru_cache(maxsize=4)

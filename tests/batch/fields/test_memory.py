@@ -7,11 +7,10 @@ import pytest
 from sobolev_batch import ClusterError, Lattice
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.compute import size_tasks
-from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec
+from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.memory import Batching, Workload, fastest_batching
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.spectral.transform.transform import projected_bytes
+from sobolev_batch.spectral.transform.transform import fastest_spec, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
@@ -51,7 +50,7 @@ def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() 
 def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
     sizes = size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers_with(5, threads=threads), rows=1)
     workload = Workload(triangles * 3, triangles * 12, triangles)
-    fastest_batching(Batching(NufftSpec(blocks[0].shape, 1e-9)), workload, CPU_COSTS, sizes.allowed_bytes)
+    fastest_spec(NufftSpec(blocks[0].shape, 1e-9), workload, CPU_COSTS, sizes.allowed_bytes)
     assert sizes.projected_bytes <= 5e9
 
 

@@ -26,7 +26,6 @@ from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
-from sobolev_batch.spectral.transform.memory import Batching
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -91,11 +90,8 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     block = Block((-3, 1, 2), (5, 4, 4))
     coefficients = np.random.default_rng(4).standard_normal((2, *block.shape)) + 1j
     one, many = (
-        evaluate_at(points.T, coefficients, LATTICE, block, batching)
-        for batching in (
-            Batching(NufftSpec(block.shape, 1e-13)),
-            Batching(NufftSpec((2, 3, 3), 1e-13, oversampling=2.0), 7),
-        )
+        evaluate_at(points.T, coefficients, LATTICE, block, spec)
+        for spec in (NufftSpec(block.shape, 1e-13), NufftSpec((2, 3, 3), 1e-13, oversampling=2.0, batch=7))
     )
     assert many == pytest.approx(one, rel=0, abs=1e-11 * np.abs(one).max())
 
@@ -106,7 +102,7 @@ def test_evaluation_is_the_adjoint_of_the_transform() -> None:
     points, weights = rng.uniform(-1, 1, (3, 40)), rng.standard_normal(40)
     coefficients = rng.standard_normal((1, *block.shape)) + 1j * rng.standard_normal((1, *block.shape))
     transformed, _ = transform_points([WeightedPoints(points, weights)], LATTICE, block, NufftSpec(block.shape, 1e-13))
-    (values,) = evaluate_at(points, coefficients, LATTICE, block, Batching(NufftSpec(block.shape, 1e-13)))
+    (values,) = evaluate_at(points, coefficients, LATTICE, block, NufftSpec(block.shape, 1e-13))
     assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
 
 

@@ -8,9 +8,9 @@ from math import prod
 import numpy as np
 import pytest
 
-from sobolev_batch.spectral.backends import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
+from sobolev_batch.spectral.backends import CPU_COSTS, GPU_COSTS, Costs, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.memory import Batching, Workload, _sub_shapes, fastest_batching, sub_blocks
+from sobolev_batch.spectral.transform.transform import fastest_spec, sub_shapes
 
 
 @pytest.mark.parametrize("shape", [(65, 65, 33), (129, 129, 65), (17, 90, 3), (5, 4, 2)])
@@ -18,33 +18,32 @@ from sobolev_batch.spectral.transform.memory import Batching, Workload, _sub_sha
 @pytest.mark.parametrize("costs", [CPU_COSTS, GPU_COSTS], ids=["cpu", "gpu"])
 def test_smaller_sub_blocks_never_take_more(shape: tuple[int, int, int], sigma: float, costs: Costs) -> None:
     workload = Workload(1e6, 1e6)
-    specs = [NufftSpec(sub_shape, 1e-6, oversampling=sigma) for sub_shape in _sub_shapes(shape, sigma)]
-    projected = [Batching(spec).projected_bytes(workload, costs) for spec in specs]
+    specs = [NufftSpec(sub_shape, 1e-6, oversampling=sigma) for sub_shape in sub_shapes(shape, sigma)]
+    projected = [costs.projected_bytes(spec, workload) for spec in specs]
     assert projected == sorted(projected, reverse=True)
 
 
 @pytest.mark.parametrize("allowed_bytes", [2.2e7, 4e7, 8e7, 1.2e8])
 def test_it_is_the_fastest_of_all_that_fit(allowed_bytes: float) -> None:
-    whole, workload = Batching(NufftSpec((129, 129, 65), 1e-6)), Workload(3e5, 6e5, 100_000)
-    found = fastest_batching(whole, workload, CPU_COSTS, allowed_bytes)
-    assert found.projected_bytes(workload, CPU_COSTS) <= allowed_bytes
-    shape = whole.spec.shape
+    whole, workload, costs = NufftSpec((129, 129, 65), 1e-6), Workload(3e5, 6e5, 100_000), CPU_COSTS
+    found = fastest_spec(whole, workload, costs, allowed_bytes)
+    assert costs.projected_bytes(found, workload) <= allowed_bytes
     others = [
-        Batching(replace(whole.spec, shape=sub_shape, oversampling=sigma), whole.batch >> halvings)
-        for sigma in CPU_COSTS.oversamplings(whole.spec)
-        for sub_shape in _sub_shapes(shape, sigma)
+        replace(whole, shape=shape, oversampling=sigma, batch=whole.batch >> halvings)
+        for sigma in costs.oversamplings(whole)
+        for shape in sub_shapes(whole.shape, sigma)
         for halvings in range(10)
     ]
-    fitting = [other for other in others if other.projected_bytes(workload, CPU_COSTS) <= allowed_bytes]
-    fastest = min(other.projected_nanoseconds(shape, workload, CPU_COSTS) for other in fitting)
+    fitting = [other for other in others if costs.projected_bytes(other, workload) <= allowed_bytes]
+    fastest = min(costs.projected_nanoseconds(other, whole.shape, workload) for other in fitting)
     assert found != whole
-    assert found.projected_nanoseconds(shape, workload, CPU_COSTS) <= 1.05 * fastest
+    assert costs.projected_nanoseconds(found, whole.shape, workload) <= 1.05 * fastest
 
 
 def test_sub_blocks_cover_the_block_once() -> None:
     block = Block((-3, 1, 2), (5, 4, 4))
     covered = np.zeros(block.shape, dtype=int)
-    for sub_block, (x, y, z) in sub_blocks(block, (2, 3, 3)):
+    for sub_block, (x, y, z) in block.tiles((2, 3, 3)):
         assert prod(sub_block.shape) == 18
         assert sub_block.start == (block.start[0] + x.start, block.start[1] + y.start, block.start[2] + z.start)
         covered[x, y, z] += 1
