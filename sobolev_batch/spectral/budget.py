@@ -125,10 +125,7 @@ class NormEstimate:
 
 
 def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:
-    """Return values over norms, and bounds on the errors, from both with their errors.
-
-    The bound is NaN where a norm is not larger than its error.
-    """
+    """Return values over norms, and bounds on the errors, from both with their errors; NaN up to a norm's own error."""
     (value, error), (norm, norm_error) = values, norms
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = value / norm
@@ -159,13 +156,9 @@ def outer_windows(weights: SobolevWeights) -> Reals:
 
 
 def estimate_norms(sums: Sums, weights: SobolevWeights, support: Support, discretisation: Reals) -> NormEstimate:
-    """Return norms with their errors from the sums of fields or of their differences.
+    """Return norms from the sums of fields or of differences, and from the norms of their own errors (orders, ...).
 
-    Args:
-        sums: Sums of the fields or differences.
-        weights: Weights of the sums.
-        support: Sizes of the surfaces.
-        discretisation: Norms of the fields' errors (orders, ...), those of both fields added.
+    The errors of both fields of a difference are added.
     """
     totals: Reals = np.maximum(sums.totals, 0.0)
     values = np.sqrt(totals)
@@ -223,16 +216,11 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
 
 
 def area_bound(area: float, order: float, highest: float) -> float:
-    """Return what no squared norm beyond a frequency exceeds, whatever the surfaces are.
+    """Return what no squared norm beyond a frequency exceeds, whatever the surfaces of an area together are.
 
     The energy on |ξ| = r is twice the area on average, and twice that where layers reinforce each other. If surfaces
     repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just beyond. Besides, no
     value of the transform is larger than the area.
-
-    Args:
-        area: Area of all surfaces together, in squared units of length.
-        order: Order s.
-        highest: The frequency, in cycles per unit length.
     """
     factor, power = min(area_bounds(area, order), key=lambda bound: bound[0] * highest ** -bound[1])
     return float(factor * highest**-power)
@@ -267,13 +255,7 @@ def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
 
 
 def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
-    """Return the size of images at the period over that of images at half the period, which even indices alone bring.
-
-    Args:
-        spacing: Spacing h of the lattice, in cycles per unit length.
-        order: Order s.
-        widths: See `image_weight`.
-    """
+    """Return the size of images at the period over that at half of it, which even indices alone bring."""
     (_, _, halves) = _SUBLATTICES[-1]
     return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, halves)
 
@@ -285,7 +267,7 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
         spacing: Spacing h of the lattice, in cycles per unit length.
         order: Order s.
         widths: Widths of the surfaces along `DIRECTIONS` (13,), in units of length.
-        images: Periods n, (..., 3); by default all that differ by one period or none along each axis.
+        images: Periods n, (..., 3).
     """
     # The least distance of S to S + v is at least v·u - width(u), for every direction u.
     offsets = np.abs(images @ DIRECTIONS.T) / spacing
@@ -325,16 +307,9 @@ class ReferenceEstimate:
     def on_lattice(
         cls, products: Sums, distances: NormEstimate, norms: NormEstimate, weights: SobolevWeights, widths: Reals
     ) -> Self:
-        """Return the estimate where the surfaces are known on a lattice alone.
+        """Return the estimate where the surfaces are known on a lattice alone, from the sums of <a - b, b>.
 
-        Beyond the lattice a product is at most the product of both norms there.
-
-        Args:
-            products: Sums of the products of the difference with the reference.
-            distances: Distances ||a - b|| on the lattice.
-            norms: Norms of the reference on the lattice.
-            weights: Weights of the sums.
-            widths: Widths of all surfaces, see `Support`.
+        Beyond the lattice a product is at most the product of the norms of both factors there.
         """
         beyond = np.prod([(one.values + one.truncation) ** 2 - one.values**2 for one in (distances, norms)], axis=0)
         errors = np.sqrt(beyond) + aliased(products, weights, widths)

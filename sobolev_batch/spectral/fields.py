@@ -61,12 +61,12 @@ class TailQuality:
     difference: Remainder | None = None
 
     def to_table(self) -> dict[str, Any]:
-        """Return the quality as a table, from which `from_table` makes it again."""
+        """Return the quality as a table."""
         return asdict(self)
 
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> Self:
-        """Return the quality that a table holds."""
+        """Return the quality that a table of `to_table` holds."""
         own, difference = (part and Remainder.from_table(part) for part in (table["own"], table["difference"]))
         return cls(tuple(table["radii"]), tuple(table["squares"]), own, difference)
 
@@ -207,15 +207,14 @@ def compute_field(
     *,
     sample: Sample | None = None,
 ) -> Field:
-    """Return the field of a surface by given settings, with its probe.
+    """Return the field of a surface by given settings, with its probe for some orders.
 
     Args:
         surface: Surface in units of length.
         lattice: Lattice of the field.
         settings: Accuracy and dtype.
         orders: Sobolev orders that the field is probed for.
-        execution: Backend, threads and memory of the transform; the exact values of the probe are always computed on
-            the processor.
+        execution: Means of the transform; the exact values of the probe are always computed on the processor.
         sample: Sample of the surface, drawn for these orders and `USUAL_DEGREE`, if there is one.
 
     Raises:
@@ -232,7 +231,7 @@ def compute_field(
         probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
-        probe = probe_block(surface, lattice, settings, orders, block, values, draws)
+        probe = probe_block(surface, lattice, settings, block, values, draws)
     return Field(values, Quality.from_surface(surface, probe), settings, transformed.points, transformed.backend)
 
 
@@ -245,18 +244,10 @@ def field_for(
     *,
     sample: Sample | None = None,
 ) -> Field:
-    """Return the field of a surface with an error within a target, by the estimate of its probe.
+    """Return the field of a surface with an error within a target, by the estimate of its probe; see `compute_field`.
 
-    Args:
-        surface: Surface in units of length.
-        lattice: Lattice of the field.
-        target: Largest error of the field.
-        settings: Settings whose dtype and quadrature are kept.
-        execution: See `compute_field`.
-        sample: See `compute_field`.
-
-    Returns:
-        The first of a few attempts that meets the target, or the last.
+    It is the first of a few attempts that meets the target, or the last. The dtype and quadrature of the settings
+    are kept.
     """
     if kind_of(surface).is_closed_form:
         return compute_field(surface, lattice, settings, target.orders, sample=sample)
@@ -305,11 +296,7 @@ def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -
 
 
 def field_values(field: xr.DataArray) -> Complexes:
-    """Return all samples of a field, complex128 on the half lattice.
-
-    Raises:
-        InputError: Some are not finite.
-    """
+    """Return all samples of a field, complex128 on the half lattice; refuse any that is not finite."""
     values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
     if not np.isfinite(values).all():
         raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")

@@ -82,14 +82,6 @@ class Block:
             )
             yield Block((i, j, k), shape), (x, y, z)
 
-    def place_in(self, whole: Block) -> tuple[slice, slice, slice]:
-        """Return the slices of this block in an array of a larger one."""
-        x, y, z = (
-            slice(start - first, start - first + count)
-            for first, start, count in zip(whole.start, self.start, self.shape, strict=True)
-        )
-        return x, y, z
-
 
 class FrequencyLattice(ABC):
     """Equally spaced frequencies along three orthogonal axes.
@@ -147,7 +139,9 @@ class FrequencyLattice(ABC):
 
     def place(self, block: Block) -> tuple[slice, slice, slice]:
         """Return the slices of a block in an array of the whole lattice."""
-        return block.place_in(self.half)
+        starts = zip(self.half.start, block.start, block.shape, strict=True)
+        x, y, z = (slice(start - first, start - first + count) for first, start, count in starts)
+        return x, y, z
 
 
 @dataclass(frozen=True)

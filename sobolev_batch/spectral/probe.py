@@ -94,10 +94,7 @@ def norms_of_draws(parts: Reals) -> Reals:
 def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
     """Return norms of an error (orders,) from checks at some |ξ| (P,), raised.
 
-    Args:
-        radii: |ξ| of each check.
-        squares: Contribution of each check to the squared norm, without the weight of an order.
-        orders: Orders s.
+    Their contributions to the squared norm come without the weight of an order.
     """
     weights = np.array([(1 + radii**2) ** order for order in orders])
     return norms_of_draws(weights * squares)
@@ -109,17 +106,11 @@ def draw_count(terms: int) -> int:
 
 
 def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, seed: int) -> Draws:
-    """Draw random frequencies where the error of a rule of some degree weighs most.
+    """Draw P random frequencies of a lattice where the error of a rule of some degree weighs most.
 
     Half of them follow weight · |ξ|^(2(degree+1)), as the error of the triangle rule does, and half
     follow the weight alone, as the error of the NUFFT does. The weights of all orders are mixed evenly.
-
-    Args:
-        lattice: Lattice to draw from.
-        orders: Orders s.
-        degree: Degree of the lowest rule in use.
-        count: Number P of draws.
-        seed: Seed of the generator. The same seed gives the same draws.
+    The same seed gives the same draws.
     """
     rng = np.random.default_rng(seed)
     chances = _shell_chances(lattice, tuple(orders), degree)
@@ -196,13 +187,9 @@ class Sample:
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
-    """Draw the frequencies to probe fields at; the same surfaces get the same ones.
+    """Draw the frequencies to probe fields of surfaces at, by the lowest degree of their triangle rules.
 
-    Args:
-        surfaces: Surfaces of the fields.
-        lattice: Lattice of the fields.
-        orders: Orders s.
-        degree: Lowest degree of the triangle rules in use.
+    The same surfaces get the same ones.
     """
     terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
@@ -213,20 +200,17 @@ def probe_block(
     surface: Surface,
     lattice: Lattice,
     settings: TransformSettings,
-    orders: Sequence[float],
     block: Block,
     values: Complexes,
-    draws: Draws | None = None,
+    draws: Draws,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
-    Closed forms in double precision are exact and have an empty probe. The exact values of a parametrised
-    surface come from twice its nodes. Its probe therefore also holds the change that the last doubling made.
+    The exact values of a parametrised surface come from twice its nodes. Its probe therefore also holds the change
+    that the last doubling made, once for the whole field.
     """
     if not needs_probe(surface, settings):
         return Probe()
-    if draws is None:
-        draws = draws_for([surface], lattice, orders, settings.plan(surface, lattice).lowest_degree)
     draws = draws.within(block)
     probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws).exact)
     change = settings.plan(surface, lattice).change
@@ -237,17 +221,15 @@ def probe_block(
 
 
 def needs_probe(surface: Surface, settings: TransformSettings) -> bool:
-    """Tell whether a field computed with these settings can differ noticeably from the exact transform."""
+    """Tell whether a field computed with these settings can differ noticeably from the exact transform.
+
+    Closed forms in double precision are exact.
+    """
     return not kind_of(surface).is_closed_form or settings.dtype == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:
-    """Estimate the norm of a surface, or the distance of two, without bias from samples (orders,).
-
-    Args:
-        samples: One or two samples of the same draws.
-        orders: Orders s.
-    """
+    """Estimate the norm of a surface, or the distance of two, without bias from samples of the same draws (orders,)."""
     draws = samples[0].draws
     difference = samples[0].exact - (samples[1].exact if len(samples) > 1 else 0.0)
     squares = draws.scales * np.abs(difference) ** 2

@@ -86,12 +86,7 @@ def check_orders(order: Orders) -> tuple[float, ...]:
 
 
 def single_order(order: float) -> float:
-    """Return an order as a float.
-
-    Raises:
-        OrderError: It does not lie between -100 and -1/2.
-        InputError: There are several.
-    """
+    """Return one order as a float, as `check_orders` does; several are an InputError."""
     orders = check_orders(order)
     if len(orders) > 1:
         raise InputError(f"one order is needed, found {len(orders)}")

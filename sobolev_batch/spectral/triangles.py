@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -317,56 +316,43 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     if others.size:
         with ThreadPoolExecutor(threads) as pool:
             for _, batch in mesh.batches(_SAMPLED_PAIRS):
-                others += np.concatenate(list(pool.map(partial(_plain_sums, _Triangles.from_mesh(batch)), parts)))
+                others += np.concatenate(list(pool.map(partial(_plain_sums, *_face_arrays(batch)), parts)))
     values[~fine] = others
     return values
 
 
-@dataclass(frozen=True, eq=False)
-class _Triangles:
-    """Triangles of a batch in arrays of one row per axis or corner.
-
-    Attributes:
-        vertices: Coordinates, float64 (3, n).
-        corners: Indices of the first, second and third corners, (3, m).
-        doubled: Twice the areas (m,).
-        before: Edges from the first corners to the second ones, float64 (3, m).
-        after: Edges from the second corners to the third ones, float64 (3, m).
-    """
-
-    vertices: Reals
-    corners: NDArray[np.int64]
-    doubled: Reals
-    before: Reals
-    after: Reals
-
-    @classmethod
-    def from_mesh(cls, mesh: Mesh) -> _Triangles:
-        corners = np.ascontiguousarray(mesh.triangles.T)
-        a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
-        return cls(np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), b - a, c - b)
+def _face_arrays(mesh: Mesh) -> tuple[Reals, NDArray[np.int64], Reals, tuple[Reals, Reals]]:
+    """Return vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (3, m) each."""
+    corners = np.ascontiguousarray(mesh.triangles.T)
+    a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
+    return np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), (b - a, c - b)
 
 
-def _plain_sums(triangles: _Triangles, frequencies: Reals) -> Complexes:
-    step = max(1, _SAMPLED_PAIRS // len(triangles.doubled))
+def _plain_sums(
+    vertices: Reals, corners: NDArray[np.int64], doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
+) -> Complexes:
+    """Return the transform (P,) from the `_face_arrays` of a mesh, a few frequencies at a time."""
+    step = max(1, _SAMPLED_PAIRS // len(doubled))
     groups = [frequencies[first : first + step] for first in range(0, len(frequencies), step)]
-    return np.concatenate([_group_sums(triangles, group) for group in groups] or [np.empty(0, complex)])
+    sums = [_group_sums(vertices, corners, doubled, edges, group) for group in groups]
+    return np.concatenate(sums or [np.empty(0, complex)])
 
 
-def _group_sums(triangles: _Triangles, frequencies: Reals) -> Complexes:
-    """Return the transform (P,) at a few frequencies."""
+def _group_sums(
+    vertices: Reals, corners: NDArray[np.int64], doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
+) -> Complexes:
     directions = -2 * np.pi * frequencies
-    phases = directions @ triangles.vertices
+    phases = directions @ vertices
     # Of one edge, of the next, and of both.
-    first, second = directions @ triangles.before, directions @ triangles.after
+    first, second = directions @ edges[0], directions @ edges[1]
     both = first + second
     product = first * second
     product *= both
     close = np.abs(product) < _LEAST_PRODUCT
     product[close] = np.inf
-    factors = triangles.doubled / product
+    factors = doubled / product
     # The divided difference is (e_a g_bc + e_b g_ca + e_c g_ab) / (g_ab g_bc g_ca); the gaps g add up to zero.
-    a, b, c = triangles.corners
+    a, b, c = corners
     parts = []
     for values in cosine_and_sine(phases):
         middle = np.take(values, b, axis=1)
@@ -382,6 +368,6 @@ def _group_sums(triangles: _Triangles, frequencies: Reals) -> Complexes:
     gaps = first[rows, columns], both[rows, columns]
     means = phases[rows, b[columns]] + (gaps[1] - 2 * gaps[0]) / 3
     cosines, sines = cosine_and_sine(means)
-    terms = triangles.doubled[columns] * (cosines + 1j * sines) * second_difference(*gaps)
+    terms = doubled[columns] * (cosines + 1j * sines) * second_difference(*gaps)
     sums += np.bincount(rows, terms.real, len(sums)) + 1j * np.bincount(rows, terms.imag, len(sums))
     return np.asarray(sums)

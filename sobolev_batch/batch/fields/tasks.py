@@ -255,15 +255,15 @@ def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
 
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
     """Compute and store some of several blocks."""
-    lattice, orders, execution = job.lattice, job.orders, job.execution
+    lattice, execution = job.lattice, job.execution
     transform = job.transform_settings(surface)
     plan = transform.plan(surface, lattice)
-    draws = draws_for([surface], lattice, orders, plan.lowest_degree)
+    draws = draws_for([surface], lattice, job.orders, plan.lowest_degree)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, plan)
         checksums.append(job.store.write_field(job.index, lattice.place(block), result.values))
-        probes.append(probe_block(surface, lattice, transform, orders, block, result.values, draws))
+        probes.append(probe_block(surface, lattice, transform, block, result.values, draws))
         backends.append(result.backend)
         points = result.points
     quality = Quality.from_surface(surface, join(probes))

@@ -106,13 +106,7 @@ def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
 
 
 def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Return values over the dimension `order`, or without dimensions for a single order.
-
-    Args:
-        order: Order or orders, as the user gave them.
-        values: Variables by name, (orders,) each.
-        attributes: Attributes of the dataset besides the kernel.
-    """
+    """Return values (orders,) by name over the dimension `order`, or without dimensions for a single order."""
     axis = order_axis(order)
     variables = {name: (axis[0], np.asarray(value).reshape(axis[1].shape)) for name, value in values.items()}
     return describe(xr.Dataset(variables, coords={"order": axis}, attrs={"kernel": KERNEL, **attributes}))

@@ -7,7 +7,7 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -102,11 +102,11 @@ def norm(
     _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if spheres := _spheres(a, lattice=lattice):
         values = np.array([sphere_norm(spheres[0], s) for s in orders])
-        return _dataset("norm", order, _closed_form(values, values**2))
+        return labelled(order, _closed_form(values, values**2).named("norm"), {})
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)
     estimate = _estimate(weights, shells_of(field, None, weights.lattice), [field])
-    return _dataset("norm", order, estimate, lattice_attributes(weights.lattice, field))
+    return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
 
 
 def inner_product(
@@ -264,7 +264,7 @@ def to_accuracy(
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     reference = None
     if name == "norm":
-        dataset = _dataset(name, order, solution.estimate, attributes)
+        dataset = labelled(order, solution.estimate.named(name), attributes)
     else:
         reference = Reference.for_problem(problem, solution, seed) if problem.surfaces else None
         estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate()
@@ -338,9 +338,3 @@ def _closed_form(values: Reals, squares: Reals) -> NormEstimate:
     zeros = np.zeros_like(values)
     rounding = _CLOSED_FORM_ACCURACY * squares
     return NormEstimate(values, zeros, zeros, np.sqrt(values**2 + rounding) - values + rounding**0.5 * (values == 0))
-
-
-def _dataset(
-    name: str, order: Orders, estimate: NormEstimate, attributes: Mapping[str, object] | None = None
-) -> xr.Dataset:
-    return labelled(order, estimate.named(name), attributes or {})

@@ -100,57 +100,39 @@ def yardsticks(
         values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
         target = ErrorTarget(orders, tuple(values_errors.tolist()))
         if solved is not None:
-            reference = _Reference(solved.frequencies, solved.values, cast(Mesh, solved.pair[1]), target)
+            b, frequencies, values = cast(Mesh, solved.pair[1]), solved.frequencies, solved.values
         else:
             # Without an accuracy there is one.
             frequencies = Frequencies(cast(Lattice, lattice), (), orders, support_of([a, b]).widths)
-            reference = _Reference(frequencies, frequencies.values(b, target, _execution()), b, target)
-        curves = reference.curves(float(relative.min()), seed)
+            values = frequencies.values(b, target, _execution())
+        curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
             for kind, curve in curves.items():
                 columns[kind][i], columns[f"{kind}_error"][i] = curve.equivalent(i, distances[i], errors[i])
     return found.assign(labelled(order, columns, {}).data_vars)
 
 
-@dataclass(frozen=True, eq=False)
-class _Reference:
-    """The reference, and what the distances of changed ones to it are computed with.
+def _curves(
+    mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
+) -> dict[str, _Curve]:
+    """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
 
-    Attributes:
-        frequencies: Frequencies of all values.
-        values: Values of the reference.
-        mesh: The reference.
-        target: Largest error of the values of changed meshes.
-    """
+    def apart(changed: Mesh) -> Reals:
+        others = frequencies.values(changed, target, _execution())
+        return frequencies.norms([others, values], [changed, mesh], [1, -1]).values
 
-    frequencies: Frequencies
-    values: SurfaceValues
-    mesh: Mesh
-    target: ErrorTarget
-
-    def distances(self, changed: Mesh) -> Reals:
-        """Return the distances of a changed reference to the reference (orders,)."""
-        values = self.frequencies.values(changed, self.target, _execution())
-        return self.frequencies.norms([values, self.values], [changed, self.mesh], [1, -1]).values
-
-    def curves(self, relative: float, seed: int) -> dict[str, _Curve]:
-        """Return the distance by the amount of each change, for relative distances that begin with one."""
-        _, radius = self.mesh.bounding_sphere
-        bounds, count = (_LEAST, _MOST), len(self.mesh.triangles)
-        return {
-            "moved": _Curve(
-                lambda amount: self.frequencies.moved(self.values, self.mesh, amount * radius), relative, bounds, 1.0
-            ),
-            "noise": _Curve(
-                lambda amount: self.distances(with_noise(self.mesh, amount * radius, seed)), relative, bounds, 1.0
-            ),
-            "decimated": _Curve(
-                lambda amount: self.distances(decimated(self.mesh, round(amount))),
-                max(count // 4, _FEWEST_TRIANGLES),
-                (_FEWEST_TRIANGLES, max(count - 1, _FEWEST_TRIANGLES)),
-                -1.0,
-            ),
-        }
+    _, radius = mesh.bounding_sphere
+    bounds, count = (_LEAST, _MOST), len(mesh.triangles)
+    return {
+        "moved": _Curve(lambda amount: frequencies.moved(values, mesh, amount * radius), start, bounds, 1.0),
+        "noise": _Curve(lambda amount: apart(with_noise(mesh, amount * radius, seed)), start, bounds, 1.0),
+        "decimated": _Curve(
+            lambda amount: apart(decimated(mesh, round(amount))),
+            max(count // 4, _FEWEST_TRIANGLES),
+            (_FEWEST_TRIANGLES, max(count - 1, _FEWEST_TRIANGLES)),
+            -1.0,
+        ),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +172,7 @@ class _Curve:
             if abs(gaps[nearest]) <= _CLOSENESS:
                 break
             step = math.exp(min(max(-gaps[nearest] / power, -_LARGEST_STEP), _LARGEST_STEP))
-            following = self._allowed(nearest * step)
+            following = min(max(nearest * step, self.bounds[0]), self.bounds[1])
             if following in gaps:
                 break
             amount = following
@@ -207,9 +189,6 @@ class _Curve:
             if power / self.slope > _LEAST_POWER:
                 return power
         return self.slope
-
-    def _allowed(self, amount: float) -> float:
-        return min(max(amount, self.bounds[0]), self.bounds[1])
 
 
 def _execution() -> Execution:

@@ -107,11 +107,9 @@ class SurfaceKind(ABC):
 
     @abstractmethod
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
-        """Yield the points in batches, which are nearly equal for a mesh.
+        """Yield the points in batches of at most a number, which are nearly equal for a mesh.
 
-        Args:
-            capacity: Largest number of points of a batch; at least 8 times that of the largest rule (3,624).
-            backend: Backend to make the points on.
+        The number is at least 8 times that of the largest rule (3,624).
 
         Raises:
             InputError: A parametrised surface whose quadrature does not converge.

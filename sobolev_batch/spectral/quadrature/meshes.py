@@ -168,11 +168,9 @@ def assign_rules(
 
 
 def choose_rules(sizes: Reals, ranges: Reals) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return how often to halve the edges of triangles of sizes 2π|ξ|ρ, and the index of the rule that follows.
+    """Return how often to halve the edges of triangles, and the index of the rule that follows; see `rule_ranges`.
 
-    Args:
-        sizes: 2π|ξ|ρ (n,), in radians.
-        ranges: Range of each rule: see `rule_ranges`.
+    The sizes are 2π|ξ|ρ (n,), in radians.
     """
     splits = np.ceil(np.log2(np.maximum(sizes / ranges[-1], 1.0))).astype(np.int64)
     # Rounding of the logarithm may leave a size just beyond the last range.
@@ -188,11 +186,7 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
 
 
 def merged_corners(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
-    """Return the corners of some triangles, each with a third of the areas that meet there.
-
-    Returns:
-        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
-    """
+    """Return the corners of some triangles (3, n), each with a third of the areas that meet there (n,)."""
     vertices, triangles, areas = mesh
     thirds = np.repeat(areas[members] / 3, 3)
     weights = np.bincount(triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
@@ -201,11 +195,7 @@ def merged_corners(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
 
 
 def merged_midpoints(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
-    """Return the edge midpoints of some triangles, each with a third of the areas that meet there.
-
-    Returns:
-        Coordinates (3, n), in units of length, and weights (n,), in squared units of length.
-    """
+    """Return the edge midpoints of some triangles (3, n), each with a third of the areas that meet there (n,)."""
     vertices, triangles, areas = mesh
     triangles = triangles[members]
     triangle_bits = len(triangles).bit_length()
@@ -248,15 +238,9 @@ _STEPS_PER_DECADE = 4
 
 
 def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
-    """Return the largest tolerance of the triangle rules whose error is predicted to have at most some norms.
+    """Return the largest tolerance of triangle rules whose error is predicted to have at most some norms (orders,).
 
     On fine meshes the prediction was measured to be one to ten times the true error, on coarse ones down to a fifth.
-
-    Args:
-        mesh: Mesh in units of length.
-        lattice: Lattice of the field.
-        orders: Orders s.
-        norms: Largest norm of the error at each order (orders,).
     """
     classes = size_classes(mesh)
     decades = math.log10(_LOOSEST_TOLERANCE / FINEST_TOLERANCE)

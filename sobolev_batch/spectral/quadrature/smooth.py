@@ -69,15 +69,9 @@ def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -
 
 
 def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Complexes:
-    """Return the transform Σ w exp(-2πi ξ·x) over the nodes of a rule, summed one by one.
+    """Return the transform Σ w exp(-2πi ξ·x) over the nodes of a rule (P,), summed one by one.
 
-    Args:
-        surface: Surface in units of length.
-        counts: Nodes along u and v.
-        frequencies: ξ, float64 (P, 3), in cycles per unit length.
-
-    Returns:
-        complex128 (P,), to a few rounding errors of the area.
+    The frequencies are float64 (P, 3), in cycles per unit length. The values have a few rounding errors of the area.
     """
     wave_vectors = -2 * np.pi * np.asarray(frequencies, dtype=np.float64)
     values = np.zeros(len(wave_vectors), dtype=np.complex128)
@@ -88,14 +82,10 @@ def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Com
 
 
 def exact_values(surface: Smooth, frequencies: Reals) -> Complexes:
-    """Return the transform (P,) of a surface, with twice the nodes along each parameter at which it converges.
+    """Return the transform (P,) at frequencies (P, 3), with twice the nodes along each parameter at which it converges.
 
     On a smooth surface the error is about 1e-14 of the area. If half a million nodes do not suffice, the values are
     those of twice as many along each parameter, and have the error of these.
-
-    Args:
-        surface: Surface in units of length.
-        frequencies: float64 (P, 3), in cycles per unit length.
     """
     if not len(frequencies):
         return np.zeros(0, dtype=np.complex128)

@@ -146,14 +146,7 @@ def choose_settings(
 ) -> TransformSettings:
     """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
 
-    Args:
-        surface: Surface of the field.
-        lattice: Lattice of the field.
-        target: Largest permitted error.
-        settings: Settings whose dtype and quadrature are kept.
-
-    Returns:
-        ``settings`` with a new eps and tolerance; as they are for a closed form, which depends on neither.
+    The dtype and quadrature are kept, and all settings for a closed form, which depends on none.
     """
     kind = kind_of(surface)
     if kind.is_closed_form:

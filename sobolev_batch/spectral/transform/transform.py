@@ -76,14 +76,7 @@ def transform_block(
 ) -> Transformed:
     """Return the transform of a surface on one block of the lattice.
 
-    Args:
-        surface: Surface in units of length.
-        lattice: Lattice of the frequencies.
-        block: Block of the lattice.
-        settings: Accuracy and dtype.
-        execution: Backend, threads and memory.
-        plan: Quadrature plan of the surface by the same settings, if there is one. Pass it to transform several
-            blocks with one choice of rules.
+    Pass the quadrature plan of the surface by the same settings to transform several blocks with one choice of rules.
 
     Raises:
         LatticeError: The surface extends beyond the lattice's half period.
@@ -180,11 +173,7 @@ def projected_bytes(
 ) -> int:
     """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
 
-    Args:
-        block: Block of the lattice.
-        settings: Accuracy and dtype.
-        execution: Allowed memory and batch.
-        triangles: Number of triangles of the mesh, at some bytes each while its rule is chosen.
+    Each triangle of the mesh counts for some bytes while its rule is chosen.
     """
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, batch=execution.batch)
     needed: float = CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
@@ -312,14 +301,7 @@ _NANO = 1e-9
 
 
 def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
-    """Return the predicted processor time of a field.
-
-    Args:
-        triangles: Number of triangles of the mesh; 0 for a closed form.
-        area: Area, in squared units of length.
-        lattice: Lattice of the field.
-        settings: Accuracy and dtype.
-    """
+    """Return the predicted processor time of the field of a mesh; of a closed form with zero triangles."""
     spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
     workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
     return _NANO * CPU_COSTS.projected_nanoseconds(spec, spec.shape, workload)
@@ -329,8 +311,7 @@ def field_seconds(triangles: int, area: float, lattice: Lattice, settings: Trans
 def slowness(backend: Backend = CPU) -> float:
     """Return how many times as long as predicted a field takes on this machine, in processor time of one thread.
 
-    Args:
-        backend: Backend to try. The time of a GPU is that of the whole computation.
+    The time of a GPU is that of the whole computation.
     """
     mesh, settings = icosphere(_TRIAL_LEVEL), TransformSettings()
     clock = time.thread_time if backend is CPU else time.perf_counter
