@@ -8,9 +8,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from sobolev_batch import Lattice, OrderError, Sphere, distance, icosphere, norm
+from sobolev_batch import Lattice, OrderError, Sphere, norm
 from sobolev_batch.spectral.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
-from sobolev_batch.surfaces.shapes.surface import Similarity
 
 
 @pytest.mark.parametrize(
@@ -70,24 +69,6 @@ def test_block_and_pointwise_transform_agree() -> None:
     lattice, sphere = Lattice(2.0, 8), Sphere(0.7, (0.1, -0.2, 0.3))
     grid = np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
     assert np.allclose(sphere_block(sphere, lattice, lattice.half), sphere_transform(sphere, grid), rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_distance_of_two_spheres_is_that_of_fine_meshes_of_them() -> None:
-    lattice = Lattice(5.0, 64)
-    fine = icosphere(6)
-    shrunk = Similarity(0.9, (-0.3 / 0.9, 0.0, 0.0)).apply(fine)
-    for order in (-5.0, -10.0):
-        exact = distance(Sphere(), Sphere(0.9, (0.3, 0.0, 0.0)), order)["distance"].item()
-        meshed = distance(fine, shrunk, order, lattice=lattice)["distance"].item()
-        assert exact == sphere_distance(Sphere(), Sphere(0.9, (0.3, 0.0, 0.0)), order)
-        assert meshed == pytest.approx(exact, rel=3e-4)  # O(h²): h = 0.019
-
-
-@pytest.mark.parametrize("order", [-0.5, 0.0, 3.0, float("nan")])
-def test_refuses_orders_without_a_norm(order: float) -> None:
-    with pytest.raises(OrderError, match="below -1/2"):
-        sphere_inner_product(Sphere(), Sphere(), order)
 
 
 def test_says_when_its_functions_overflow() -> None:

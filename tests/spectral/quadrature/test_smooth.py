@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.special import j0
 
 from sobolev_batch import (
     Ellipsoid,
@@ -22,7 +21,6 @@ from sobolev_batch import (
     Torus,
     distance,
     fourier_transform,
-    inner_product,
     norm,
 )
 from sobolev_batch.spectral.backends import CPU
@@ -40,7 +38,6 @@ from tests.support.smooth_shapes import (
     HALF_TURN,
     TURN,
     angular_ball,
-    ball,
     plate,
     roof,
     roof_derivatives,
@@ -94,12 +91,6 @@ def test_a_torus_is_its_bessel_integral() -> None:
         assert values[16 + k, 16, 0] == pytest.approx(value, abs=1e-12 * torus.area)
 
 
-def test_a_torus_on_its_axis_is_a_bessel_function() -> None:
-    heights = LATTICE.axes[2]
-    values = half_values(Torus(1.0, 0.4))[16, 16]
-    assert values == pytest.approx(4 * math.pi**2 * 0.4 * j0(2 * math.pi * 0.4 * heights), abs=1e-12 * 16)
-
-
 @pytest.mark.parametrize(("a", "c"), [(1.0, 0.4), (0.4, 1.0)])
 def test_a_spheroid_is_its_bessel_integral(a: float, c: float) -> None:
     spheroid = Ellipsoid((a, a, c))
@@ -148,14 +139,6 @@ def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
     for block in LATTICE.split(4000):
         part = transform_block(surface, LATTICE, block, settings, Execution(allowed_bytes=1e9, batch=1 << 12))
         assert part.values == pytest.approx(whole.values[LATTICE.place(block)], abs=1e-12 * surface.area)
-
-
-def test_single_precision() -> None:
-    surface = SMOOTH[0]
-    field = fourier_transform(surface, LATTICE, dtype="complex64", threads=1)
-    assert field.dtype == np.complex64
-    error = np.abs(field.values - half_values(surface)).max() / surface.area
-    assert 1e-9 < error < 5e-6
 
 
 # The nodes.
@@ -276,40 +259,6 @@ def test_a_norm_to_an_accuracy(rtol: float) -> None:
     assert (found["error"].values <= rtol * exact).all()
 
 
-@pytest.mark.slow
-def test_a_distance_to_an_accuracy() -> None:
-    near, far = Sphere(0.8, (0.2, 0.0, 0.0)), Ellipsoid((1.0, 1.0, 1.0))
-    exact = distance(near, Sphere(), [-3.0, -6.0])["distance"].values
-    found = distance(near, far, [-3.0, -6.0], rtol=1e-4)
-    assert found["within"].all()
-    assert (np.abs(found["distance"].values - exact) <= found["error"].values).all()
-
-
-def test_twins_have_no_distance() -> None:
-    torus = Torus(0.9, 0.3)
-    same = ParametrisedSurface(torus.positions, TURN, TURN)
-    found = distance(torus, same, -5.0, lattice=LATTICE)
-    assert found["distance"].item() < found["discretisation"].item() < 1e-8
-
-
-def test_inner_products() -> None:
-    torus, ellipsoid = Torus(0.9, 0.3), SMOOTH[0]
-    both = inner_product(torus, ellipsoid, -3.0, lattice=LATTICE)["inner_product"].item()
-    squares = [norm(part, -3.0, lattice=LATTICE)["norm"].item() ** 2 for part in (torus, ellipsoid)]
-    apart = distance(torus, ellipsoid, -3.0, lattice=LATTICE)["distance"].item()
-    assert sum(squares) - 2 * both == pytest.approx(apart**2, rel=1e-9)
-
-
-def test_nodes_of_a_surface_are_its_points() -> None:
-    surface = ParametrisedSurface(ball, HALF_TURN, TURN)
-    parts = list(surface.nodes((15, 31), most=40))
-    assert max(len(weights) for _, weights in parts) <= 40
-    points = np.concatenate([part for part, _ in parts], axis=1)
-    assert points.shape == (3, 15 * 31)
-    assert np.linalg.norm(points, axis=0) == pytest.approx(np.ones(15 * 31), rel=1e-14)
-    assert sum(weights.sum() for _, weights in parts) == pytest.approx(4 * math.pi, rel=1e-13)
-
-
 def test_a_gpu_gets_the_same_nodes() -> None:
     device = Device()
     for surface in SMOOTH:
@@ -320,16 +269,6 @@ def test_a_gpu_gets_the_same_nodes() -> None:
         assert (found.backend, expected.backend) == ("cufinufft", "finufft")
         assert found.points == expected.points > 1 << 12
         assert np.abs(found.values - expected.values).max() < 1e-12 * surface.area
-
-
-def test_little_memory_makes_parts_and_not_other_numbers() -> None:
-    surface, lattice = SMOOTH[1], Lattice(4.0, 64)
-    whole, parts = (
-        transform_block(surface, lattice, lattice.half, TransformSettings(1e-9), Execution(allowed_bytes=memory))
-        for memory in (None, 1.5e7)
-    )
-    assert whole.points == parts.points
-    assert 0 < np.abs(whole.values - parts.values).max() < 1e-8 * surface.area
 
 
 @pytest.mark.slow

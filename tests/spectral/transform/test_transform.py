@@ -5,22 +5,21 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from pathlib import Path
+from dataclasses import replace
+from math import prod
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
+from sobolev_batch.spectral.backends import CPU_COSTS, GPU_COSTS, ComplexDtype, Costs, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
+from sobolev_batch.spectral.transform.transform import fastest_spec, projected_bytes, sub_shapes, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
-from sobolev_batch.surfaces.shapes.surface import Similarity
-from sobolev_batch.surfaces.sources.files import FileSource
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -49,18 +48,8 @@ def bumpy(rng: np.random.Generator) -> Mesh:
     return Mesh(sphere.vertices * radii[:, None], sphere.triangles)
 
 
-def cortex(rng: np.random.Generator) -> Mesh:
-    pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
-    path = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
-    (member,) = FileSource(paths=(path,), distribution="nilearn").members(Path())
-    mesh = member.load()
-    scaled = Similarity.to_unit_ball(mesh).apply(mesh)
-    assert isinstance(scaled, Mesh)
-    return scaled
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy, cortex])
+@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy])
 @pytest.mark.parametrize("eps", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
 def test_agrees_with_the_exact_transform_to_a_small_multiple_of_eps(make, eps: float) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(17)
@@ -88,21 +77,6 @@ def test_every_block_of_the_lattice_equals_the_same_part_of_the_whole() -> None:
     for block in (*lattice.split(600), Block((-3, 4, 2), (5, 2, 4)), Block((10, -10, 0), (1, 1, 1))):
         part = transform_block(mesh, lattice, block, settings).values
         assert np.abs(part - whole[lattice.place(block)]).max() < 1e-11 * mesh.area
-
-
-def test_parts_of_a_mesh_add_up() -> None:
-    lattice, mesh = Lattice(3.0, 16), icosphere(2)
-    halves = [Mesh(mesh.vertices, mesh.triangles[i::2]) for i in range(2)]
-    added = sum(fourier_transform(half, lattice, 1e-12) for half in halves)
-    assert np.abs(added - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
-
-
-def test_batches_change_nothing_but_rounding() -> None:
-    lattice, mesh = Lattice(3.0, 16), icosphere(3)
-    settings = TransformSettings(1e-12)
-    one = transform_block(mesh, lattice, lattice.half, settings).values
-    many = transform_block(mesh, lattice, lattice.half, settings, Execution(batch=4_000)).values
-    assert np.abs(one - many).max() < 1e-11 * mesh.area
 
 
 @pytest.mark.slow
@@ -234,3 +208,40 @@ def test_refuses_meshes_that_would_fold() -> None:
     with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 1, "):
         fourier_transform(Sphere(), lattice)
     fourier_transform(icosphere(1), Lattice(5.0, 22))
+
+
+@pytest.mark.parametrize("shape", [(65, 65, 33), (129, 129, 65), (17, 90, 3), (5, 4, 2)])
+@pytest.mark.parametrize("sigma", [1.25, 1.5, 2.0])
+@pytest.mark.parametrize("costs", [CPU_COSTS, GPU_COSTS], ids=["cpu", "gpu"])
+def test_smaller_sub_blocks_never_take_more(shape: tuple[int, int, int], sigma: float, costs: Costs) -> None:
+    workload = Workload(1e6, 1e6)
+    specs = [NufftSpec(sub_shape, 1e-6, oversampling=sigma) for sub_shape in sub_shapes(shape, sigma)]
+    projected = [costs.projected_bytes(spec, workload) for spec in specs]
+    assert projected == sorted(projected, reverse=True)
+
+
+@pytest.mark.parametrize("allowed_bytes", [2.2e7, 4e7, 8e7, 1.2e8])
+def test_it_is_the_fastest_of_all_that_fit(allowed_bytes: float) -> None:
+    whole, workload, costs = NufftSpec((129, 129, 65), 1e-6), Workload(3e5, 6e5, 100_000), CPU_COSTS
+    found = fastest_spec(whole, workload, costs, allowed_bytes)
+    assert costs.projected_bytes(found, workload) <= allowed_bytes
+    others = [
+        replace(whole, shape=shape, oversampling=sigma, batch=whole.batch >> halvings)
+        for sigma in costs.oversamplings(whole)
+        for shape in sub_shapes(whole.shape, sigma)
+        for halvings in range(10)
+    ]
+    fitting = [other for other in others if costs.projected_bytes(other, workload) <= allowed_bytes]
+    fastest = min(costs.projected_nanoseconds(other, whole.shape, workload) for other in fitting)
+    assert found != whole
+    assert costs.projected_nanoseconds(found, whole.shape, workload) <= 1.05 * fastest
+
+
+def test_sub_blocks_cover_the_block_once() -> None:
+    block = Block((-3, 1, 2), (5, 4, 4))
+    covered = np.zeros(block.shape, dtype=int)
+    for sub_block, (x, y, z) in block.tiles((2, 3, 3)):
+        assert prod(sub_block.shape) == 18
+        assert sub_block.start == (block.start[0] + x.start, block.start[1] + y.start, block.start[2] + z.start)
+        covered[x, y, z] += 1
+    assert (covered == 1).all()

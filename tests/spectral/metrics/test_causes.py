@@ -1,0 +1,333 @@
+"""Causes of distances: area and shape, wavelengths, places, against sums over the whole lattice and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch import (
+    InputError,
+    Lattice,
+    LatticeError,
+    Mesh,
+    OrderError,
+    Similarity,
+    Sphere,
+    distance,
+    fourier_transform,
+    icosphere,
+    norm,
+    proportion,
+    spectrum,
+    witness,
+)
+from sobolev_batch.spectral import fields
+from sobolev_batch.spectral.backends import NufftSpec
+from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.quadrature.kinds import kind_of
+from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
+from sobolev_batch.spectral.spheres import sphere_inner_product
+from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
+from tests.support.oracles import full_lattice_norm
+from tests.support.shapes import CENTRED_BOX as BOX
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+LATTICE = Lattice(4.0, 32)
+ORDERS = [-0.7, -2.0, -10.0]
+SMALL = Lattice(2.0, 16)
+SMALL_ORDERS = [-0.6, -2.0, -5.0, -10.0]
+RANDOM = Lattice(3.0, 12)
+WITNESS_ORDERS = [-0.8, -3.0, -10.0]
+
+
+def as_field(values: Complexes, lattice: Lattice) -> xr.DataArray:
+    return fourier_transform(Sphere(0.1), lattice).copy(data=values)
+
+
+def random_values(rng: np.random.Generator) -> Complexes:
+    return rng.standard_normal(SMALL.shape) + 1j * rng.standard_normal(SMALL.shape)
+
+
+# Area and shape.
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_is_the_projection_spelt_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    b = random_values(rng)
+    a = rng.uniform(-2, 2) * b + rng.uniform(0, 2) * random_values(rng)
+    dataset = proportion(as_field(a, SMALL), as_field(b, SMALL), SMALL_ORDERS)
+    for order in SMALL_ORDERS:
+        row = dataset.sel(order=order)
+
+        def norm(values: Complexes, order: float = order) -> float:
+            return full_lattice_norm(values, SMALL, order)
+
+        # The inner product by polarisation.
+        multiple = (norm(a + b) ** 2 - norm(a - b) ** 2) / (4 * norm(b) ** 2)
+        assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-10, abs=1e-12)
+        assert row["area_part"].item() == pytest.approx(abs(multiple - 1) * norm(b), rel=1e-10)
+        assert row["shape_part"].item() == pytest.approx(norm(a - multiple * b), rel=1e-10)
+        # Any other multiple is farther away.
+        assert all(norm(a - (multiple + d) * b) > row["shape_part"].item() for d in (-1e-3, 1e-3))
+
+
+def test_parts_add_up_to_the_squared_distance() -> None:
+    rng = np.random.default_rng(7)
+    a, b = as_field(random_values(rng), SMALL), as_field(random_values(rng), SMALL)
+    dataset = proportion(a, b, SMALL_ORDERS)
+    squares = distance(a, b, SMALL_ORDERS)["distance"].values ** 2
+    assert (dataset["area_part"] ** 2 + dataset["shape_part"] ** 2).values == pytest.approx(squares, rel=1e-12)
+    assert dataset["distance"].values ** 2 == pytest.approx(squares, rel=1e-12)
+    assert dataset["area_share"].values == pytest.approx(dataset["area_part"].values ** 2 / squares, rel=1e-12)
+
+
+def test_near_twins_keep_their_digits() -> None:
+    # Values on grids of powers of two, so that a = b + e and a - b are exact: e is known to all digits.
+    rng = np.random.default_rng(8)
+    b = np.round(random_values(rng) * 2**10) / 2**10
+    e = np.round((0.3 * b + random_values(rng)) * 2**6) / 2**42
+    assert np.array_equal((b + e) - b, e)
+    dataset = proportion(as_field(b + e, SMALL), as_field(b, SMALL), -3.0)
+    larger = proportion(as_field(b + 2**30 * e, SMALL), as_field(b, SMALL), -3.0)
+    for name in ("excess", "area_part", "shape_part"):
+        assert 2**30 * dataset[name].item() == pytest.approx(larger[name].item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("a", [Sphere(0.9), Sphere(1.0, (0.05, 0.0, 0.0))])
+@pytest.mark.parametrize("order", [-10.0, -4.0])
+def test_spheres_against_their_closed_forms(a: Sphere, order: float) -> None:
+    b = Sphere()
+    row = proportion(a, b, order, lattice=Lattice(5.0, 64))
+    multiple = sphere_inner_product(a, b, order) / sphere_inner_product(b, b, order)
+    assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-3)
+    left_over = sphere_inner_product(a, a, order) - multiple * sphere_inner_product(a, b, order)
+    assert row["shape_part"].item() ** 2 == pytest.approx(left_over, rel=2e-3)
+
+
+def test_equal_fields_and_missing_samples() -> None:
+    a = fourier_transform(BOX, SMALL)
+    same, bands = proportion(a, a, -2.0), spectrum(a, a, -2.0)
+    assert (same["distance"].item(), same["area_part"].item(), same["shape_part"].item()) == (0, 0, 0)
+    assert np.isnan(same["area_share"].item())
+    assert np.isnan(bands["share"].values).all()
+    damaged = a.copy()
+    damaged[8, 8, 0] = np.nan
+    parts, bands = proportion(damaged, a, -2.0), spectrum(damaged, a, -2.0)
+    assert all(np.isnan(parts[name].item()) for name in ("area_part", "shape_part"))
+    assert np.isnan([bands["total"].item(), bands["squared"].values[0]]).all()
+
+
+def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(10)
+    a, b = as_field(random_values(rng), SMALL), as_field(random_values(rng), SMALL)
+    whole, read = proportion(a, b, SMALL_ORDERS), fields.read_blocks
+    monkeypatch.setattr(fields, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=200))
+    xr.testing.assert_allclose(proportion(a, b, SMALL_ORDERS), whole, rtol=1e-12)
+
+
+# Wavelengths.
+
+
+@pytest.mark.parametrize("bands", [None, 1, 7, 40])
+def test_bands_add_up_to_the_squared_distance(bands: int | None) -> None:
+    a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(), LATTICE)
+    dataset = spectrum(a, b, ORDERS, bands=bands)
+    squares = distance(a, b, ORDERS)["distance"].values ** 2
+    assert dataset["squared"].sum("band").values == pytest.approx(squares, rel=1e-12)
+    assert dataset["share"].sum("band").values == pytest.approx(1, rel=1e-12)
+    assert dataset["total"].values == pytest.approx(squares, rel=1e-12)
+    assert spectrum(a, None, -2.0, bands=bands)["squared"].sum().item() == pytest.approx(
+        norm(a, -2.0)["norm"].item() ** 2, rel=1e-12
+    )
+
+
+def test_bands_are_sums_over_the_whole_lattice() -> None:
+    rng = np.random.default_rng(0)
+    lattice = Lattice(1.5, 6)
+    values = rng.standard_normal(lattice.shape) + 1j * rng.standard_normal(lattice.shape)
+    field = fourier_transform(Sphere(0.1), lattice).copy(data=values)
+    edges = [0.0, 0.5, 0.8, 1.5, 2.1]  # the shells |k|² = 1 and 9 lie on edges, those beyond 17 in no band
+    dataset = spectrum(field, None, -2.0, bands=edges)
+    x, y, z = np.meshgrid(*lattice.axes, indexing="ij")
+    ends = [np.where(np.abs(axis) == 1.5, 0.5, 1.0) for axis in (x, y, z)]
+    weights = 0.5**3 * ends[0] * ends[1] * ends[2] * np.where(z > 0, 2, 1)
+    radii = np.round(np.sqrt(x**2 + y**2 + z**2), 12)
+    for i in range(4):
+        inside = (radii >= edges[i]) & (radii < edges[i + 1])
+        expected = np.sum((weights * (1 + radii**2) ** -2.0 * np.abs(values) ** 2)[inside])
+        assert dataset["squared"].values[i] == pytest.approx(expected, rel=1e-12)
+        mean = np.average(np.abs(values[inside]) ** 2, weights=weights[inside])
+        assert dataset["mean_square"].values[i] == pytest.approx(mean, rel=1e-12)
+    assert dataset["squared"].sum().item() < dataset["total"].item()
+
+
+def test_energy_of_a_sphere_is_its_closed_form() -> None:
+    # ∫_{|ξ|=r} |σ^|² dS = 16π sin²(2πr): twice the area in the mean over whole periods, zero at multiples of 1/2.
+    lattice = Lattice(5.0, 160)
+    edges = np.arange(1.0, 5.01, 0.125)
+    dataset = spectrum(Sphere(), None, -2.0, bands=edges.tolist(), lattice=lattice)
+    middles = (edges[1:] + edges[:-1]) / 2
+    averages = 8 * np.pi * (1 - np.sinc(2 * 0.125) * np.cos(4 * np.pi * middles))
+    assert dataset["energy"].values == pytest.approx(averages, rel=0.1, abs=1.5)
+    whole = spectrum(Sphere(), None, -2.0, bands=[1.0, 5.0], lattice=lattice)
+    assert whole["energy"].item() == pytest.approx(2 * Sphere().area, rel=0.02)
+
+
+def test_default_bands_and_wavelengths() -> None:
+    similarity = Similarity(0.02)
+    dataset = spectrum(icosphere(2), Sphere(), -3.0, lattice=LATTICE, similarity=similarity)
+    assert dataset["upper"].values == pytest.approx([0.5, 1, 2, 4, 4 * 3**0.5])
+    assert dataset["lower"].values[0] == 0
+    assert dataset["longest_wavelength"].values == pytest.approx([np.inf, 2, 1, 0.5, 0.25])
+    assert dataset["own_shortest_wavelength"].values[:4] == pytest.approx([100, 50, 25, 12.5])
+    assert dataset["squared"].dims == ("band",)
+    assert "own_longest_wavelength" not in spectrum(Sphere(), None, -3.0, lattice=LATTICE).coords
+
+
+def test_equal_fields_have_no_shares_and_missing_samples_no_spectrum() -> None:
+    a = fourier_transform(Sphere(), LATTICE)
+    assert np.isnan(spectrum(a, a, -2.0)["share"].values).all()
+    damaged = a.copy()
+    damaged[16, 16, 0] = np.nan
+    dataset = spectrum(damaged, a, -2.0)
+    assert np.isnan(dataset["total"].item())
+    assert np.isnan(dataset["squared"].values[0])
+
+
+@pytest.mark.parametrize(
+    "bands", [0, -3, [1.0], [1.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [0.0, np.inf], "octaves", [[0, 1]]]
+)
+def test_refuses_bands(bands: object) -> None:
+    with pytest.raises(InputError, match="band"):
+        spectrum(Sphere(), None, -2.0, lattice=LATTICE, bands=bands)  # type: ignore[arg-type]
+
+
+# Places.
+
+
+def random_pair(seed: int) -> tuple[Complexes, Complexes]:
+    """Return two fields of random points: real measures that are not smooth."""
+    rng = np.random.default_rng(seed)
+    fields: list[Complexes] = []
+    for _ in range(2):
+        points, weights = rng.uniform(-0.9, 0.9, (7, 3)), rng.uniform(0, 1, 7)
+        x, y, z = RANDOM.axes
+        phases = np.multiply.outer(x, points[:, 0])[:, None, None] + np.multiply.outer(y, points[:, 1])[:, None]
+        turns = np.exp(-2j * np.pi * (phases + np.multiply.outer(z, points[:, 2])))
+        fields.append(np.asarray(turns @ weights, dtype=np.complex128))
+    return fields[0], fields[1]
+
+
+def direct_sum(difference: Complexes, lattice: Lattice, order: float, points: Reals) -> Reals:
+    """Return the witness function by the trapezoidal rule on the whole cube, conjugate half included."""
+    whole = np.concatenate([np.conj(difference[::-1, ::-1, :0:-1]), difference], axis=2)
+    axis = lattice.axes[0]
+    ends = np.where(np.abs(axis) == lattice.xi_max, 0.5, 1.0) * lattice.spacing
+    squares = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
+    weighted = whole * ends[:, None, None] * ends[:, None] * ends * (1 + squares) ** order
+    turns = [np.exp(2j * np.pi * np.multiply.outer(points[:, i], axis)) for i in range(3)]
+    values = np.einsum("ijk,ni,nj,nk->n", weighted, *turns, optimize=True)
+    assert np.abs(values.imag).max() < 1e-12 * np.abs(weighted).sum()
+    return np.asarray(values.real)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_is_the_direct_sum_over_the_whole_lattice(seed: int) -> None:
+    a, b = random_pair(seed)
+    points = np.random.default_rng(seed).uniform(-0.99, 0.99, (23, 3)) * RANDOM.half_period
+    evaluated = witness(as_field(a, RANDOM), as_field(b, RANDOM), WITNESS_ORDERS, points, eps=1e-13)
+    assert evaluated.dims == ("order", "point")
+    for order in WITNESS_ORDERS:
+        expected = direct_sum(a - b, RANDOM, order, points)
+        # A lattice of so few samples: the sum of all terms is not much above the largest values.
+        assert evaluated.sel(order=order).values == pytest.approx(expected, rel=0, abs=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = random_pair(3)
+    points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))
+    whole = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
+    monkeypatch.setattr("sobolev_batch.spectral.metrics.causes.BLOCK_SAMPLES", 100)
+    assert len(RANDOM.split(100)) > 10
+    in_blocks = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
+    assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())
+    block = Block((-3, 1, 2), (5, 4, 4))
+    coefficients = np.random.default_rng(4).standard_normal((2, *block.shape)) + 1j
+    one, many = (
+        evaluate_at(points.T, coefficients, RANDOM, block, spec)
+        for spec in (NufftSpec(block.shape, 1e-13), NufftSpec((2, 3, 3), 1e-13, oversampling=2.0, batch=7))
+    )
+    assert many == pytest.approx(one, rel=0, abs=1e-11 * np.abs(one).max())
+
+
+def test_evaluation_is_the_adjoint_of_the_transform() -> None:
+    rng = np.random.default_rng(5)
+    block = Block((-6, -2, 1), (7, 6, 4))
+    points, weights = rng.uniform(-1, 1, (3, 40)), rng.standard_normal(40)
+    coefficients = rng.standard_normal((1, *block.shape)) + 1j * rng.standard_normal((1, *block.shape))
+    transformed, _ = transform_points([WeightedPoints(points, weights)], RANDOM, block, NufftSpec(block.shape, 1e-13))
+    (values,) = evaluate_at(points, coefficients, RANDOM, block, NufftSpec(block.shape, 1e-13))
+    assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("other", [Mesh(0.7 * icosphere(1).vertices, icosphere(1).triangles), BOX])
+def test_its_integral_against_the_difference_is_the_squared_distance(other: Mesh) -> None:
+    lattice, mesh = Lattice(4.0, 32), icosphere(2)
+    a, b = (fourier_transform(surface, lattice, 1e-14) for surface in (mesh, other))
+    total = np.zeros(len(WITNESS_ORDERS))
+    for surface, sign in ((mesh, 1.0), (other, -1.0)):
+        for batch in kind_of(surface).plan(lattice.highest_frequency, 1e-14).batches(1 << 20):
+            values = witness(a, b, WITNESS_ORDERS, batch.coordinates.T, eps=1e-14).values
+            total += sign * values @ batch.weights
+    assert total == pytest.approx(distance(a, b, WITNESS_ORDERS)["distance"].values ** 2, rel=1e-10)
+
+
+def test_is_positive_where_the_first_has_more() -> None:
+    lattice = Lattice(4.0, 40)
+    right = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    evaluated = witness(Sphere(0.5, (0.5, 0, 0)), Sphere(0.5, (-0.5, 0, 0)), -4.0, right, lattice=lattice).values
+    assert evaluated[0] > 0 > evaluated[1]
+    assert evaluated[0] == pytest.approx(-evaluated[1], rel=1e-9)
+    assert witness(Sphere(), Sphere(), -4.0, right, lattice=lattice).values == pytest.approx([0, 0], abs=1e-15)
+
+
+def test_single_precision_and_little_memory() -> None:
+    lattice = Lattice(4.0, 40)
+    points = np.random.default_rng(8).uniform(-1, 1, (5_000, 3))
+    a, b = (fourier_transform(surface, lattice) for surface in (BOX, Sphere()))
+    exact = witness(a, b, -3.0, points, eps=1e-13, threads=1)
+    scale = float(np.abs(exact).max())
+    single = witness(a, b, -3.0, points, dtype="complex64", threads=1)
+    assert single.dtype == np.float32
+    assert 1e-9 * scale < float(np.abs(single - exact).max()) < 1e-4 * scale
+    little = witness(a, b, -3.0, points, eps=1e-12, memory="15MB")
+    assert float(np.abs(little - exact).max()) < 1e-9 * scale
+    with pytest.raises(InputError, match="give at least"):
+        witness(a, b, -3.0, points, memory=1e5)
+
+
+def test_missing_samples_and_no_points() -> None:
+    a, b = random_pair(1)
+    a[3, 4, 5] = np.nan
+    assert np.isnan(witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, np.zeros((3, 3))).values).all()
+    assert witness(as_field(b, RANDOM), as_field(b, RANDOM), [-2.0], np.empty((0, 3))).shape == (1, 0)
+
+
+def test_refusals() -> None:
+    field = as_field(random_pair(0)[0], RANDOM)
+    with pytest.raises(LatticeError, match=r"points reach to \|coordinate\| = 1\.2, .* < 1/\(2h\) = 1;"):
+        witness(field, field, -2.0, [[0, -1.2, 0]])
+    for points, message in (([[1.0, 2.0]], r"\(1, 2\)"), ([[np.nan, 0, 0]], "1 of 1 points"), ("x", "real numbers")):
+        with pytest.raises(InputError, match=message):
+            witness(field, field, -2.0, points)
+    with pytest.raises(OrderError):
+        witness(field, field, -0.5, np.zeros((1, 3)))
+    with pytest.raises(InputError, match="dtype"):
+        witness(field, field, -2.0, np.zeros((1, 3)), dtype="float32")  # type: ignore[arg-type]
