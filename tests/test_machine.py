@@ -100,7 +100,6 @@ ASKING: dict[str, Callable[[], object]] = {
     "SobolevAccessor.witness": lambda: FIELD.sobolev.witness(SPHERES[1], -2.0, [[0, 0, 0]], memory=1e15),
     "assert_same_surface": lambda: sb.assert_same_surface(*SPHERES, memory="1000TB"),
     "distance": lambda: sb.distance(*SPHERES, -2.0, rtol=0.1, memory="1000TB"),
-    "inner_product": lambda: sb.inner_product(*SPHERES, -2.0, rtol=0.1, memory="1000TB"),
     "norm": lambda: sb.norm(SPHERES[0], -2.0, rtol=0.1, memory=1e15),
     "run": lambda: sb.run(STUDY, "memory://greedy.zarr", memory="1000TB"),
     "same_surface": lambda: sb.same_surface(*SPHERES, memory="1000TB"),

@@ -60,13 +60,9 @@ class TailQuality:
     own: Remainder
     difference: Remainder | None = None
 
-    def to_table(self) -> dict[str, Any]:
-        """Return the quality as a table."""
-        return asdict(self)
-
     @classmethod
     def from_table(cls, table: dict[str, Any]) -> Self:
-        """Return the quality that a table of `to_table` holds."""
+        """Return the quality from a table of its attributes."""
         own, difference = (part and Remainder.from_table(part) for part in (table["own"], table["difference"]))
         return cls(tuple(table["radii"]), tuple(table["squares"]), own, difference)
 
@@ -103,7 +99,7 @@ class Quality:
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
         parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
-        return json.dumps(parts if self.tail is None else [*parts, self.tail.to_table()])
+        return json.dumps(parts if self.tail is None else [*parts, asdict(self.tail)])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -290,7 +286,7 @@ def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -
     if lattice is None:
         raise InputError(
             f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
-            "pass lattice=Lattice(xi_max=..., M=...) or rtol=..."
+            "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"
         )
     return fourier_transform(surface, lattice, order=orders)
 

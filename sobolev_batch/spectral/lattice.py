@@ -55,8 +55,7 @@ class Block:
     def split(self, largest_size: int) -> tuple[Block, ...]:
         """Return equal blocks of at most ``largest_size`` samples that make up this one.
 
-        They differ in shape only at the high ends, as the chunks of a regular grid do. The slow axes are split
-        first, so that a block is as contiguous in memory as possible.
+        They differ in shape only at the high ends, as the chunks of a regular grid do. The slow axes are split first.
         """
         shape = list(self.shape)
         for axis in range(3):

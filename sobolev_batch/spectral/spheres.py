@@ -55,11 +55,9 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
     one-dimensional integral otherwise. The relative error is about 1e-13.
 
     Raises:
-        OrderError: The order is not below -1/2, or so low that the Bessel functions overflow.
+        OrderError: The order is so low that the Bessel functions overflow.
     """
     nu = -order - 0.5
-    if not nu > 0:
-        raise OrderError(f"the norm of a surface needs an order below -1/2, found {order:g}")
     separation = math.dist(first.center, second.center)
     radii = first.radius, second.radius
     near, far = radii[0] - radii[1], radii[0] + radii[1]

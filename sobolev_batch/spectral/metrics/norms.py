@@ -38,16 +38,13 @@ from sobolev_batch.spectral.fields import (
     shells_of,
 )
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.metrics.datasets import LENGTH, VARIABLES, labelled, labelled_distances, lattice_attributes
+from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
-# Fraction of an inner product's accuracy for each of the three numbers that it follows from, and the ratio of two norms
-# below which the larger one is computed again.
-_PART_OF_PRODUCT, _UNEQUAL = 0.125, 0.5
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
 
@@ -115,9 +112,6 @@ def inner_product(
     order: Orders,
     *,
     lattice: Lattice | None = None,
-    rtol: float | None = None,
-    memory: float | str | None = None,
-    seed: int = 0,
 ) -> xr.Dataset:
     """Return the Sobolev inner product <a, b>_s of two surfaces' area measures, which is real.
 
@@ -126,31 +120,21 @@ def inner_product(
         b: Field on the same lattice, or a surface.
         order: One order s < -1/2, or several.
         lattice: Lattice to transform surfaces on. A field brings its own.
-        rtol: Largest error relative to ||a||_s ||b||_s, in place of a lattice; the inner product itself may be zero.
-        memory: Memory that a transform may take with rtol; see `distance`.
-        seed: Seed of the random frequencies with rtol; see `distance`.
 
     Returns:
         Dataset over `order` with `inner_product`, float64, in units of length. A single order has no
-        dimension. Attributes hold the lattice and the kernel. With rtol there is also the `error`, in units of length.
+        dimension. Attributes hold the lattice and the kernel.
 
     Raises:
         OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
-        InputError: A surface comes without a lattice or an rtol, or with both.
-        AccuracyError: The rtol is out of reach.
+        InputError: A surface comes without a lattice.
 
     >>> from sobolev_batch import Sphere, inner_product
     >>> f"{inner_product(Sphere(), Sphere(0.5), -2.0)['inner_product'].item():.6f}"
     '1.758104'
     """
     orders = check_orders(order)
-    if rtol is not None:
-        accuracy = accuracy_of(rtol, memory)
-        # Converted once, as three numbers are computed of them.
-        operands = as_operand(a), as_operand(b)
-        return _inner_product_to_accuracy(operands, order, lattice, accuracy, seed)
-    _refuse_settings_of_rtol(memory)
     if spheres := _spheres(a, b, lattice=lattice):
         products = np.array([sphere_inner_product(spheres[0], spheres[1], s) for s in orders])
         return labelled(order, {"inner_product": products}, {})
@@ -239,7 +223,7 @@ def accuracy_of(rtol: float, memory: float | str | None, *, best_effort: bool = 
     return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
 
 
-def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool = False) -> None:
+def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool) -> None:
     if memory is not None:
         raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
     if best_effort:
@@ -251,8 +235,7 @@ def to_accuracy(
 ) -> tuple[xr.Dataset, Reference | None]:
     """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen.
 
-    Returns:
-        The dataset, and the reference of a distance between surfaces that are not equal.
+    The reference comes with a distance between surfaces that are not equal.
     """
     orders = check_orders(order)
     surfaces = [as_surface(operand) for operand in operands if not isinstance(operand, xr.DataArray)]
@@ -271,32 +254,6 @@ def to_accuracy(
         dataset = labelled_distances(order, solution.estimate, estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))
     return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"])), reference
-
-
-def _inner_product_to_accuracy(
-    operands: tuple[OperandLike, OperandLike], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
-) -> xr.Dataset:
-    """Compute an inner product from both norms and the distance: 2 <a, b> = ||a||² + ||b||² - ||a - b||²."""
-
-    def measured(name: str, some: Sequence[OperandLike], fraction: float) -> tuple[Reals, Reals]:
-        part = replace(accuracy, rtol=fraction * accuracy.rtol)
-        dataset, _ = to_accuracy(name, some, np.atleast_1d(order).tolist(), lattice, part, seed)
-        return dataset[name].to_numpy(), dataset["error"].to_numpy()
-
-    norms = [measured("norm", (operand,), _PART_OF_PRODUCT) for operand in operands]
-    # The larger norm must not drown the product.
-    ratio = float(np.min(norms[0][0] / norms[1][0])), float(np.min(norms[1][0] / norms[0][0]))
-    norms = [
-        measured("norm", (operand,), _PART_OF_PRODUCT * share) if share < _UNEQUAL else found
-        for operand, found, share in zip(operands, norms, reversed(ratio), strict=True)
-    ]
-    distances = measured("distance", operands, _PART_OF_PRODUCT * min(ratio))
-    squares = [(value**2, 2 * value * error + error**2) for value, error in (*norms, distances)]
-    product = (squares[0][0] + squares[1][0] - squares[2][0]) / 2
-    errors = sum(error for _, error in squares) / 2
-    dataset = labelled(order, {"inner_product": product, "error": errors}, {"rtol": accuracy.rtol, "seed": seed})
-    dataset["error"].attrs["units"] = LENGTH
-    return dataset
 
 
 def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray]) -> NormEstimate:

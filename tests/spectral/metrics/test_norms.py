@@ -117,18 +117,3 @@ def test_single_precision_fields_are_summed_in_double() -> None:
     field = fourier_transform(icosphere(2), LATTICE, 1e-6)
     single = norm(field.astype(np.complex64), -2)["norm"].item()
     assert single == pytest.approx(norm(field, -2)["norm"].item(), rel=1e-7)
-
-
-@pytest.mark.slow
-def test_inner_products_to_an_accuracy_agree_with_the_closed_form() -> None:
-    orders = [-1.0, -2.0]
-    for a, b in ((Sphere(), Sphere(0.9, (0.1, 0.0, 0.0))), (Sphere(), Sphere(0.2, (0.0, 2.0, 0.0)))):
-        exact = inner_product(a, b, orders)["inner_product"].values
-        found = inner_product(a, b, orders, rtol=5e-2)
-        gap = np.abs(found["inner_product"].values - exact)
-        assert (gap <= found["error"].values).all()
-        product_of_norms = norm(a, orders)["norm"].values * norm(b, orders)["norm"].values
-        assert (found["error"].values <= 5e-2 * product_of_norms).all()
-    assert found["error"].attrs["units"] == "unit length"
-    with pytest.raises(InputError, match="an rtol chooses the lattice"):
-        inner_product(Sphere(), Sphere(), -2.0, rtol=1e-2, lattice=Lattice(2.0, 16))
