@@ -92,18 +92,14 @@ def test_more_than_there_is_is_refused_with_both_numbers() -> None:
 
 
 SPHERES = sb.Sphere(), sb.Sphere(0.9)
-FIELD = sb.fourier_transform(SPHERES[0], sb.Lattice(1.0, 8))
-LATTICE = sb.Lattice(1.0, 8)
 STUDY = sb.Study.from_table(small_table())
 # Every public function with such an argument, by name.
 ASKING: dict[str, Callable[[], object]] = {
-    "SobolevAccessor.witness": lambda: FIELD.sobolev.witness(SPHERES[1], -2.0, [[0, 0, 0]], memory=1e15),
     "assert_same_surface": lambda: sb.assert_same_surface(*SPHERES, memory="1000TB"),
     "distance": lambda: sb.distance(*SPHERES, -2.0, rtol=0.1, memory="1000TB"),
     "norm": lambda: sb.norm(SPHERES[0], -2.0, rtol=0.1, memory=1e15),
     "run": lambda: sb.run(STUDY, "memory://greedy.zarr", memory="1000TB"),
     "same_surface": lambda: sb.same_surface(*SPHERES, memory="1000TB"),
-    "witness": lambda: sb.witness(*SPHERES, -2.0, [[0, 0, 0]], lattice=LATTICE, memory="1000TB"),
     "yardsticks": lambda: sb.yardsticks(sb.icosphere(1), sb.icosphere(2), -2.0, rtol=0.1, memory="1000TB"),
 }
 

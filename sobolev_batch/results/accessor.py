@@ -95,13 +95,12 @@ class SobolevAccessor:
         points: ArrayLike,
         *,
         eps: float | None = None,
-        memory: float | str | None = None,
     ) -> xr.DataArray:
         """Return the witness function at points (n, 3), positive where this surface has more area.
 
         See `sobolev_batch.witness`.
         """
-        return witness(self._field, other, order, points, eps=eps, memory=memory)
+        return witness(self._field, other, order, points, eps=eps)
 
     def _each_with(
         self, other: OperandLike, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]

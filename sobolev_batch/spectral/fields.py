@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_named
@@ -325,21 +325,6 @@ def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> 
         if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
             raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")
     return lattices[0] if lattices else None
-
-
-def point_array(values: ArrayLike, name: str) -> Reals:
-    """Return values as float64 (n, 3); they may be infinite or NaN.
-
-    Raises:
-        InputError: The values are not real, or not of that shape; the message calls them ``name``.
-    """
-    try:
-        points = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be real numbers (n, 3): {error}") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{name} must have the shape (n, 3), found {points.shape}")
-    return points
 
 
 def quality_of(field: xr.DataArray) -> Quality | None:

@@ -38,7 +38,6 @@ def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) ->
     xr.testing.assert_identical(own.spectrum(b, ORDERS, bands=5), sb.spectrum(a, b, ORDERS, bands=5))
     xr.testing.assert_identical(own.spectrum(None, -2), sb.spectrum(a, None, -2))
     xr.testing.assert_allclose(own.witness(b, -2, points), sb.witness(a, b, -2, points), rtol=1e-9)
-    xr.testing.assert_equal(own.witness(b, -2, points, memory="64MB"), own.witness(b, -2, points))
     assert own.lattice == sb.Lattice(4.0, 32)
     # A surface beside a field is transformed on its lattice.
     assert own.distance(sb.Sphere(), -2)["distance"].item() == pytest.approx(own.distance(b, -2)["distance"].item())

@@ -9,15 +9,12 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.machine import available
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.spectral.backends import CPU, ComplexDtype, NufftSpec, Workload
+from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
 from sobolev_batch.spectral.fields import (
-    BLOCK_SAMPLES,
     OperandLike,
     field_of,
     pair_of,
-    point_array,
     read_blocks,
     shells_against,
     shells_of,
@@ -36,16 +33,12 @@ from sobolev_batch.spectral.metrics.datasets import (
 )
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, thread_count
-from sobolev_batch.spectral.transform.transform import fastest_spec, require_points_inside
+from sobolev_batch.spectral.transform.settings import TransformSettings, thread_count
+from sobolev_batch.spectral.transform.transform import require_points_inside
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12
-# Fraction of a given memory for blocks of fields; the rest is for the NUFFT.
-_BLOCK_FRACTION = 0.25
-# Samples of a block besides their coefficients: two fields, their difference, its weights and its shells.
-_SAMPLE_BYTES = 72
 
 
 def proportion(a: OperandLike, b: OperandLike, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
@@ -251,7 +244,6 @@ def witness(
     eps: float | None = None,
     dtype: ComplexDtype = "complex128",
     threads: int | None = None,
-    memory: float | str | None = None,
 ) -> xr.DataArray:
     """Return the witness function of two surfaces at points: positive where a has area that b lacks.
 
@@ -270,8 +262,6 @@ def witness(
             multiple of it. Default 1e-9, or 1e-6 in single precision.
         dtype: "complex128" or "complex64", the dtype of the arithmetic, whatever that of the fields.
         threads: Threads of the NUFFT; default one per core.
-        memory: Memory for the computation besides points, result and fields in memory, in bytes or as a text
-            such as "4GB". Default as much as is fastest.
 
     Returns:
         `witness` over (order, point), or (point,) for a single order, with the coordinates `order` and `x`,
@@ -283,7 +273,7 @@ def witness(
         OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or points lie beyond the half period 1/(2h).
         InputError: Points are not finite or not (n, 3); a surface comes without a lattice; settings are out
-            of range; the memory is too little.
+            of range.
 
     Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
 
@@ -294,21 +284,16 @@ def witness(
     """
     orders = check_orders(order)
     settings = TransformSettings(eps, dtype)
-    allowed_bytes = None if memory is None else available(memory)
     coordinates = _coordinates(points)
     first, second = pair_of(a, b, lattice, orders)
     lattice = Lattice.from_field(first)
     require_points_inside(coordinates, lattice)
     weights = SobolevWeights(lattice, orders)
-    execution = Execution(threads=thread_count(threads), allowed_bytes=allowed_bytes)
-    largest = BLOCK_SAMPLES
-    if allowed_bytes is not None:
-        sample_bytes = _SAMPLE_BYTES + len(orders) * np.dtype(dtype).itemsize
-        largest = max(1, min(BLOCK_SAMPLES, int(_BLOCK_FRACTION * allowed_bytes / sample_bytes)))
+    threads = thread_count(threads)
     values = np.zeros((len(orders), coordinates.shape[1]))
     # FINUFFT refuses to evaluate nothing.
-    for block, (of_a, of_b) in read_blocks(lattice, first, second, largest=largest) if values.size else ():
-        values += _block_values(coordinates, weights, block, of_a - of_b, settings, execution)
+    for block, (of_a, of_b) in read_blocks(lattice, first, second) if values.size else ():
+        values += _block_values(coordinates, weights, block, of_a - of_b, settings, threads)
     dims, labels, _ = axis = order_axis(order)
     values = values.astype(np.float32 if dtype == "complex64" else np.float64)
     places = {name: ("point", row, described(name, LENGTH)) for name, row in zip("xyz", coordinates, strict=True)}
@@ -333,7 +318,7 @@ def _block_values(
     block: Block,
     difference: NDArray[np.complexfloating],
     settings: TransformSettings,
-    execution: Execution,
+    threads: int,
 ) -> Reals:
     """Return the contribution of a block of the difference of two fields to the witness functions, (orders, n)."""
     lattice = weights.lattice
@@ -342,11 +327,7 @@ def _block_values(
     coefficients = np.empty((len(weights.orders), *block.shape), dtype=settings.dtype)
     for row, weight in zip(coefficients, weights.per_shell, strict=True):
         np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-    spec = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads)
-    if execution.allowed_bytes is not None:
-        count = coordinates.shape[1]
-        allowed_bytes = (1 - _BLOCK_FRACTION) * execution.allowed_bytes
-        spec = fastest_spec(spec, Workload(count, count, fill=1.0), CPU.costs, allowed_bytes)
+    spec = NufftSpec(block.shape, settings.eps, settings.dtype, threads=threads)
     return evaluate_at(coordinates, coefficients, lattice, block, spec)
 
 
@@ -356,7 +337,12 @@ def _coordinates(points: ArrayLike) -> Reals:
     Raises:
         InputError: The points are not real, finite or of that shape.
     """
-    array = point_array(points, "points")
+    try:
+        array = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"points must be real numbers (n, 3): {error}") from error
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"points must have the shape (n, 3), found {array.shape}")
     bad = int(np.count_nonzero(~np.isfinite(array).all(axis=1)))
     if bad:
         raise InputError(f"{bad} of {len(array)} points have NaN or infinite coordinates")

@@ -298,7 +298,7 @@ def test_is_positive_where_the_first_has_more() -> None:
     assert witness(Sphere(), Sphere(), -4.0, right, lattice=lattice).values == pytest.approx([0, 0], abs=1e-15)
 
 
-def test_single_precision_and_little_memory() -> None:
+def test_single_precision() -> None:
     lattice = Lattice(4.0, 40)
     points = np.random.default_rng(8).uniform(-1, 1, (5_000, 3))
     a, b = (fourier_transform(surface, lattice) for surface in (BOX, Sphere()))
@@ -307,10 +307,6 @@ def test_single_precision_and_little_memory() -> None:
     single = witness(a, b, -3.0, points, dtype="complex64", threads=1)
     assert single.dtype == np.float32
     assert 1e-9 * scale < float(np.abs(single - exact).max()) < 1e-4 * scale
-    little = witness(a, b, -3.0, points, eps=1e-12, memory="15MB")
-    assert float(np.abs(little - exact).max()) < 1e-9 * scale
-    with pytest.raises(InputError, match="give at least"):
-        witness(a, b, -3.0, points, memory=1e5)
 
 
 def test_missing_samples_and_no_points() -> None:
