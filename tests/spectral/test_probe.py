@@ -7,7 +7,6 @@ import pytest
 
 from sobolev_batch import (
     Ellipsoid,
-    InputError,
     Lattice,
     Mesh,
     Sphere,
@@ -18,7 +17,7 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.fields import PROBED_ORDERS
-from sobolev_batch.spectral.probe import Sample, draw, draws_for, estimate, measure, needs_probe
+from sobolev_batch.spectral.probe import Sample, draw, estimate, measure, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -62,8 +61,3 @@ def test_closed_forms_need_a_probe_in_single_precision_alone() -> None:
     assert not needs_probe(Sphere(), double)
     assert needs_probe(BOX, double)
     assert needs_probe(Ellipsoid((1.0, 0.8, 0.6)), double)
-
-
-def test_unknown_kinds_of_surfaces_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match=r"must be a Mesh, a Sphere or a parametrised surface .*, found Lattice"):
-        Sample.from_surface(LATTICE, draws_for([Sphere()], LATTICE, ORDERS, 2))  # type: ignore[arg-type]

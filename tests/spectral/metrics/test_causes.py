@@ -26,6 +26,7 @@ from sobolev_batch import (
 from sobolev_batch.spectral import fields
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.metrics import causes
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.spheres import sphere_inner_product
@@ -253,7 +254,8 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     a, b = random_pair(3)
     points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))
     whole = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
-    monkeypatch.setattr("sobolev_batch.spectral.metrics.causes.BLOCK_SAMPLES", 100)
+    read = fields.read_blocks
+    monkeypatch.setattr(causes, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=100))
     assert len(RANDOM.split(100)) > 10
     in_blocks = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
     assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())

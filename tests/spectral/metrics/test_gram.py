@@ -60,19 +60,6 @@ def test_sums_are_those_of_shells(intervals: int) -> None:
     assert squares.outer == pytest.approx(expected.outer, rel=1e-13 if intervals == 2 else 0.15)
 
 
-def test_an_arrangement_has_every_sample_once_and_few_of_the_outer_ones() -> None:
-    lattice = Lattice(4.0, 64)
-    arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
-    assert np.array_equal(np.sort(arrangement.order), np.arange(lattice.half.size))
-    ends = [(run.samples.start, run.samples.stop) for run in arrangement.runs]
-    assert [start for start, _ in ends] == [0, *(stop for _, stop in ends[:-1])]
-    assert ends[-1][1] == lattice.half.size
-    for run in arrangement.runs:
-        assert np.all(arrangement.shells[run.samples] % 4 == run.residue)
-    sampled = sum(run.samples.stop - run.samples.start for run in arrangement.runs if run.window is not None)
-    assert sampled < lattice.half.size / 15
-
-
 def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
     # They come from the same samples as the squares, so that what cancels leaves no noise behind.
     lattice = Lattice(4.0, 40)

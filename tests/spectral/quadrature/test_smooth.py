@@ -24,14 +24,12 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.backends import CPU
-from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature import smooth as resolution
 from sobolev_batch.spectral.quadrature.smooth import direct_transform, exact_values, resolution_of
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 from tests.support.fake_device import Device
 from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
 from tests.support.smooth_shapes import (
@@ -237,16 +235,6 @@ def test_what_doubling_the_nodes_changes_is_reported() -> None:
     assert (truth > 1e-6).all()
     _, change = resolution_of(surface, LATTICE.highest_frequency, 1e-4)
     assert (reported > change * surface.area).all()
-
-
-@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
-def test_the_quality_knows_area_and_extents(surface: Smooth) -> None:
-    found = Quality.from_json(fourier_transform(surface, LATTICE, threads=1).attrs["quality"])
-    points = np.concatenate([part for part, _ in surface.nodes((301, 301))], axis=1)
-    assert found.area == surface.area
-    assert np.array(found.extent.highest) == pytest.approx((DIRECTIONS @ points).max(axis=1), abs=1e-3)
-    assert np.array(found.extent.lowest) == pytest.approx((DIRECTIONS @ points).min(axis=1), abs=1e-3)
-    assert len(found.probe.shells) == 32 + 8
 
 
 @pytest.mark.slow
