@@ -26,7 +26,7 @@ from sobolev_batch.spectral.transform.settings import (
     choose_settings,
     thread_count,
 )
-from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.spectral.transform.transform import Transformed, transform_block
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 
@@ -110,22 +110,16 @@ class Quality:
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
-    """A computed field.
+class Field(Transformed):
+    """The whole field of a surface.
 
     Attributes:
-        values: Complex array on the half lattice.
         quality: Area, extent and probe, from which errors follow.
         settings: Settings that it was computed with.
-        points: Number of quadrature points.
-        backend: Library that computed it: see `Transformed`.
     """
 
-    values: Complexes
     quality: Quality
     settings: TransformSettings
-    points: int
-    backend: str
 
 
 def fourier_transform(
@@ -228,7 +222,8 @@ def compute_field(
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
         probe = probe_block(surface, lattice, settings, block, values, draws)
-    return Field(values, Quality.from_surface(surface, probe), settings, transformed.points, transformed.backend)
+    quality = Quality.from_surface(surface, probe)
+    return Field(values, transformed.points, transformed.backend, quality, settings)
 
 
 def field_for(

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -88,20 +88,66 @@ def transform_block(
         require_inside(surface, lattice)
     if kind.is_closed_form:
         return Transformed(_closed_form(kind, lattice, block, settings.dtype), 0, "closed form")
+    plan = plan or settings.plan(surface, lattice)
+    whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
     low, high = surface.bounds
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
-    task = _QuadratureTransform(plan or settings.plan(surface, lattice), lattice, block, settings, execution, fill)
+
+    def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
+        workload = Workload(triangles=plan.triangles, fill=fill)
+        if costs.projected_bytes(whole, workload) > allowed_bytes:
+            # Only now do the points need counting.
+            workload = replace(workload, points=plan.expected_points, largest_points=plan.largest_points)
+        spec = fastest_spec(whole, workload, costs, allowed_bytes)
+        return spec, costs.projected_bytes(spec, workload)
+
+    def compute(backend: Backend, spec: NufftSpec) -> Transformed:
+        values, points = transform_points(plan.batches(spec.batch, backend), lattice, block, spec, backend)
+        return Transformed(backend.download(values), points, backend.library)
+
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
-    spec = task.whole if execution.allowed_bytes is None else task.fitting(CPU, execution.allowed_bytes)[0]
-    failure = ""
-    if isinstance(execution.backend, Gpu):
-        transformed = task.on_gpu(execution.backend)
-        if isinstance(transformed, Transformed):
-            return transformed
-        library = execution.backend.library
-        _log.warning("%s: %s; the processor computes it instead", library, transformed)
-        failure = f" after {library}: {transformed}"
-    return task.compute(CPU, spec, failure)
+    spec = whole if execution.allowed_bytes is None else fitting(CPU.costs, execution.allowed_bytes)[0]
+    if not isinstance(execution.backend, Gpu):
+        return compute(CPU, spec)
+    gpu = execution.backend
+    try:
+        with gpu.work():
+            return _on_gpu(gpu, block.size * whole.item_bytes, fitting, compute)
+    except InputError:  # nothing is small enough
+        failure = _OUT_OF_MEMORY
+    except Exception as error:
+        failure = one_line(error)[:200]
+    _log.warning("%s: %s; the processor computes it instead", gpu.library, failure)
+    transformed = compute(CPU, spec)
+    return replace(transformed, backend=f"{transformed.backend} after {gpu.library}: {failure}")
+
+
+def _on_gpu(
+    gpu: Gpu,
+    result_bytes: int,
+    fitting: Callable[[Costs, float], tuple[NufftSpec, int]],
+    compute: Callable[[Backend, NufftSpec], Transformed],
+) -> Transformed:
+    """Compute on a GPU; if memory is too little after all, try again with half as much.
+
+    Raises:
+        InputError: The memory is too little.
+    """
+    allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - result_bytes
+    for _ in range(_ATTEMPTS):
+        spec, projected = fitting(gpu.costs, allowed_bytes)
+        gpu.release_memory(projected)
+        try:
+            return compute(gpu, spec)
+        except Exception as error:
+            # cuFINUFFT says of a failure only where it happened, and nothing if cuFFT ran out of memory.
+            unexplained = type(error) is RuntimeError and projected > allowed_bytes / 2
+            if not (gpu.is_out_of_memory(error) or unexplained):
+                raise
+        allowed_bytes = min(allowed_bytes, projected) / 2
+        _log.warning("%s: %s; trying again with %.3g MB", gpu.library, _OUT_OF_MEMORY, allowed_bytes / 1e6)
+        gpu.release_memory(math.inf)
+    raise InputError(_OUT_OF_MEMORY)
 
 
 def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_bytes: float) -> NufftSpec:
@@ -180,78 +226,6 @@ def projected_bytes(
     if execution.allowed_bytes is not None:
         needed = min(needed, execution.allowed_bytes)
     return block.size * whole.item_bytes + math.ceil(needed)
-
-
-@dataclass(frozen=True, eq=False)
-class _QuadratureTransform:
-    """The transform of a surface's points onto a block.
-
-    Attributes:
-        fill: Fraction of the lattice's period that the surface's bounding box fills, by volume.
-    """
-
-    plan: SurfaceKind
-    lattice: FrequencyLattice
-    block: Block
-    settings: TransformSettings
-    execution: Execution
-    fill: float
-
-    @property
-    def whole(self) -> NufftSpec:
-        """NUFFT of the whole block."""
-        settings, execution = self.settings, self.execution
-        return NufftSpec(
-            self.block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch
-        )
-
-    def fitting(self, backend: Backend, allowed_bytes: float) -> tuple[NufftSpec, int]:
-        """Return the fastest NUFFTs within the allowed memory, and the memory that they take.
-
-        Raises:
-            InputError: The memory is too little.
-        """
-        workload = Workload(triangles=self.plan.triangles, fill=self.fill)
-        costs = backend.costs
-        if costs.projected_bytes(self.whole, workload) > allowed_bytes:
-            # Only now do the points need counting.
-            workload = replace(workload, points=self.plan.expected_points, largest_points=self.plan.largest_points)
-        spec = fastest_spec(self.whole, workload, costs, allowed_bytes)
-        return spec, costs.projected_bytes(spec, workload)
-
-    def compute(self, backend: Backend, spec: NufftSpec, failure: str = "") -> Transformed:
-        """Return the transform, computed by one backend."""
-        batches = self.plan.batches(spec.batch, backend)
-        values, points = transform_points(batches, self.lattice, self.block, spec, backend)
-        return Transformed(backend.download(values), points, backend.library + failure)
-
-    def on_gpu(self, gpu: Gpu) -> Transformed | str:
-        """Return the transform, computed by a GPU, or the reason why it failed."""
-        try:
-            with gpu.work():
-                return self._attempts_on(gpu)
-        except InputError:  # nothing is small enough
-            return _OUT_OF_MEMORY
-        except Exception as error:
-            return one_line(error)[:200]
-
-    def _attempts_on(self, gpu: Gpu) -> Transformed | str:
-        """Compute on a GPU; if memory is too little after all, try again with half as much."""
-        allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - self.block.size * self.whole.item_bytes
-        for _ in range(_ATTEMPTS):
-            spec, projected = self.fitting(gpu, allowed_bytes)
-            gpu.release_memory(projected)
-            try:
-                return self.compute(gpu, spec)
-            except Exception as error:
-                # cuFINUFFT says of a failure only where it happened, and nothing if cuFFT ran out of memory.
-                unexplained = type(error) is RuntimeError and projected > allowed_bytes / 2
-                if not (gpu.is_out_of_memory(error) or unexplained):
-                    raise
-            allowed_bytes = min(allowed_bytes, projected) / 2
-            _log.warning("%s: %s; trying again with %.3g MB", gpu.library, _OUT_OF_MEMORY, allowed_bytes / 1e6)
-            gpu.release_memory(math.inf)
-        return _OUT_OF_MEMORY
 
 
 def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
