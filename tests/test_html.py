@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 import sobolev_batch as sb
+from sobolev_batch.results.tables.league import leagues_of
+from tests.support.leagues import method_rows
 from tests.support.studies import small_table
 
 HOSTILE = "<script>alert('&')</script>"
@@ -76,21 +78,10 @@ def test_a_plan_shows_its_lines() -> None:
         assert line[15:] in page.text
 
 
-@pytest.mark.slow
-def test_a_league_shows_both_tables(tmp_path: Path) -> None:
-    families = [
-        {"name": name, "source": "icosphere", "levels": levels}
-        for name, levels in ((HOSTILE_NAME, [0, 1]), ("b", [0, 2]))
-    ]
-    spheres = {
-        "object": [
-            {"name": name, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
-            for name, radius in (("ball", 1.0), ("large", 1.1))
-        ]
-    }
-    table = {key: value for key, value in small_table(family=families).items() if key != "reference"}
-    sb.run(sb.StudyCollection.from_table({**table, **spheres}), "memory://html-league.zarr", workers=1)
-    page = shown(sb.league("memory://html-league.zarr")[0])
+def test_a_league_shows_both_tables() -> None:
+    rows = method_rows({HOSTILE_NAME: {100: 0.1, 400: 0.03}, "b": {100: 0.2, 400: 0.05}})
+    (league,) = leagues_of({"ball": rows, "large": rows}, ["ball", "large"])
+    page = shown(league)
     assert page.tags.count("table") == 2
     assert HOSTILE_NAME in page.text
     assert "over 2 objects" in page.text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -16,6 +16,7 @@ from sobolev_batch.results.report import collection as collection_module
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.tables.league import leagues_of
 from tests.support.browser import Browser, browser
+from tests.support.leagues import method_rows
 from tests.support.studies import small_table
 
 SCRIPT = "<script>window.ran=1</script>"
@@ -112,24 +113,6 @@ def test_meshes_of_a_collection_are_shown_by_the_report_of_an_object(store: str)
         make_report(store, witnesses=["ico/1"])
 
 
-def frame(factors: Mapping[str, float], scale: float) -> pd.DataFrame:
-    """Return rows of a table of methods whose distances differ by factors."""
-    rows = [
-        {
-            "order": -2.0,
-            "mesh": f"{method}/{triangles}",
-            "family": method,
-            "triangles": triangles,
-            "edge_length": triangles**-0.5,
-            "relative": scale * factor / triangles,
-            "relative_error": 0.0,
-        }
-        for method, factor in factors.items()
-        for triangles in (100, 400)
-    ]
-    return pd.DataFrame(rows)
-
-
 @pytest.mark.parametrize(
     ("factors", "objects", "sentence"),
     [
@@ -149,6 +132,7 @@ def frame(factors: Mapping[str, float], scale: float) -> pd.DataFrame:
     ],
 )
 def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], objects: int, sentence: str) -> None:
-    tables = {f"o{i}": frame(factors, 1.0) for i in range(objects)}
+    rows = method_rows({method: {n: factor / n for n in (100, 400)} for method, factor in factors.items()})
+    tables = {f"o{i}": rows for i in range(objects)}
     (league,) = leagues_of(tables, list(tables))
     assert collection_module.sentence_of(league) == sentence

@@ -14,28 +14,11 @@ from scipy import stats
 import sobolev_batch as sb
 from sobolev_batch.results.tables.league import League, format_league, leagues_of
 from sobolev_batch.results.tables.statistics import Interval, adjusted, sign_flip_test, within_objects
+from tests.support.leagues import method_rows
 
 SIZES = (100, 400, 1600)
 
 Ranked = Callable[..., League]
-
-
-def frame(distances: Mapping[str, Mapping[int, float]], error: float = 0.0, order: float = -2.0) -> pd.DataFrame:
-    """Return rows of a table from relative distances by method and triangles."""
-    rows = [
-        {
-            "order": order,
-            "mesh": f"{method}/{triangles}",
-            "family": method,
-            "triangles": triangles,
-            "edge_length": triangles**-0.5,
-            "relative": value,
-            "relative_error": error * value,
-        }
-        for method, by_size in distances.items()
-        for triangles, value in by_size.items()
-    ]
-    return pd.DataFrame(rows)
 
 
 @pytest.fixture
@@ -51,7 +34,9 @@ def ranked() -> Ranked:
 
 def of_powers(factors: Mapping[str, float], scale: float, rate: float = 2.0) -> pd.DataFrame:
     """Return the table of methods whose distances are factors of the same power of the edge length."""
-    return frame({name: {n: factor * scale * n ** (-rate / 2) for n in SIZES} for name, factor in factors.items()})
+    return method_rows(
+        {name: {n: factor * scale * n ** (-rate / 2) for n in SIZES} for name, factor in factors.items()}
+    )
 
 
 def test_factors_between_methods_are_found_whatever_the_objects(ranked: Ranked) -> None:
@@ -76,7 +61,7 @@ def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
     first = {n: 1.0 / n for n in SIZES}
     # The same curve, sampled elsewhere: with fewer triangles each, at which a mean of distances would be larger.
     second = {n: 1.0 / n for n in (50, 150, 500, 2000)}
-    tables = {name: frame({"a": first, "b": second}) for name in ("x", "y", "z")}
+    tables = {name: method_rows({"a": first, "b": second}) for name in ("x", "y", "z")}
     made = ranked(tables)
     assert made.pairs["ratio"].item() == pytest.approx(1.0)
     # The middle of the common range, 100 to 1600, on a logarithmic axis.
@@ -85,8 +70,8 @@ def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
 
 def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes(ranked: Ranked) -> None:
     # The k-th meshes of the objects differ in size: a mean of these would put b below a.
-    plain = frame({"a": {n: 1.0 / n for n in (100, 400, 1600)}, "b": {n: 2.0 / n for n in (400, 1600, 6400)}})
-    made = ranked({"x": plain, "y": frame({"a": {n: 3.0 / n for n in SIZES}, "b": {n: 6.0 / n for n in SIZES}})})
+    plain = method_rows({"a": {n: 1.0 / n for n in (100, 400, 1600)}, "b": {n: 2.0 / n for n in (400, 1600, 6400)}})
+    made = ranked({"x": plain, "y": method_rows({"a": {n: 3.0 / n for n in SIZES}, "b": {n: 6.0 / n for n in SIZES}})})
     lines = {line.get_label(): line for line in sb.plot_league(made).lines}
     for method, relative in made.table.set_index("method")["relative"].items():
         places, values = np.asarray(lines[str(method)].get_xydata()).T
@@ -96,7 +81,7 @@ def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes(ra
 
 def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
     distances = {"a": dict.fromkeys(SIZES, 1.0), "b": dict.fromkeys(SIZES, 1.1)}
-    sharp, blurred = (ranked({f"{i}": frame(distances, error) for i in range(8)}) for error in (1e-3, 0.1))
+    sharp, blurred = (ranked({f"{i}": method_rows(distances, error) for i in range(8)}) for error in (1e-3, 0.1))
     assert sharp.pairs["nearer"].item() == "a"
     assert sharp.table["last_rank"].tolist() == [1, 2]
     assert blurred.pairs["nearer"].item() == ""
@@ -105,7 +90,7 @@ def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
 
 
 def test_a_distance_below_its_error_bounds_nothing(ranked: Ranked) -> None:
-    tables = {f"{i}": frame({"a": {100: 1e-3}, "b": {100: 1.0}}, error=2.0) for i in range(6)}
+    tables = {f"{i}": method_rows({"a": {100: 1e-3}, "b": {100: 1.0}}, error=2.0) for i in range(6)}
     made = ranked(tables)
     assert np.isinf(made.table["high"]).all()
     assert made.table["last_rank"].tolist() == [2, 2]
@@ -128,7 +113,7 @@ POWERS = of_powers({"a": 1, "b": 2}, 1.0)
 def test_objects_that_cannot_be_compared_are_left_out_and_named(
     distances: Mapping[str, Mapping[int, float]], reason: str
 ) -> None:
-    tables = {"x": POWERS, "y": frame(distances, error=0.03), "z": POWERS}
+    tables = {"x": POWERS, "y": method_rows(distances, error=0.03), "z": POWERS}
     (made,) = leagues_of(tables, [*tables, "later"])
     assert made.objects == ("x", "z")
     assert made.left_out == {"later": "it has no tables yet", "y": reason}
@@ -147,17 +132,17 @@ def test_methods_may_be_chosen_and_must_be_known(ranked: Ranked) -> None:
 
 
 def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate(ranked: Ranked) -> None:
-    near = frame({"a": {1000: 1.0}, "b": {1100: 2.0}})
+    near = method_rows({"a": {1000: 1.0}, "b": {1100: 2.0}})
     made = ranked({"x": near, "z": near})
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
     assert made.table["rate"].isna().all()
-    steep = frame({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
+    steep = method_rows({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
     np.testing.assert_allclose(ranked({"x": POWERS, "steep": steep}).table["rate"], 2.0)
 
 
 def test_objects_are_named_with_the_orders_that_leave_them_out(ranked: Ranked) -> None:
     plain = of_powers({"a": 1, "b": 2}, 1.0)
-    exact = frame({"a": dict.fromkeys(SIZES, 1e-8), "b": {n: 1.0 / n for n in SIZES}})
+    exact = method_rows({"a": dict.fromkeys(SIZES, 1e-8), "b": {n: 1.0 / n for n in SIZES}})
     every, some = ranked({"x": plain, "box": plain}), ranked({"x": plain, "box": exact})
     assert "box is left out at order -2: a reproduced it" in format_league([every, some])
     assert "box is left out: a reproduced it" in format_league([some, some])
@@ -171,13 +156,13 @@ def test_few_objects_are_said_to_be_too_few(ranked: Ranked) -> None:
 
 
 def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size(ranked: Ranked) -> None:
-    close = frame({"a": {1000: 0.0100, 1001: 0.0102}, "b": {1150: 0.0100}})
+    close = method_rows({"a": {1000: 0.0100, 1001: 0.0102}, "b": {1150: 0.0100}})
     made = ranked(dict.fromkeys("stuvwxyz", close))
     assert made.table.set_index("method").loc["a", "relative"] == pytest.approx(0.0102)
 
 
 def test_meshes_of_one_size_all_count(ranked: Ranked) -> None:
-    tables = frame({"a": {1000: 0.01}, "b": {1000: 0.015}})
+    tables = method_rows({"a": {1000: 0.01}, "b": {1000: 0.015}})
     more = [tables[tables["family"] == "a"].assign(relative=relative) for relative in (0.03, 0.03)]
     made = ranked(dict.fromkeys("stuvwxyz", pd.concat([tables, *more], ignore_index=True)))
     assert made.table["method"].tolist() == ["b", "a"]
