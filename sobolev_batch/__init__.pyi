@@ -58,7 +58,6 @@ from .spectral.metrics.causes import proportion as proportion
 from .spectral.metrics.causes import spectrum as spectrum
 from .spectral.metrics.causes import witness as witness
 from .spectral.metrics.norms import distance as distance
-from .spectral.metrics.norms import inner_product as inner_product
 from .spectral.metrics.norms import norm as norm
 from .spectral.metrics.yardsticks import yardsticks as yardsticks
 from .surfaces.formats.readers import as_mesh as as_mesh

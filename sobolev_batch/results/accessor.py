@@ -11,7 +11,7 @@ from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import OperandLike, pair_of
 from sobolev_batch.spectral.lattice import AXES, Lattice
 from sobolev_batch.spectral.metrics.causes import proportion, spectrum, witness
-from sobolev_batch.spectral.metrics.norms import distance, inner_product, norm
+from sobolev_batch.spectral.metrics.norms import distance, norm
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
@@ -24,7 +24,7 @@ class SobolevAccessor:
     you open with plain xarray, import this class: ``from sobolev_batch import SobolevAccessor``.
 
     A field lies over xi_x, xi_y and xi_z >= 0, is the transform ∫ exp(-2πi ξ·x) dμ(x) with ξ in cycles per
-    unit length, and may be lazy. `norm`, `inner_product`, `distance`, `proportion` and `spectrum` also take a
+    unit length, and may be lazy. `norm`, `distance`, `proportion` and `spectrum` also take a
     stack of fields along one more dimension, such as mesh. They read one field at a time, and their results
     have that dimension.
 
@@ -55,10 +55,6 @@ class SobolevAccessor:
     def norm(self, order: Orders) -> xr.Dataset:
         """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""
         return self._each(lambda field: norm(field, order))
-
-    def inner_product(self, other: OperandLike, order: Orders) -> xr.Dataset:
-        """Return the inner product with another field or a surface; see `sobolev_batch.inner_product`."""
-        return self._each_with(other, order, lambda field, common: inner_product(field, common, order))
 
     def distance(self, other: OperandLike, order: Orders) -> xr.Dataset:
         """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""

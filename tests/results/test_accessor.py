@@ -33,7 +33,6 @@ def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) ->
     own: SobolevAccessor = a.sobolev
     xr.testing.assert_identical(own.norm(ORDERS), sb.norm(a, ORDERS))
     xr.testing.assert_identical(own.distance(b, -2), sb.distance(a, b, -2))
-    xr.testing.assert_identical(own.inner_product(b, ORDERS), sb.inner_product(a, b, ORDERS))
     xr.testing.assert_identical(own.proportion(b, ORDERS), sb.proportion(a, b, ORDERS))
     xr.testing.assert_identical(own.spectrum(b, ORDERS, bands=5), sb.spectrum(a, b, ORDERS, bands=5))
     xr.testing.assert_identical(own.spectrum(None, -2), sb.spectrum(a, None, -2))

@@ -32,7 +32,6 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "time": described("time of the mesh", description="in the unit of the study's times"),
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
     **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
-    "inner_product": described("Sobolev inner product", LENGTH),
     "squared_distance": described("squared Sobolev distance", LENGTH),
     "gradient": described("derivative of the squared distance with respect to the vertices", NUMBER),
     "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),

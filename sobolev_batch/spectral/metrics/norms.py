@@ -1,4 +1,4 @@
-"""Sobolev norms, inner products and distances of fields, for any list of orders at once.
+"""Sobolev norms and distances of fields, for any list of orders at once.
 
 The weight (1 + |ξ|²)^s depends on the shell |k|² of a lattice point only. A field is therefore
 reduced to one number per shell first, whatever the orders; a norm of any order is then a short
@@ -33,13 +33,12 @@ from sobolev_batch.spectral.fields import (
     field_of,
     pair_of,
     quality_of,
-    read_blocks,
     shells_against,
     shells_of,
 )
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
-from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders
 from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
@@ -104,47 +103,6 @@ def norm(
     weights = SobolevWeights(Lattice.from_field(field), orders)
     estimate = _estimate(weights, shells_of(field, None, weights.lattice), [field])
     return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
-
-
-def inner_product(
-    a: OperandLike,
-    b: OperandLike,
-    order: Orders,
-    *,
-    lattice: Lattice | None = None,
-) -> xr.Dataset:
-    """Return the Sobolev inner product <a, b>_s of two surfaces' area measures, which is real.
-
-    Args:
-        a: Field, or a surface; see `norm`. The inner product of two spheres without a lattice is a closed form.
-        b: Field on the same lattice, or a surface.
-        order: One order s < -1/2, or several.
-        lattice: Lattice to transform surfaces on. A field brings its own.
-
-    Returns:
-        Dataset over `order` with `inner_product`, float64, in units of length. A single order has no
-        dimension. Attributes hold the lattice and the kernel.
-
-    Raises:
-        OrderError: An order is not below -1/2.
-        LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
-        InputError: A surface comes without a lattice.
-
-    >>> from sobolev_batch import Sphere, inner_product
-    >>> f"{inner_product(Sphere(), Sphere(0.5), -2.0)['inner_product'].item():.6f}"
-    '1.758104'
-    """
-    orders = check_orders(order)
-    if spheres := _spheres(a, b, lattice=lattice):
-        products = np.array([sphere_inner_product(spheres[0], spheres[1], s) for s in orders])
-        return labelled(order, {"inner_product": products}, {})
-    first, second = pair_of(a, b, lattice, orders)
-    weights = SobolevWeights(Lattice.from_field(first), orders)
-    sums = np.zeros(weights.lattice.shell_count)
-    for block, (values, others) in read_blocks(weights.lattice, first, second):
-        sums += shell_sums(values, others, weights.lattice, block)
-    attributes = lattice_attributes(weights.lattice, first, second)
-    return labelled(order, {"inner_product": weights.per_shell @ sums}, attributes)
 
 
 def distance(

@@ -15,7 +15,6 @@ from sobolev_batch import (
     distance,
     fourier_transform,
     icosphere,
-    inner_product,
     norm,
     proportion,
     spectrum,
@@ -28,7 +27,6 @@ A, B = fourier_transform(icosphere(1), LATTICE), fourier_transform(Sphere(), LAT
 POINTS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 METRICS: dict[str, Callable[[list[float]], xr.Dataset]] = {
     "norm": lambda order: norm(A, order),
-    "inner_product": lambda order: inner_product(A, B, order),
     "distance": lambda order: distance(A, B, order),
     "proportion": lambda order: proportion(A, B, order),
     "spectrum": lambda order: spectrum(A, B, order),

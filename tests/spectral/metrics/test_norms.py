@@ -1,4 +1,4 @@
-"""Norms, inner products and distances of fields."""
+"""Norms and distances of fields."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from sobolev_batch import (
     distance,
     fourier_transform,
     icosphere,
-    inner_product,
     norm,
 )
 from sobolev_batch.spectral.quadrature.kinds import kind_of
@@ -39,13 +38,6 @@ def test_distance_is_the_norm_of_the_difference() -> None:
     a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(), LATTICE)
     distances = distance(a, b, [-1.0, -3.0])["distance"].values
     assert distances == pytest.approx([full_lattice_norm((a - b).values, LATTICE, s) for s in (-1.0, -3.0)], rel=1e-13)
-
-
-def test_inner_product_polarises() -> None:
-    a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(0.8, (0.1, 0.2, 0.0)), LATTICE)
-    product = inner_product(a, b, -2.5)["inner_product"].item()
-    squares = norm(a, -2.5)["norm"].item() ** 2 + norm(b, -2.5)["norm"].item() ** 2
-    assert squares - 2 * product == pytest.approx(distance(a, b, -2.5)["distance"].item() ** 2, rel=1e-12)
 
 
 @pytest.mark.slow
