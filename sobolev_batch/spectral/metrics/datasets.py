@@ -115,7 +115,7 @@ def labelled_distances(
     order: Orders,
     distances: NormEstimate,
     reference: ReferenceEstimate,
-    attributes: Mapping[str, object] | None = None,
+    attributes: Mapping[str, object],
 ) -> xr.Dataset:
     """Return distances and what they are relative to the reference, in the form of `labelled`."""
     relative, relative_errors = distances.relative_to(reference.norms)
@@ -127,7 +127,7 @@ def labelled_distances(
         "area_share_error": share_errors,
         "excess": reference.excesses,
     }
-    return labelled(order, {**distances.named("distance"), **columns}, attributes or {})
+    return labelled(order, {**distances.named("distance"), **columns}, attributes)
 
 
 def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:

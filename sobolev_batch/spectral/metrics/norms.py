@@ -161,10 +161,8 @@ def distance(
         return _distance_of_spheres(spheres[0], spheres[1], order)
     has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
     if lattice is not None and not has_fields and are_equal(a, b):
-        settings = {"xi_max": lattice.xi_max, "M": lattice.M}
-        return labelled_distances(
-            order, Solution.zero(orders).estimate, ReferenceEstimate.of_equal(len(orders)), settings
-        )
+        nothing, reference = Solution.zero(orders).estimate, ReferenceEstimate.of_equal(len(orders))
+        return labelled_distances(order, nothing, reference, {"xi_max": lattice.xi_max, "M": lattice.M})
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
@@ -245,7 +243,7 @@ def _distance_of_spheres(a: Sphere, b: Sphere, order: Orders) -> xr.Dataset:
     squares = np.array([sphere_norm(a, s) ** 2 for s in orders]) + norms**2
     products = np.array([sphere_inner_product(a, b, s) for s in orders]) - norms**2
     reference = ReferenceEstimate(_closed_form(norms, norms**2), products, _CLOSED_FORM_ACCURACY * squares)
-    return labelled_distances(order, _closed_form(values, squares), reference)
+    return labelled_distances(order, _closed_form(values, squares), reference, {})
 
 
 def _closed_form(values: Reals, squares: Reals) -> NormEstimate:
