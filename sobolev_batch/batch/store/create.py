@@ -50,15 +50,12 @@ def require_usable(location: Location) -> None:
         StoreError: The location cannot be read, or holds something else.
     """
     store = Store(location)
-    try:
-        exists = store.exists()
-    except DamageError:
-        # See `prepare_store`.
-        return
-    if not exists:
-        location.require_free(besides=LOCK_KEYS)
-    elif not store.is_unfinished:
-        store.attributes()
+    # Damaged metadata are made again.
+    with suppress(DamageError):
+        if not store.exists():
+            location.require_free(besides=LOCK_KEYS)
+        elif not store.is_unfinished:
+            store.attributes()
 
 
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:

@@ -474,9 +474,7 @@ def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
         StoreError: The location cannot be read, or holds something else.
     """
     existing = Store(store)
-    try:
-        if not existing.exists() or existing.is_unfinished:
-            return None
-    except DamageError:
-        return None
-    return existing.choice() if existing.attributes()["study"].get("choice") else None
+    with suppress(DamageError):
+        if existing.exists() and not existing.is_unfinished and existing.attributes()["study"].get("choice"):
+            return existing.choice()
+    return None

@@ -53,6 +53,10 @@ def url(request: pytest.FixtureRequest) -> str:
     return f"s3://{BUCKET}/{re.sub(r'[^a-z0-9]+', '-', request.node.name.lower())}/results.zarr"
 
 
+def key_of(url: str) -> str:
+    return url.removeprefix(f"s3://{BUCKET}/")
+
+
 @pytest.fixture(scope="module")
 def stored(server: Server, threads: Client) -> str:
     """The small study's store after a run; not to be changed."""
@@ -69,7 +73,7 @@ def test_a_study_on_two_processes_equals_that_of_a_folder(server: Server, url: s
     assert_same(tree, open_store(finished_store))
     assert len(set(variable(tree, "meshes", "worker").values.tolist())) == 2
     # What is written is what a folder holds, key for key.
-    keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
+    keys = server.keys(key_of(url))
     assert {key.split("results.zarr/")[1] for key in keys} == {
         str(path.relative_to(finished_store)) for path in finished_store.rglob("*") if path.is_file()
     }
@@ -113,7 +117,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     del table["lattice"]
     plan = make_plan(Study.from_table(table))
     store = prepare_store(url, plan)
-    prefix = url.removeprefix(f"s3://{BUCKET}/")
+    prefix = key_of(url)
     empty = server.keys(prefix)
     store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
     store.write_record(1, Record("key", "complete"))
@@ -148,7 +152,7 @@ def test_the_command_line_and_credentials_that_stay_in_the_environment(
     assert done.returncode == 0, done.stderr
     assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
     assert "DEBUG" in done.stderr
-    keys = server.keys(url.removeprefix(f"s3://{BUCKET}/"))
+    keys = server.keys(key_of(url))
     stored = b"".join(server.client().get_object(Bucket=BUCKET, Key=key)["Body"].read() for key in keys)
     for hidden in (SECRET, TOKEN, "Signature=", "tester", server.url):
         assert hidden not in done.stdout
@@ -159,14 +163,6 @@ def test_the_command_line_and_credentials_that_stay_in_the_environment(
     assert call("table", url, "--format", "csv", folder=tmp_path).stdout.count("\n") == 5
     drawn = call("plot", url, folder=tmp_path).stdout.split()
     assert {path.name for path in tmp_path.iterdir()} == {"study.toml", *drawn}
-
-
-def test_a_place_that_holds_something_else(server: Server, url: str) -> None:
-    plan = make_plan(Study.from_table(small_table()))
-    server.client().put_object(Bucket=BUCKET, Key=url.removeprefix(f"s3://{BUCKET}/") + "/precious.txt", Body=b"text")
-    with pytest.raises(StoreError, match="not empty and holds no store"):
-        prepare_store(url, plan)
-    assert len(server.keys(url.removeprefix(f"s3://{BUCKET}/"))) == 1
 
 
 def assert_refused(arguments: Sequence[str], environment: dict[str, str], message: str, folder: Path) -> None:
@@ -192,11 +188,14 @@ def deaf() -> Iterator[str]:
 def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path: Path, deaf: str) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     there, nowhere = f"s3://{BUCKET}/nothing.zarr", "s3://no-such-bucket/results.zarr"
+    taken = f"s3://{BUCKET}/taken.zarr"
+    server.client().put_object(Bucket=BUCKET, Key="taken.zarr/precious.txt", Body=b"text")
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
     unknown = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
     cases: list[tuple[tuple[str, ...], dict[str, str], str]] = [
         (("status", there), {}, "it holds no store of a study"),
+        (("run", "study.toml", "--store", taken), {}, "not empty and holds no store"),
         (("run", "study.toml", "--store", nowhere), {}, "cannot be read: there is no bucket 'no-such-bucket'"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}, "cannot be read: Could not connect"),
         (("status", there), {"AWS_ENDPOINT_URL": f"http://u:{SECRET}@127.0.0.1:{port}"}, "cannot be read: "),
@@ -206,6 +205,7 @@ def test_no_store_there_is_not_the_same_as_no_way_there(server: Server, tmp_path
     for arguments, environment, message in cases:
         assert_refused(arguments, environment, message, tmp_path)
     assert server.keys("nothing.zarr") == []
+    assert server.keys("taken.zarr") == ["taken.zarr/precious.txt"]
 
 
 @pytest.mark.process
@@ -258,7 +258,7 @@ def test_workers_that_do_not_reach_the_store_are_found_at_once(server: Server, u
                 StoreError, match=r"the worker tcp://\S+ cannot use the store: s3://.*Could not connect"
             ):
                 run(Study.from_table(small_table()), url, client)
-    assert server.keys(url.removeprefix(f"s3://{BUCKET}/")) == []
+    assert server.keys(key_of(url)) == []
 
 
 def test_a_store_in_memory_is_computed_by_threads(study: Study, finished_store: Path) -> None:
@@ -287,7 +287,7 @@ def test_a_store_in_memory_is_refused_where_workers_are_other_processes(client: 
 
 
 def test_what_other_processes_write_and_delete_is_seen(server: Server, url: str) -> None:
-    location, key = Location.parse(url), url.removeprefix(f"s3://{BUCKET}/") + "/a/b"
+    location, key = Location.parse(url), key_of(url) + "/a/b"
     assert location.names() == set()
     server.client().put_object(Bucket=BUCKET, Key=key, Body=b"1")
     assert location.names() == {"a"}
@@ -324,7 +324,7 @@ def test_a_damaged_field_is_found_and_repaired(
 ) -> None:
     study, s3 = Study.from_table(small_table()), server.client()
     run(study, url, threads)
-    place = {"Bucket": BUCKET, "Key": url.removeprefix(f"s3://{BUCKET}/") + "/fourier/fourier/c/2/0/0/0"}
+    place = {"Bucket": BUCKET, "Key": key_of(url) + "/fourier/fourier/c/2/0/0/0"}
     data = bytearray(s3.get_object(**place)["Body"].read())
     data[1000] ^= 4
     if damage == "gone":
