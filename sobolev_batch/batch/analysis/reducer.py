@@ -253,30 +253,33 @@ class Reducer:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
     def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals]:
-        """Return norms of rows, distances to the reference and their decomposition, each over (orders, rows).
+        """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
 
-        Without the reference's field, all but the norms are NaN.
+        The four parts are the distance's area part and shape part, see `area_and_shape`, and what lies beyond the last
+        octave in the squared norm and in the squared distance. Without the reference's field, distances are NaN.
         """
         rows = list(rows)
         sums, differences, products, reference = self._sums(rows)
         tails = None if self.tails is None else self._tails(self.tails, rows)
         own = self._estimate(sums, None if tails is None else tails[0], self.areas[rows], self.errors[:, rows])
+        beyond = np.zeros_like(own.values) if tails is None else tails[0].beyond
         if self.reference is None:
             unknown = np.full_like(own.values, np.nan)
-            return own, NormEstimate(*[unknown] * 5), np.stack([unknown] * 3)
+            return own, NormEstimate(*[unknown] * 5), np.stack([unknown, unknown, beyond, unknown])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
         errors = errors + self.errors[:, [self.reference]]
         distances = self._estimate(differences, None if tails is None else tails[1], areas, errors, apart)
-        product, square = products.totals, reference.totals
+        product, square, beyond_difference = products.totals, reference.totals, np.zeros_like(beyond)
         if tails is not None:
-            tail, tail_difference, tail_product, tail_reference = tails
+            _, tail_difference, tail_product, tail_reference = tails
+            beyond_difference = tail_difference.beyond * apart
             # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-            beyond = tail.beyond - tail_reference.beyond - tail_difference.beyond * apart
-            product = product + tail_product + beyond / 2 * apart
+            product = product + tail_product + (beyond - tail_reference.beyond - beyond_difference) / 2 * apart
             square = square + tail_reference.squares
-        return own, distances, area_and_shape(distances.values**2, product, square[:, 0])
+        area, shape, _ = area_and_shape(distances.values**2, product, square[:, 0])
+        return own, distances, np.stack([area, shape, beyond, beyond_difference])
 
     def _sums(self, rows: Sequence[int]) -> list[Sums]:
         """Return sums over the lattice: of rows, differences from the reference, their products with it, and itself.

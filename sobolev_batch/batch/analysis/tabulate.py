@@ -32,7 +32,7 @@ from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 6
+TABLES_VERSION = 7
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
@@ -99,7 +99,7 @@ class Results:
         orders: Sobolev orders s.
         norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, meshes), distances to the reference.
-        proportions: (3, orders, meshes), see `area_and_shape`.
+        parts: (4, orders, meshes), see `Reducer.norms`.
         distances: (5, orders, meshes, others), distances of all pairs, or to the reference alone.
     """
 
@@ -108,7 +108,7 @@ class Results:
     orders: tuple[float, ...]
     norms: Reals
     to_reference: Reals
-    proportions: Reals
+    parts: Reals
     distances: Reals
 
     @classmethod
@@ -116,7 +116,7 @@ class Results:
         """Return the results before any task."""
         count = meshes.sizes["mesh"]
         others = count if every_pair else 1
-        shapes = [(parts, len(orders), count) for parts in (5, 5, 3)]
+        shapes = [(parts, len(orders), count) for parts in (5, 5, 4)]
         arrays = [np.full(shape, np.nan) for shape in (*shapes, (5, len(orders), count, others))]
         return cls(meshes, reference, orders, *arrays)
 
@@ -152,11 +152,11 @@ class Results:
 
     def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Reals], rows: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.norms` for some rows."""
-        norms, to_reference, proportions = outcome
+        norms, to_reference, parts = outcome
         places = [self._places[row] for row in rows]
         self.norms[..., places] = np.stack(list(norms))
         self.to_reference[..., places] = np.stack(list(to_reference))
-        self.proportions[..., places] = proportions
+        self.parts[..., places] = parts
 
     def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
@@ -176,7 +176,7 @@ class Results:
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        return self._table(NormEstimate(*self.norms).named("norm"), "mesh")
+        return self._table({**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}, "mesh")
 
     def distances_table(self) -> xr.Dataset:
         """Return `distance` (mesh, other, order) with its error."""
@@ -205,8 +205,9 @@ class Results:
             **to_reference.named("distance"),
             "relative": relative,
             "relative_error": relative_errors,
-            "area_part": self.proportions[0],
-            "shape_part": self.proportions[1],
+            "area_part": self.parts[0],
+            "shape_part": self.parts[1],
+            "beyond": self.parts[3],
             "rate": rates,
             "rate_error": rate_errors,
             "resolved": errors < distances,

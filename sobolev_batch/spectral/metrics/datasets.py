@@ -47,6 +47,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "relative_error": described("bound on the error of the relative distance", NUMBER),
     "area_part": described("distance explained by a change of total area alone", NORM),
     "shape_part": described("rest of the distance", NORM, description="the squares of both parts add up"),
+    "beyond": described("part of the square beyond the last octave", LENGTH, description="zero without octaves"),
     "area_share": described("share of the squared distance explained by a change of total area", NUMBER),
     "area_share_error": described("bound on the error of that share", NUMBER),
     "moved": described("move of the reference that is like the distance", NUMBER, description="over its radius"),

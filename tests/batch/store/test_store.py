@@ -18,7 +18,6 @@ from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.spectral.fields import Quality
 from tests.support.repository import blocks
 from tests.support.stores import READER
 from tests.support.studies import small_table
@@ -126,20 +125,13 @@ def test_zarr_and_numpy_alone_compute_norms_and_distances(octaves: int, store_pa
     (function,) = (block for block in blocks("docs/store.md", "python") if "def squared_norm" in block)
     names: dict[str, Any] = {}
     exec(function, names)
-    store, labels = zarr.open_group(str(store_path), mode="r"), Store.open(store_path).labels()
-    for row, record in enumerate(Store.open(store_path).records()):
-        assert record is not None
-        tail = Quality.from_json(record.quality).tail
+    store = zarr.open_group(str(store_path), mode="r")
+    norms, convergence, reference = tree["norms"].to_dataset(), tree["convergence"].to_dataset(), 4
+    for row, label in enumerate(Store.open(store_path).labels()):
         for order in (-10.0, -3.0):
-            place = {"mesh": labels[row], "order": order}
-            norm = tree["norms"]["norm"].sel(place).item()
-            distance = tree["convergence"]["distance"].sel(place).item()
-            # What lies beyond the last octave is an estimate, and no sum.
-            beyond = (
-                [0.0, 0.0]
-                if tail is None
-                else [part.at([order])[0].item() if part else 0.0 for part in (tail.own, tail.difference)]
-            )
-            found = names["squared_norm"](store, row, None, order), names["squared_norm"](store, row, 4, order)
-            assert found[0] == pytest.approx(norm**2 - beyond[0], rel=1e-13)
-            assert found[1] == pytest.approx(distance**2 - beyond[1], rel=1e-11, abs=1e-30)
+            norm, distance = (table.sel(mesh=label, order=order) for table in (norms, convergence))
+            squared = names["squared_norm"](store, row, None, order) + norm["beyond"].item()
+            assert squared == pytest.approx(norm["norm"].item() ** 2, rel=1e-13)
+            squared = names["squared_norm"](store, row, reference, order) + distance["beyond"].item()
+            assert squared == pytest.approx(distance["distance"].item() ** 2, rel=1e-13)
+    assert (norms["beyond"] > 0).all() == (convergence["beyond"].drop_sel(mesh="reference") > 0).all() == bool(octaves)
