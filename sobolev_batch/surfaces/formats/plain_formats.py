@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import warnings
 from array import array
 from collections.abc import Iterator
 from itertools import islice
@@ -395,7 +396,10 @@ def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyD
     # The library closes the stream of a text.
     stream = io.BytesIO(source) if isinstance(source, bytes) else source
     stream.seek(0)
-    return PlyData.read(stream, known_list_len=lengths)
+    with warnings.catch_warnings():
+        # NumPy warns where an element has no entries.
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+        return PlyData.read(stream, known_list_len=lengths)
 
 
 def _triangles(faces: PlyElement) -> NDArray[np.int64]:

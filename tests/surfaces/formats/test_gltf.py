@@ -18,48 +18,33 @@ from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, CLOSED, 
 ROTATION = [0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]  # by a right angle about z
 
 
-@pytest.mark.parametrize(
-    ("nodes", "roots", "area", "upper"),
-    [
-        ([{"mesh": 0, "scale": [2, 2, 2]}], None, 4 * 28, [2, 4, 8]),
-        ([{"mesh": 0, "scale": [3, 1, 1]}], None, 2 * (6 + 12 + 8), [3, 2, 4]),
-        ([{"mesh": 0, "scale": [-1, 1, 1]}], None, 28, [0, 2, 4]),
-        ([{"mesh": 0, "translation": [5, 6, 7]}], None, 28, [6, 8, 11]),
-        ([{"mesh": 0, "rotation": ROTATION}], None, 28, [0, 1, 4]),
-        # Scaled, then rotated, then shifted.
-        ([{"mesh": 0, "scale": [3, 1, 1], "rotation": ROTATION, "translation": [9, 0, 0]}], None, 52, [9, 3, 4]),
-        # Column by column: the same rotation, with lengths doubled and a shift.
-        ([{"mesh": 0, "matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 9, 0, 0, 1]}], None, 4 * 28, [9, 2, 8]),
-        ([{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [1, 0, 0]}], [0], 4 * 28, [4, 4, 8]),
-        ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], None, 5 * 28, [2, 4, 8]),
-        ([{"mesh": 0, "name": "a"}, {"mesh": 0, "name": "a", "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
-        ([{"mesh": 0, "name": "world"}, {"mesh": 0, "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
-        # The second node belongs to no scene.
-        ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], [0], 28, [1, 2, 4]),
-        # A camera at a mesh, and a mesh that hangs on a camera.
-        ([{"mesh": 0, "camera": 0}, {"mesh": 0, "translation": [9, 0, 0]}], None, 2 * 28, [10, 2, 4]),
-        ([{"camera": 0, "children": [1], "translation": [9, 0, 0]}, {"mesh": 0}], [0], 28, [10, 2, 4]),
-    ],
-    ids=[
-        "scaled",
-        "stretched",
-        "mirrored",
-        "shifted",
-        "rotated",
-        "all three",
-        "matrix",
-        "child",
-        "two nodes",
-        "two of a name",
-        "named world",
-        "outside the scene",
-        "camera beside",
-        "camera above",
-    ],
-)
-def test_gltf_nodes_place_their_meshes(
-    read: Read, nodes: list[dict[str, Any]], roots: list[int] | None, area: float, upper: list[float]
-) -> None:
+# Nodes, the roots of the scene, and the area and the upper corner of what they place.
+PLACED: dict[str, tuple[list[dict[str, Any]], list[int] | None, float, list[float]]] = {
+    "stretched": ([{"mesh": 0, "scale": [3, 1, 1]}], None, 2 * (6 + 12 + 8), [3, 2, 4]),
+    "mirrored": ([{"mesh": 0, "scale": [-1, 1, 1]}], None, 28, [0, 2, 4]),
+    "scaled, then rotated, then shifted": (
+        [{"mesh": 0, "scale": [3, 1, 1], "rotation": ROTATION, "translation": [9, 0, 0]}],
+        None,
+        52,
+        [9, 3, 4],
+    ),
+    # Column by column: the same rotation, with lengths doubled and a shift.
+    "matrix": ([{"mesh": 0, "matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 9, 0, 0, 1]}], None, 4 * 28, [9, 2, 8]),
+    "child": ([{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [1, 0, 0]}], [0], 4 * 28, [4, 4, 8]),
+    "two of a name": (
+        [{"mesh": 0, "name": "a"}, {"mesh": 0, "name": "a", "translation": [9, 0, 0]}],
+        None,
+        2 * 28,
+        [10, 2, 4],
+    ),
+    "outside the scene": ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], [0], 28, [1, 2, 4]),
+    "below a camera": ([{"camera": 0, "children": [1], "translation": [9, 0, 0]}, {"mesh": 0}], [0], 28, [10, 2, 4]),
+}
+
+
+@pytest.mark.parametrize("name", PLACED)
+def test_gltf_nodes_place_their_meshes(read: Read, name: str) -> None:
+    nodes, roots, area, upper = PLACED[name]
     scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], nodes, roots)
     if "camera" in nodes[0]:
         scene.tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1, "aspectRatio": 1}}]

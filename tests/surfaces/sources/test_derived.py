@@ -128,11 +128,3 @@ def test_what_the_vertices_depend_on_is_in_the_fingerprint() -> None:
 def test_a_vertex_at_the_centre_stays() -> None:
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
     np.testing.assert_array_equal(carried(points, 1.0, 5.0, 2.0)[0], 0.0)
-
-
-def test_the_flow_needs_one_mesh() -> None:
-    with pytest.raises(sb.StudyError, match="exactly one surface is needed here, but the source makes 2"):
-        members({**FLOW, "mesh": {"source": "icosphere", "levels": [1, 2]}})
-    (member,) = members({**FLOW, "mesh": {"source": "sphere"}})
-    with pytest.raises(sb.MeshError, match="sphere is no mesh"):
-        member.load()

@@ -51,33 +51,6 @@ def test_a_named_file_may_be_missing_until_it_is_read(tmp_path: Path) -> None:
             use()
 
 
-def test_globs_find_files_in_order(tmp_path: Path) -> None:
-    (tmp_path / "deep" / "deeper").mkdir(parents=True)
-    (tmp_path / "folder.off").mkdir()
-    for name in ("b.off", "a.off", "c.obj", "deep/e.off", "deep/deeper/d.off", ".hidden.off"):
-        (tmp_path / name).write_bytes(OFF_BOX)
-
-    def names(*paths: str) -> list[str]:
-        return [member.name for member in members({"source": "files", "paths": list(paths)}, tmp_path)]
-
-    assert names("*.off") == ["a", "b"]
-    assert names("?.o*") == ["a", "b", "c"]
-    assert names("[bc].*") == ["b", "c"]
-    assert names("**/*.off") == ["a", "b", "d", "e"]
-    assert names("deep/*/*.off") == ["d"]
-    # What two of them find is there once.
-    assert names("a.off", "*.off", "[a].off", "./a.off") == ["a", "b"]
-
-
-def test_wildcards_in_the_name_of_the_folder_are_letters(tmp_path: Path) -> None:
-    folder = tmp_path / "run [1] *"
-    folder.mkdir()
-    (folder / "a.off").write_bytes(OFF_BOX)
-    (found,) = members({"source": "files", "paths": ["*.off"]}, folder)
-    assert found.name == "a"
-    assert loaded(found).area == BOX_AREA
-
-
 def names_of(tmp_path: Path, *files: str) -> list[str]:
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

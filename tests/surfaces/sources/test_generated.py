@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import Ellipsoid, Torus
+from sobolev_batch import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 from tests.support.members import listed, loaded, members
 
+BALL: dict[str, Any] = {"source": "sphere", "radius": 2, "center": [1, 2.5, -3]}
 EGG: dict[str, Any] = {"source": "ellipsoid", "axes": [3, 2, 1], "center": [0.0, 0.5, 0.0]}
 RING: dict[str, Any] = {"source": "torus", "R": 2, "r": 0.5, "center": [0.0, 0.5, 0.0]}
 
@@ -22,13 +23,22 @@ def identity(table: dict[str, Any], member: int = 0) -> str:
 
 
 def test_smooth_surfaces_are_one_member_each() -> None:
-    (egg,), (ring,) = members(EGG), members(RING)
-    assert listed((egg, ring)) == [("ellipsoid", -1), ("torus", -1)]
+    (ball,), (egg,), (ring,) = members(BALL), members(EGG), members(RING)
+    assert listed((ball, egg, ring)) == [("sphere", -1), ("ellipsoid", -1), ("torus", -1)]
+    assert ball.load() == Sphere(2.0, (1.0, 2.5, -3.0))
+    assert ball.fingerprint() == {"sphere": [2.0, 1.0, 2.5, -3.0]}
     assert egg.load() == Ellipsoid((3.0, 2.0, 1.0), (0.0, 0.5, 0.0))
     assert ring.load() == Torus(2.0, 0.5, (0.0, 0.5, 0.0))
     assert egg.fingerprint() == {"ellipsoid": [3.0, 2.0, 1.0, 0.0, 0.5, 0.0]}
     assert ring.fingerprint() == {"torus": [2.0, 0.5, 0.0, 0.5, 0.0]}
     assert egg.expected_size() == ring.expected_size() == ExpectedSize()
+
+
+def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
+    found = members({"source": "icosphere", "levels": [3, 0, 10, 3, 2]})
+    assert listed(found) == [("0", 0), ("2", 2), ("3", 3), ("10", 10)]
+    assert loaded(found[1]).digest == icosphere(2).digest
+    assert found[1].fingerprint() == {"icosphere": 2}
 
 
 def test_levels_of_an_ellipsoid() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,28 @@ def test_stems_that_would_be_misleading_labels_are_refused(tmp_path: Path, stem:
         message = refused(tmp_path, path)
         assert "is no label: it " in message
         assert message.endswith("; rename the file")
+
+
+@pytest.mark.parametrize(
+    ("globs", "names"),
+    [
+        (["*.off"], "ab"),
+        (["?.o*"], "abc"),
+        (["[bc].*"], "bc"),
+        (["**/*.off"], "abde"),
+        (["deep/**"], "de"),
+        (["deep/*/*.off"], "d"),
+        ([".*.off"], [".hidden"]),
+        # What two of them find is there once.
+        (["a.off", "*.off", "[a].off", "./a.off"], "ab"),
+    ],
+)
+def test_globs_find_files_in_order(tmp_path: Path, globs: list[str], names: Sequence[str]) -> None:
+    # The wildcards in the name of the folder are letters.
+    folder = tmp_path / "run [1] *"
+    put(folder, "b.off", "a.off", "c.obj", "deep/e.off", "deep/deeper/d.off", ".hidden.off", ".deep/f.off")
+    (folder / "folder.off").mkdir()
+    assert names_of(folder, *globs) == list(names)
 
 
 def test_files_in_different_folders_or_formats_are_told_apart(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import MeshError, Sphere, StudyError, icosphere
+from sobolev_batch import StudyError
 from sobolev_batch.surfaces.sources import registry as sources
-from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, single_member, source_type_of
-from tests.support.members import BALL, KINDS, listed, loaded, members
+from sobolev_batch.surfaces.sources.registry import Member, Source, parse_source, source_type_of
+from tests.support.members import BALL, KINDS, listed, members
 from tests.support.mesh_files import off
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
@@ -194,13 +194,6 @@ def test_a_dump_tells_everything_of_nested_sources() -> None:
     assert json.loads(parse_source(table).model_dump_json()) == {"mesh": {"levels": [3]}, "triangles": [80, 20]}
 
 
-def test_a_single_member_is_the_only_one() -> None:
-    assert single_member(parse_source(BALL), Path()).name == "3"
-    many = parse_source({"source": "icosphere", "levels": list(range(8))})
-    with pytest.raises(StudyError, match=r"exactly one surface is needed here, but the source makes 8: 0, 1, 2, 3, 4$"):
-        single_member(many, Path())
-
-
 # All sources.
 
 
@@ -215,31 +208,3 @@ def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
     assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 23
-
-
-@pytest.mark.parametrize("kind", ["decimate", "remesh", "spherical-levels"])
-def test_members_are_listed_without_being_made(tmp_path: Path, kind: str) -> None:
-    missing = {"source": "files", "paths": ["missing.ply"]}
-    table = {"source": kind, "mesh": missing, "triangles": [80]}
-    if kind == "spherical-levels":
-        table = {"source": kind, "mesh": missing, "sphere": missing, "levels": [1]}
-    (member,) = members(table, tmp_path)
-    assert member.name in ("80", "1")
-    with pytest.raises(MeshError, match=re.escape(f"{tmp_path / 'missing.ply'}: cannot be read")):
-        member.fingerprint()
-
-
-def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
-    found = members({"source": "icosphere", "levels": [3, 0, 10, 3, 2]})
-    assert listed(found) == [("0", 0), ("2", 2), ("3", 3), ("10", 10)]
-    assert loaded(found[1]).digest == icosphere(2).digest
-    assert found[1].fingerprint()["icosphere"] == 2
-
-
-def test_the_sphere_is_one_member() -> None:
-    (member,) = members({"source": "sphere"})
-    assert listed((member,)) == [("sphere", -1)]
-    assert member.load() == Sphere()
-    (member,) = members({"source": "sphere", "radius": 2, "center": [1, 2.5, -3]})
-    assert member.load() == Sphere(2.0, (1.0, 2.5, -3.0))
-    assert member.fingerprint() == {"sphere": [2.0, 1.0, 2.5, -3.0]}
