@@ -100,11 +100,6 @@ def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Re
     return norms_of_draws(weights * squares)
 
 
-def draw_count(terms: int) -> int:
-    """Return the number of frequencies to probe a mesh of this many triangles at: fewer where each costs more."""
-    return int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
-
-
 def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, seed: int) -> Draws:
     """Draw P random frequencies of a lattice where the error of a rule of some degree weighs most.
 
@@ -189,11 +184,12 @@ class Sample:
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
     """Draw the frequencies to probe fields of surfaces at, by the lowest degree of their triangle rules.
 
-    The same surfaces get the same ones.
+    They are fewer where each costs more. The same surfaces get the same ones.
     """
     terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
+    count = int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
-    return draw(lattice, orders, degree, draw_count(terms), seed)
+    return draw(lattice, orders, degree, count, seed)
 
 
 def probe_block(

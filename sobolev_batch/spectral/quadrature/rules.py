@@ -119,7 +119,7 @@ def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
 
 
 def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
-    """Return the root mean square of a rule's error on one triangle over all directions of ξ.
+    """Return the root mean square of a candidate's error on one triangle over all directions of ξ.
 
     Returns:
         Sizes 2π|ξ|ρ (radians), and at each the even and the odd part of the error, relative to the area. The even
@@ -127,11 +127,8 @@ def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
         neighbours that point opposite ways, and mostly cancels. Each is the larger one of the equilateral and the
         flat triangle.
     """
-    stored, measured = measured_errors(), candidate_rules()
-    if rule in measured:
-        row = measured.index(rule)
-        return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]
-    return _SIZES_ON_AVERAGE, *measure_typical_errors(rule)
+    stored, row = measured_errors(), candidate_rules().index(rule)
+    return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]
 
 
 @cache
@@ -166,7 +163,6 @@ def measure_largest_errors(rule: TriangleRule) -> Reals:
     return np.asarray(errors.reshape(len(_SIZES), -1).max(axis=1))
 
 
-@lru_cache(maxsize=16)
 def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
     """Return the even and the odd part of a rule's error at each size (64,): see `typical_errors`."""
     sizes = _SIZES_ON_AVERAGE

@@ -210,22 +210,13 @@ def sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
             lengths[axis] = math.ceil(shape[axis] / counts[axis])
 
 
-def projected_bytes(
-    block: Block,
-    settings: TransformSettings,
-    execution: Execution = ON_CPU,
-    *,
-    triangles: int = 0,
-) -> int:
+def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int = 0) -> int:
     """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
 
     Each triangle of the mesh counts for some bytes while its rule is chosen.
     """
-    whole = NufftSpec(block.shape, settings.eps, settings.dtype, batch=execution.batch)
-    needed: float = CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
-    if execution.allowed_bytes is not None:
-        needed = min(needed, execution.allowed_bytes)
-    return block.size * whole.item_bytes + math.ceil(needed)
+    whole = NufftSpec(block.shape, settings.eps, settings.dtype)
+    return block.size * whole.item_bytes + CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
 
 
 def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
