@@ -261,22 +261,8 @@ class StudyCollection:
         values = {"reference": None, "family": [], **written}
         document = StudyDocument.from_tables(values)
         listed = _listed_meshes(document.objects.get("meshes", ()), folder)
-        listed_names = list(dict.fromkeys(name for name, _ in listed))
-        if document.object is None:
-            found = [{"name": name} for name in listed_names or _names_in_reference(values, folder)]
-            document = StudyDocument.from_tables({**values, "object": found})
-        objects = document.object or []
-        names = [section.name for section in objects]
-        unnamed = [name for name in listed_names if name not in names]
-        if unnamed:
-            raise StudyError(
-                f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or "
-                "give all of them sections"
-            )
-        same = duplicate_names(names)
-        if same:
-            raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
-        families = [_families(family, names, folder) for family in values["family"]]
+        objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
+        families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]
         studies: dict[str, Study] = {}
         for section in objects:
             made = [entry for entries in families for entry in entries[section.name]]
@@ -348,6 +334,27 @@ def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
     return meshes
 
 
+def _objects(
+    document: StudyDocument, values: Mapping[str, Any], listed: Sequence[str], folder: Path
+) -> Sequence[ObjectSection]:
+    """Return the objects that have sections, or those that a list or the files of the reference name."""
+    if document.object is None:
+        found = [{"name": name} for name in listed or _names_in_reference(values, folder)]
+        document = StudyDocument.from_tables({**values, "object": found})
+    objects = document.object or []
+    names = [section.name for section in objects]
+    unnamed = [name for name in listed if name not in names]
+    if unnamed:
+        raise StudyError(
+            f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or give "
+            "all of them sections"
+        )
+    same = duplicate_names(names)
+    if same:
+        raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
+    return objects
+
+
 def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the objects that the files of the reference name, in their natural order."""
     paths = (with_named_meshes(values["reference"], values.get("mesh", {})) or {}).get("paths")
@@ -387,11 +394,14 @@ def _table_of_object(
         common["reference"] = {"source": "files", "paths": references}
     if section.scaling is not None:
         common["scaling"] = section.scaling
-    methods = (method for method in own if not is_reference[method])
+    methods = [method for method in own if not is_reference[method]]
+    all_families = [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)]
+    if not all_families:
+        raise StudyError("no family has a file of it; add files, or leave it out")
     return {
         **common,
         "study": {**common["study"], "name": f"{common['study']['name']} {name}"},
-        "family": [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)],
+        "family": all_families,
     }
 
 

@@ -80,6 +80,8 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
     objects = [{"name": "cow"}, {"name": "cow_2"}]
     found = sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
     assert found.lacking == {"cow": ("quick",)}
+    with pytest.raises(sb.StudyError, match="object 'cow': no family has a file of it"):
+        sb.StudyCollection.from_table(table(object=objects, family=family[:1]), folder=folder)
     with pytest.raises(sb.StudyError, match="family 'quick': no file that it names is of an object"):
         sb.StudyCollection.from_table(table(object=[{"name": "horse"}], family=family), folder=folder)
 
