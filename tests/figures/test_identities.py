@@ -32,8 +32,7 @@ def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:
     assert isinstance(whole, sb.Mesh)
     assert isinstance(coarse, sb.Mesh)
     similarity = sb.Similarity.to_unit_ball(whole)
-    rule = 2
-    plans = (kind_of(similarity.apply(surface)).plan(1.0, 1e-9, rule) for surface in (coarse, whole))
+    plans = (kind_of(similarity.apply(surface)).plan(1.0, 1e-9, 2) for surface in (coarse, whole))
     first, second = (list(plan.batches(1 << 20)) for plan in plans)
     return first, second
 
