@@ -427,26 +427,24 @@ class Gpu(Backend):
 def _module(name: str, title: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise BackendError(f"no GPU: {title} is not installed: {INSTALL}") from error
     except ImportError as error:
-        reason = " ".join(str(error).split())
-        raise BackendError(f"no GPU: {title} is installed but cannot be imported ({reason}): {INSTALL}") from error
+        is_missing = isinstance(error, ModuleNotFoundError)
+        found = "not installed" if is_missing else f"installed but cannot be imported ({one_line(error)})"
+        raise BackendError(f"no GPU: {title} is {found}: {INSTALL}") from error
 
 
 def _require_device(cupy: Any) -> None:
-    runtime = cupy.cuda.runtime
+    runtime, count = cupy.cuda.runtime, 0
     try:
         count = runtime.getDeviceCount()
     except runtime.CUDARuntimeError as error:
-        if error.status == _NO_DEVICE:
-            count = 0
-        elif error.status == _INSUFFICIENT_DRIVER and runtime.driverGetVersion() == 0:
-            raise BackendError("no GPU: the NVIDIA driver is not installed on this machine") from error
-        elif error.status == _INSUFFICIENT_DRIVER:
-            raise BackendError("no GPU: the NVIDIA driver is too old for CUDA 12: update it to 525 or newer") from error
-        else:
-            raise BackendError(f"no GPU: CUDA says {error}") from error
+        if error.status != _NO_DEVICE:
+            reason = f"CUDA says {error}"
+            if error.status == _INSUFFICIENT_DRIVER and runtime.driverGetVersion():
+                reason = "the NVIDIA driver is too old for CUDA 12: update it to 525 or newer"
+            elif error.status == _INSUFFICIENT_DRIVER:
+                reason = "the NVIDIA driver is not installed on this machine"
+            raise BackendError(f"no GPU: {reason}") from error
     if not count:
         raise BackendError("no GPU: the NVIDIA driver sees no device; is CUDA_VISIBLE_DEVICES set to hide it?")
 
