@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from functools import cached_property
 from typing import Any, Self
 
@@ -105,24 +105,18 @@ class TailReducer:
 
     def of_pairs(self, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
         """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
-        tails: dict[tuple[int, int], Tail] = {}
+        parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
         size = max(1, _HELD_BYTES // (16 * self.sampling.size))
         for first in range(0, len(rows), size):
             held = {i: self.read(rows[i]) for i in range(first, min(first + size, len(rows)))}
-            for j, other in enumerate(others):
-                if j < first and j < shared:
-                    continue
-                values = held[j] if j < shared and j in held else self.read(other)
+            for j in range(min(first, shared), len(others)):
+                values = held[j] if j < shared and j in held else self.read(others[j])
                 for i, own in held.items():
-                    if j < shared and (j, i) in tails:
-                        tails[i, j] = tails[j, i]
-                    elif rows[i] != other:
-                        tails[i, j] = self.of_pair(rows[i], other, own - values)
-                    else:
-                        tails[i, j] = Tail(*np.zeros((4, len(self.orders))))
-        # Below the diagonal, where later rows meet earlier ones.
-        flat = [tails[i, j] if (i, j) in tails else tails[j, i] for i in range(len(rows)) for j in range(len(others))]
-        return Tail.stacked(flat).reshaped(len(rows), len(others))
+                    if i < j or j >= shared:
+                        parts[..., i, j] = astuple(self.of_pair(rows[i], others[j], own - values))
+        if shared:
+            parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
+        return Tail(*parts)
 
     def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
         """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""

@@ -49,11 +49,6 @@ class Tail:
         parts = (getattr(self, field.name) for field in fields(self))
         return Tail(*(part * factors for part in parts))
 
-    def reshaped(self, *shape: int) -> Tail:
-        """Return tails (orders, fields) as (orders, *shape)."""
-        parts = (getattr(self, field.name) for field in fields(self))
-        return Tail(*(part.reshape(len(part), *shape) for part in parts))
-
     @property
     def squares(self) -> Reals:
         """The whole tail."""

@@ -15,7 +15,7 @@ from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run
 from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.store.records import Facts, Record
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.support.repository import blocks
@@ -39,21 +39,6 @@ def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Pa
     fields = store.read_fields([0, 3], place)
     assert np.isnan(fields[0]).all()
     assert (fields[1] == 0).all()
-
-
-def test_records_come_back_and_survive_another_prepare(store_path: Path) -> None:
-    plan = small_plan()
-    store = prepare_store(store_path, plan)
-    record = Record("key", "complete", facts=Facts(vertices=3, area=1.5, digest="é"), seconds=0.1, worker="w")
-    store.write_record(2, record)
-    again = prepare_store(store_path, plan)
-    assert again.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
-    found = again.records()
-    assert found[:2] == (None, None)
-    assert found[2] is not None
-    assert found[2].facts.area == 1.5
-    assert found[2].completes("key")
-    assert not found[2].completes("other")
 
 
 @pytest.mark.parametrize(
