@@ -13,7 +13,7 @@ import numpy as np
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.fields.tasks import Job, compute_blocks, compute_mesh, compute_octaves, finish_mesh
+from sobolev_batch.batch.fields.tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Record
@@ -132,9 +132,8 @@ def _field_task(job: Job, sizes: TaskSizes) -> Task:
     if len(sizes.block_groups) == 1:
         (blocks,) = sizes.block_groups
         return Task(compute_mesh, (job, blocks), sizes.projected_bytes, needs_gpu, job.index, job.row.label)
-    groups = [Task(compute_blocks, (job, blocks), sizes.projected_bytes, needs_gpu) for blocks in sizes.block_groups]
-    if job.tail is not None:
-        groups.append(Task(compute_octaves, (job,), sizes.projected_bytes, needs_gpu))
+    parts = [(blocks, False) for blocks in sizes.block_groups] + [((), True)] * (job.tail is not None)
+    groups = [Task(compute_parts, (job, *part), sizes.projected_bytes, needs_gpu) for part in parts]
     return Task(finish_mesh, (job, groups), row=job.index, label=job.row.label)
 
 

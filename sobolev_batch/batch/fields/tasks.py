@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -177,48 +177,38 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     Raises:
         StoreError: The store cannot be written, which is not the mesh's fault.
     """
-
-    def compute(surface: Surface) -> list[StoredBlocks]:
-        field = _store_some(job, surface, blocks)
-        return [field] if job.tail is None else [field, _store_octaves(job, surface)]
-
-    return job.stored_record() or _finished(job, _of_loaded(job, compute))
+    stored = compute_parts(job, blocks, octaves=job.tail is not None)
+    return stored if isinstance(stored, Record) else _finished(job, stored)
 
 
-def compute_blocks(job: Job, blocks: Sequence[Block]) -> StoredBlocks | Record:
-    """Compute and store some blocks of a mesh's field; see `compute_octaves`."""
-    return job.stored_record() or _of_loaded(job, lambda surface: [_store_some(job, surface, blocks)])[0]
+def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:
+    """Compute and store some blocks of a mesh's field, and its values in octaves; see `compute_mesh`.
 
-
-def compute_octaves(job: Job) -> StoredBlocks | Record:
-    """Compute and store a mesh's values in octaves, unless its completion record exists; then return that.
-
-    See `compute_mesh` for failures.
+    Returns:
+        What was stored, the first with the time, or with the reason of a failure. The completion record of the mesh if
+        it exists: then nothing is computed.
     """
-    return job.stored_record() or _of_loaded(job, lambda surface: [_store_octaves(job, surface)])[0]
-
-
-def finish_mesh(job: Job, parts: Sequence[StoredBlocks | Record]) -> Record:
-    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it exists."""
-    record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
-    return record or _finished(job, [part for part in parts if isinstance(part, StoredBlocks)])
-
-
-def _of_loaded(job: Job, compute: Callable[[Surface], list[StoredBlocks]]) -> list[StoredBlocks]:
-    """Load a mesh and compute something of it; the first outcome has the time, or the reason of a failure."""
+    if record := job.stored_record():
+        return record
     started = time.perf_counter()
     try:
-        first, *others = compute(job.load())
+        surface, stored = job.load(), []
+        if blocks:
+            is_whole = tuple(blocks) == (job.lattice.half,)
+            stored.append(_store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks))
+        if octaves:
+            stored.append(_store_octaves(job, surface))
     except StoreError:
         raise
     except Exception as error:
         return [StoredBlocks(seconds=time.perf_counter() - started, error=job.failure_reason(error))]
-    return [replace(first, seconds=time.perf_counter() - started), *others]
+    return [replace(stored[0], seconds=time.perf_counter() - started), *stored[1:]]
 
 
-def _store_some(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
-    is_whole = tuple(blocks) == (job.lattice.half,)
-    return _store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks)
+def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Record:
+    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it exists."""
+    record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
+    return record or _finished(job, [stored for part in parts if isinstance(part, list) for stored in part])
 
 
 def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
@@ -273,29 +263,26 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
 
 
 def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
-    errors = [blocks.error for blocks in stored if blocks.error]
     backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
     record = Record(
         key=job.row.key,
-        status="failed" if errors else "complete",
-        reason=errors[0] if errors else "",
-        facts=Facts() if errors else stored[0].facts,
-        quality="" if errors else _joined_quality(stored).to_json(),
-        checksums=() if errors else tuple(checksum for blocks in stored for checksum in blocks.checksums),
+        status="complete",
         seconds=sum(blocks.seconds for blocks in stored),
         worker=_worker_address(),
         backend=", ".join(backends),
         finished=utc_now(),
     )
+    if errors := [blocks.error for blocks in stored if blocks.error]:
+        record = replace(record, status="failed", reason=errors[0])
+    else:
+        qualities = [blocks.quality for blocks in stored if blocks.quality is not None]
+        tail = next((quality.tail for quality in qualities if quality.tail is not None), None)
+        quality = replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
+        checksums = tuple(checksum for blocks in stored for checksum in blocks.checksums)
+        record = replace(record, facts=stored[0].facts, quality=quality.to_json(), checksums=checksums)
     job.store.write_record(job.index, record)
     _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
     return record
-
-
-def _joined_quality(stored: Sequence[StoredBlocks]) -> Quality:
-    qualities = [blocks.quality for blocks in stored if blocks.quality is not None]
-    tail = next((quality.tail for quality in qualities if quality.tail is not None), None)
-    return replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
 
 
 def _facts_of(surface: Surface, points: int) -> Facts:

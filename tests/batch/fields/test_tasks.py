@@ -13,9 +13,8 @@ import pytest
 from sobolev_batch import Study
 from sobolev_batch.batch.fields.tasks import (
     Job,
-    compute_blocks,
     compute_mesh,
-    compute_octaves,
+    compute_parts,
     finish_mesh,
 )
 from sobolev_batch.batch.store.create import prepare_store
@@ -66,7 +65,7 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     plan = make_plan(replace(study, largest_chunk_bytes=16_000))
     blocks = plan.blocks
     job = job_of(plan, store_path, "ico/1")
-    parts = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
+    parts = [*(compute_parts(job, [block]) for block in blocks), compute_parts(job, octaves=True)]
     record = finish_mesh(job, parts)
     assert (record.status, len(record.checksums)) == ("complete", len(blocks) + 1)
 
@@ -75,7 +74,7 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
 
     for name in ("write_field", "write_record"):
         monkeypatch.setattr(type(job.store), name, refuse)
-    again = [*(compute_blocks(job, [block]) for block in blocks), compute_octaves(job)]
+    again = [*(compute_parts(job, [block]) for block in blocks), compute_parts(job, octaves=True)]
     # Those whose worker was lost are done again; the results of others may be there still.
     for mixture in (parts, again, [*parts[:2], *again[2:]]):
         assert finish_mesh(job, mixture) == record
