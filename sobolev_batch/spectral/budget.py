@@ -213,7 +213,7 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
 
 
 def area_bound(area: float, order: float, highest: float) -> float:
-    """Return what no squared norm beyond a frequency exceeds, whatever the surfaces of an area together are.
+    """Return what no squared norm beyond a frequency exceeds, if no more than two layers lie in one place.
 
     The energy on |ξ| = r is twice the area on average, and twice that where layers reinforce each other. If surfaces
     repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just beyond. Besides, no
@@ -230,6 +230,16 @@ def area_bounds(area: float, order: float) -> list[tuple[float, float]]:
     if power > 0:
         bounds.append((4 * np.pi * area**2 / power, power))
     return bounds
+
+
+def modulus_bound(area: float, orders: Reals, highest: float) -> Reals:
+    """Return what no squared norm beyond a frequency exceeds (orders,), since no transform exceeds the area.
+
+    It is infinite from order -3/2 on.
+    """
+    powers = -2 * orders - 3
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.where(powers > 0, 4 * np.pi * area**2 * highest**-powers / np.maximum(powers, 0.0), np.inf)
 
 
 def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:

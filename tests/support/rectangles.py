@@ -109,8 +109,7 @@ class Rectangles:
         signs = np.concatenate([np.ones(len(self.low)), -np.ones(len(other.low))])
         logs = np.linspace(np.log(_LEAST_TIME), np.log(_LARGEST_TIME), _STEPS + 1)
         times, step = np.exp(logs), logs[1] - logs[0]
-        intervals, grid, unsigned = _grid(both, signs)
-        traces, scales = np.array([_heat_traces(intervals, grid, unsigned, time) for time in times]).T
+        traces, scales = _heat_traces(*_intervals(both), signs, times)
         squares, slacks = [], []
         for order in orders:
             factors = times**-order * np.exp(-times) / gamma(-order)
@@ -133,29 +132,38 @@ def _integral(terms: Reals, step: float, power: float) -> float:
     return float(inner + terms[0] / (power - 0.5))
 
 
-def _grid(rectangles: Rectangles, signs: Reals) -> tuple[list[Reals], Reals, Reals]:
-    """Return the different intervals (n, 2) of each axis, and the sum of signs at each three of them; also unsigned."""
+def _intervals(rectangles: Rectangles) -> tuple[list[Reals], list[NDArray[np.int64]]]:
+    """Return the different intervals (n, 2) of each axis, and which of them each rectangle has."""
     intervals, places = [], []
     for axis in range(3):
         ends = np.stack([rectangles.low[:, axis], rectangles.high[:, axis]], axis=1)
         different, place = np.unique(ends, axis=0, return_inverse=True)
         intervals.append(different)
         places.append(place.ravel())
-    grid, unsigned = (np.zeros([len(different) for different in intervals]) for _ in range(2))
-    np.add.at(grid, tuple(places), signs)
-    np.add.at(unsigned, tuple(places), 1.0)
-    return intervals, grid, unsigned
+    return intervals, places
 
 
-def _heat_traces(intervals: Sequence[Reals], grid: Reals, unsigned: Reals, time: float) -> tuple[float, float]:
-    """Return the heat trace, and what it would be if all signs were positive."""
-    factors = [_axis_factors(ends[:, 0], ends[:, 1], np.pi / np.sqrt(time)) for ends in intervals]
-    signed, positive = (
-        float(np.vdot(weights, np.einsum("ai,bj,ck,ijk->abc", *factors, weights, optimize=True)))
-        for weights in (grid, unsigned)
-    )
-    scale = (np.pi / time) ** 1.5
-    return scale * signed, scale * positive
+def _heat_traces(
+    intervals: Sequence[Reals], places: Sequence[NDArray[np.int64]], signs: Reals, times: Reals
+) -> tuple[Reals, Reals]:
+    """Return the heat trace at each time, and what it would be if all signs were positive."""
+    grids = [np.zeros([len(different) for different in intervals]) for _ in range(2)]
+    for grid, weights in zip(grids, (signs, np.ones(len(signs))), strict=True):
+        np.add.at(grid, tuple(places), weights)
+    traces = []
+    for time in times:
+        factors = [_axis_factors(ends[:, 0], ends[:, 1], np.pi / np.sqrt(time)) for ends in intervals]
+        if len(signs) ** 2 < grids[0].size:
+            # Few rectangles with many intervals: all pairs of them.
+            x, y, z = (factor[np.ix_(place, place)] for factor, place in zip(factors, places, strict=True))
+            pairs = x * y * z
+            traces.append((signs @ pairs @ signs, pairs.sum()))
+        else:
+            traces.append(
+                [np.vdot(grid, np.einsum("ai,bj,ck,ijk->abc", *factors, grid, optimize=True)) for grid in grids]
+            )
+    signed, positive = (np.pi / times) ** 1.5 * np.array(traces).T
+    return signed, positive
 
 
 def _axis_factors(a: Reals, b: Reals, rate: float) -> Reals:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, larger_pilot, refined
+from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, larger_pilot, lattice_of, refined
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Samples, Solution, error_target
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.budget import NormEstimate, Sums, area_bound, estimate_norms, sums_of_shells
+from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
@@ -27,11 +27,12 @@ from sobolev_batch.spectral.probe import Sample, estimate
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
+from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
 
-_ROUNDS = 4
+_ROUNDS = 6
 # From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.
 _OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
 # What a best effort aims at where more is out of reach.
@@ -44,6 +45,12 @@ _PAIR = 2
 _BEYOND = (4.0, 16.0, 64.0, 256.0)
 # Where the areas permit less than this fraction of the allowed truncation, nothing can hide beyond a lattice.
 _NEGLIGIBLE = 0.3
+# Predicted processor time of random points, at least and for each triangle, and of a sample of a lattice, in seconds.
+_POINTS_SECONDS, _TRIANGLE_SECONDS, _SAMPLE_SECONDS = 0.1, 1.2e-5, 4e-7
+# M of the largest lattice that takes less time than octaves.
+_WIDE_M = 160
+# The least factor by which a lattice grows that shows more.
+_LEAST_GROWTH = 1.1
 # A pilot has to tell how large distances are, not more.
 _PILOT_RTOL = 1e-3
 
@@ -116,14 +123,17 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
         return Solution.zero(problem.orders)
     strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))
     step = _first_step(strict)
-    attempts = [partial(_solve_on_lattices, strict, step)]
+    on_lattices, in_octaves = partial(_solve_on_lattices, strict, step), partial(solve_in_octaves, strict, seed)
+    attempts = [on_lattices]
     seem_equal = bool(_near_duplicates(problem, step.lattice).any())
     if seem_equal and _differ_beyond(problem, step.lattice):
         # No lattice would show it.
-        attempts = [partial(solve_in_octaves, strict, seed)]
+        attempts = [in_octaves]
     elif permits_octaves(problem.accuracy):
-        octaves_first = prefers_octaves(problem) and not seem_equal
-        attempts.insert(0 if octaves_first else 1, partial(solve_in_octaves, strict, seed))
+        if prefers_octaves(problem) and not seem_equal:
+            attempts = [in_octaves, on_lattices]
+        else:
+            attempts = [partial(on_lattices, before_octaves=True), in_octaves]
     nearest, refusals = [], []
     for attempt in attempts:
         try:
@@ -212,7 +222,7 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
     return bool(np.any(difference > problem.rounding * (1 + phases)))
 
 
-def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
+def _solve_on_lattices(problem: Problem, step: _Step, *, before_octaves: bool = False) -> Solution:
     """Return the first solution that meets the accuracy, else the last of a few rounds or of the largest lattice.
 
     Raises:
@@ -232,35 +242,75 @@ def _solve_on_lattices(problem: Problem, step: _Step) -> Solution:
         values = solution.estimate.values
         has_no_digit = equal | (values <= problem.rounding)
         is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
-        if is_met and not np.all(has_no_digit):
-            solution = _with_hidden_part(problem, solution)
+        if not is_met and rounds_left:
+            step, before = _next_step(problem, step, sums), step
+            if step == before and problem.accuracy.best_effort:
+                break
+        elif not is_met or np.all(has_no_digit):
+            break
+        else:
+            solution, larger = _with_hidden_part(problem, solution, before_octaves)
             is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
-        if is_met or not rounds_left:
-            break
-        step, before = _next_step(problem, step, sums), step
-        if step == before and problem.accuracy.best_effort:
-            break
+            if is_met or larger is None or not rounds_left:
+                break
+            step = _Step(larger, is_pilot=False)
     shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
     return _not_below_rounding(problem, replace(solution, shortfall=shortfall))
 
 
-def _with_hidden_part(problem: Problem, solution: Solution) -> Solution:
-    """Return a solution on a lattice with the error by what lies beyond it, where close points show more than its law.
+def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool) -> tuple[Solution, Lattice | None]:
+    """Return a solution on a lattice with the error by all that may lie beyond it, and a lattice that shows more of it.
 
-    The law extrapolates, and sees no period that begins beyond the lattice. All that lies there follows from close
-    points, drawn at random, and is less than the areas permit.
+    The law of growth extrapolates, and sees no period that begins beyond the lattice. What lies there is less than the
+    areas permit. Where that is too much, it follows from close points, drawn at random.
+
+    Args:
+        problem: Surfaces, orders and accuracy.
+        solution: Numbers that meet the accuracy by the law.
+        before_octaves: True if octaves follow, and may be cheaper than a larger lattice.
+
+    Returns:
+        The solution, and the lattice that is likely to show enough, if there is one.
     """
-    found, lattice = solution.estimate, cast(Lattice, solution.lattice)
-    most = np.array([area_bound(problem.area, order, lattice.xi_max) for order in problem.orders])
-    most_truncation = np.sqrt(found.values**2 + most) - found.values
-    allowed = np.array([problem.accuracy.truncation_part(order) for order in problem.orders]) * found.values
-    if np.all(most_truncation <= np.maximum(found.truncation, _NEGLIGIBLE * allowed)):
-        return solution
+    found, lattice, orders = solution.estimate, cast(Lattice, solution.lattice), np.array(problem.orders)
+    parts = np.array([problem.accuracy.truncation_part(order) for order in problem.orders])
+    allowed = np.maximum(parts * problem.accuracy.scale(found.values), problem.rounding)
+
+    def with_part(squares: Reals) -> Solution:
+        beyond = np.maximum(np.sqrt(found.values**2 + squares) - found.values, found.truncation)
+        truncation = np.where(found.values > problem.rounding, beyond, found.truncation)
+        return replace(solution, estimate=replace(found, truncation=truncation))
+
+    def needed(squares: Reals, enough: Reals, powers: Reals) -> float:
+        """Return the frequency beyond which squares that fall by some powers are small enough."""
+        with np.errstate(over="ignore"):
+            factors = (squares / enough) ** (1 / powers)
+        return max(float(factors.max()), _LEAST_GROWTH) * lattice.xi_max
+
+    largest, period = problem.accuracy.largest_intervals, 1 / lattice.spacing
+    certain, powers = modulus_bound(problem.area, orders, lattice.xi_max), -2 * orders - 1
+    negligible = (found.values + _NEGLIGIBLE * allowed) ** 2 - found.values**2
+    if np.all(certain <= negligible):
+        return with_part(certain), None
+    if np.all(np.isfinite(certain)):
+        farther = needed(certain, negligible, powers - 2)
+        if 2 * farther * period <= min(_quick_intervals(problem), largest):
+            return with_part(certain), lattice_of(farther, period, largest)
     hidden, error = _beyond_lattice(problem, solution)
-    law = (found.values + found.truncation) ** 2 - found.values**2
-    with_hidden = np.sqrt(found.values**2 + np.minimum(np.maximum(hidden + error, 0.0), most)) - found.values
-    truncation = np.where(hidden - error > law, with_hidden, found.truncation)
-    return replace(solution, estimate=replace(found, truncation=truncation))
+    bound = np.minimum(np.maximum(hidden, 0.0) + error, certain)
+    if before_octaves:
+        law = (found.values + found.truncation) ** 2 - found.values**2
+        if np.any(hidden - error > law):
+            return with_part(bound), None
+        largest = min(_WIDE_M, largest)
+    farther = needed(bound, found.values * allowed, powers)
+    return with_part(bound), lattice_of(farther, period, largest) if 2 * farther * period <= largest else None
+
+
+def _quick_intervals(problem: Problem) -> int:
+    """Return the M of the largest lattice that takes less time than random points."""
+    triangles = sum(len(surface.triangles) for surface in problem.surfaces if isinstance(surface, Mesh))
+    return int((2 * max(_POINTS_SECONDS, triangles * _TRIANGLE_SECONDS) / _SAMPLE_SECONDS) ** (1 / 3))
 
 
 def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]:

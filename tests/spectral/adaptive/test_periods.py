@@ -20,6 +20,13 @@ def plates(offset: float) -> Rectangles:
     return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
 
 
+def fine_plates(offset: float) -> Rectangles:
+    """Squares at a pitch of 1/35, which are smaller towards both ends."""
+    heights = (np.arange(35) + 0.5 + offset) / 35 - 0.5
+    halves = 0.3 * np.cos(np.pi * heights) ** 2
+    return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
+
+
 def strips(offset: float) -> Rectangles:
     """Long strips at a pitch of 0.04, half as wide."""
     lefts = 0.04 * np.arange(25) + offset
@@ -34,6 +41,7 @@ def sheets(count: int, height: float) -> Rectangles:
 
 PAIRS: dict[str, Callable[[], Pair]] = {
     "plates": lambda: (plates(0.0), plates(1 / 40)),
+    "fine plates": lambda: (fine_plates(0.0), fine_plates(0.5)),
     "fins": lambda: (Rectangles.fins(30), Rectangles.fins(30).moved(0, 0, 1 / 60)),
     "strips": lambda: (strips(0.0), strips(0.02)),
     "layers": lambda: (sheets(3, 0.0), sheets(1, 5e-3)),
@@ -45,6 +53,7 @@ PAIRS: dict[str, Callable[[], Pair]] = {
     ("name", "order", "rtol"),
     [
         ("plates", -4.0, 1e-1),
+        ("fine plates", -5.0, 1e-1),
         ("fins", -2.0, 1e-2),
         ("fins", -2.5, 1e-3),
         ("strips", -1.0, 1e-1),
