@@ -157,7 +157,7 @@ def _heat_traces(
             # Few rectangles with many intervals: all pairs of them.
             x, y, z = (factor[np.ix_(place, place)] for factor, place in zip(factors, places, strict=True))
             pairs = x * y * z
-            traces.append((signs @ pairs @ signs, pairs.sum()))
+            traces.append([signs @ pairs @ signs, pairs.sum()])
         else:
             traces.append(
                 [np.vdot(grid, np.einsum("ai,bj,ck,ijk->abc", *factors, grid, optimize=True)) for grid in grids]
