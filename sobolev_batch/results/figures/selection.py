@@ -80,20 +80,24 @@ class Selection:
         return {family: style_of(i) for i, family in enumerate(dict.fromkeys(families_of(self.tree).values()))}
 
     @cached_property
+    def compared(self) -> list[str]:
+        """Labels of the computed meshes of the chosen families; none where the reference is not computed."""
+        complete, family_of, reference = complete_meshes(self.tree), families_of(self.tree), reference_of(self.tree)
+        others = [label for label in complete if label != reference and family_of[label] in self.families]
+        return others if reference in complete else []
+
+    @cached_property
     def spectra(self) -> Spectra:
         """Spectra of the chosen families; InputError where the store has no mesh to compare."""
-        with fields_read(self.tree):
-            spectra = Spectra.from_tree(self.tree, self.orders, self.families)
-        if spectra is None:
+        if not self.compared:
             raise InputError("the store has no mesh to compare: the reference or all others are not computed")
-        return spectra
+        with fields_read(self.tree):
+            return Spectra.from_tree(self.tree, self.orders, self.compared)
 
     @property
     def has_spectra(self) -> bool:
         """True if the store has a mesh to compare, of the chosen families."""
-        complete, family_of, reference = complete_meshes(self.tree), families_of(self.tree), reference_of(self.tree)
-        others = any(family_of[label] in self.families for label in complete if label != reference)
-        return "similarity" in self.tree.attrs and reference in complete and others
+        return "similarity" in self.tree.attrs and bool(self.compared)
 
 
 @dataclass(frozen=True)
@@ -123,20 +127,13 @@ class Spectra:
     own: float
 
     @classmethod
-    def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], families: Sequence[str]) -> Self | None:
-        """Return the spectra of some meshes of an open store, evenly through each of some families.
-
-        None where it has nothing to compare.
-        """
-        reference, complete = reference_of(tree), complete_meshes(tree)
-        family_of = families_of(tree)
-        others = [label for label in complete if label != reference and family_of[label] in families]
-        if reference not in complete or not others:
-            return None
+    def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> Self:
+        """Return the spectra of some of the meshes of an open store, evenly through each family."""
+        reference, family_of = reference_of(tree), families_of(tree)
         fields = tree["fourier"].to_dataset()["fourier"]
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
         labels = _spread_over_families(
-            [(family_of[label], label) for label in others], max(1, min(MOST_SPECTRA, affordable))
+            [(family_of[label], label) for label in meshes], max(1, min(MOST_SPECTRA, affordable))
         )
         scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
@@ -153,7 +150,7 @@ class Spectra:
         errors = np.zeros_like(energies)
         if "octaves" in tree:
             errors = np.stack([bands["energy_error"].to_numpy() for bands in spectra]) / limits[:, None]
-        return cls(tuple(labels), len(others), tuple(orders), shares, longest, shortest, energies, errors, 1 / scale)
+        return cls(tuple(labels), len(meshes), tuple(orders), shares, longest, shortest, energies, errors, 1 / scale)
 
     @property
     def omission(self) -> str:
