@@ -35,9 +35,6 @@ def parse_gltf(data: bytes, path: Path) -> Raw:
     Args:
         data: Contents of the file, .gltf or .glb.
         path: Path of the file; its folder holds buffers in files of their own.
-
-    Raises:
-        MeshError: The file is damaged, a buffer lies outside its folder, or this reader does not understand it.
     """
     tree, binary = _document(data)
     required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
@@ -62,11 +59,7 @@ def parse_gltf(data: bytes, path: Path) -> Raw:
 
 
 def buffer_paths(data: bytes, path: Path) -> list[Path]:
-    """Return the files beside a glTF file that hold its buffers.
-
-    Raises:
-        MeshError: The file is damaged, or a buffer lies outside its folder.
-    """
+    """Return the files beside a glTF file that hold its buffers."""
     tree, _ = _document(data)
     uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
     return [_beside(path, uri) for uri in uris if uri is not None and not uri.startswith("data:")]

@@ -38,12 +38,7 @@ _VOLUME = (b"\0\0\0\x14", b"\0\0\0\2\0\0\0\0\0\0\0\x14")
 
 
 def parse_gifti(data: bytes) -> Raw:
-    """Return the vertices and triangles of a GIFTI surface.
-
-    Raises:
-        MeshError: The file has not exactly one point set and one triangle array, another number of arrays than
-            announced, entities, or data that do not fit their announced sizes or exceed `unpacked_limit`.
-    """
+    """Return the vertices and triangles of a GIFTI surface."""
     arrays: dict[str, list[NDArray[Any]]] = {_POINTS: [], _FACES: []}
     announced, found = None, 0
     attributes: Mapping[str, str] = {}
@@ -122,11 +117,7 @@ def is_freesurfer_name(name: str) -> bool:
 
 
 def parse_freesurfer(data: bytes) -> Raw:
-    """Return the vertices and triangles of a FreeSurfer surface; quadrilaterals are cut as FreeSurfer cuts them.
-
-    Raises:
-        MeshError: The file is none, or its counts do not fit its length.
-    """
+    """Return the vertices and triangles of a FreeSurfer surface; quadrilaterals are cut as FreeSurfer cuts them."""
     match data[:3]:
         case magic if magic == _TRIANGLES:
             return _triangle_surface(data)

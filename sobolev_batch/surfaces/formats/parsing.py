@@ -54,11 +54,7 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 def checked_length(file: IO[bytes]) -> int:
-    """Return the length of an open file.
-
-    Raises:
-        MeshError: The file is too large to be read; the message does not name it.
-    """
+    """Return the length of an open file."""
     length = os.fstat(file.fileno()).st_size
     if length > _LARGEST_BYTES:
         raise MeshError(f"larger than {_LARGEST_BYTES} bytes, which is the most that is read: {length}")
@@ -71,11 +67,7 @@ def is_gzipped(path: Path) -> bool:
 
 
 def require_memory_to_read(needed_bytes: float) -> None:
-    """Refuse a file, before it is read, that takes more memory than reading may.
-
-    Raises:
-        MeshError: It does; the message does not name the file.
-    """
+    """Refuse a file, before it is read, that takes more memory than reading may."""
     memory = MachineMemory.detect()
     if needed_bytes > _MEMORY_PART * memory.total_bytes:
         raise MeshError(
@@ -92,9 +84,6 @@ def read_regular(path: Path, *, gzipped: bool, factor: float, held_bytes: int = 
         gzipped: True where it is to be unpacked.
         factor: Bytes of memory that reading takes for each byte, unpacked.
         held_bytes: Bytes that were read before for the same mesh.
-
-    Raises:
-        MeshError: The file cannot be read, is empty, or is too large; the message does not name it.
     """
     try:
         with open_regular(path) as file:
@@ -117,9 +106,6 @@ def read_unpacked(path: Path, factor: float) -> bytes:
     Args:
         path: Path of the file.
         factor: Bytes of memory that reading takes for each byte, unpacked.
-
-    Raises:
-        MeshError: The file cannot be read, is empty, or is too large; the message starts with its path.
     """
     try:
         return read_regular(path, gzipped=is_gzipped(path), factor=factor)
@@ -141,9 +127,6 @@ def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str
 
     Yields:
         ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
-
-    Raises:
-        MeshError: There are entities, or more and longer elements than any surface has.
     """
     events: list[tuple[str, str, dict[str, str]]] = []
     heard = 0
@@ -212,9 +195,6 @@ def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArr
 
     Returns:
         Vertex indices of triangles (m, 3), int64; those of a polygon lie next to each other.
-
-    Raises:
-        MeshError: There are no polygons, or one has fewer than three corners.
     """
     if not len(sizes):
         raise MeshError("the file has no faces")
@@ -234,9 +214,6 @@ def triangle_strips(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDA
 
     Returns:
         Vertex indices of triangles (m, 3), int64.
-
-    Raises:
-        MeshError: A strip has fewer than three corners.
     """
     _check_sizes(sizes)
     first, rank = _places(sizes)

@@ -49,11 +49,7 @@ _TEXT_BYTES = 2
 
 
 def parse_ply(data: bytes) -> Raw:
-    """Return the vertices and triangles of a PLY file, in its own precision.
-
-    Raises:
-        MeshError: There are no vertices or faces, or the counts do not fit the contents.
-    """
+    """Return the vertices and triangles of a PLY file, in its own precision."""
     counts, is_text = _checked_counts(data)
     if is_text:
         ply = _parsed(data)
@@ -72,21 +68,13 @@ def parse_ply(data: bytes) -> Raw:
 
 
 def announced_sizes(header: bytes) -> tuple[int, int, bool]:
-    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text.
-
-    Raises:
-        MeshError: A count is no integer.
-    """
+    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text."""
     counts, _, is_text = _announced(header.partition(_END)[0])
     return counts.get("vertex", 0), counts.get("face", 0), is_text
 
 
 def parse_obj(data: bytes) -> Raw:
-    """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together.
-
-    Raises:
-        MeshError: A vertex or face line is malformed; the message counts them from 1.
-    """
+    """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together."""
     vertices, corners, sizes = array("d"), array("q"), array("q")
     last = ""
     for last in _joined_lines(data):
@@ -108,11 +96,7 @@ def parse_obj(data: bytes) -> Raw:
 
 
 def parse_off(data: bytes) -> Raw:
-    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text.
-
-    Raises:
-        MeshError: The counts do not fit the lines, or a line is malformed.
-    """
+    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text."""
     filled, last = 0, ""
     for last in _text_lines(data):
         filled += bool(last.partition("#")[0].strip())
@@ -145,11 +129,7 @@ def parse_off(data: bytes) -> Raw:
 
 
 def parse_stl(data: bytes) -> Raw:
-    """Return the vertices and triangles of an STL file; corners that coincide exactly are merged.
-
-    Raises:
-        MeshError: The size does not fit the announced count, or the text is malformed.
-    """
+    """Return the vertices and triangles of an STL file; corners that coincide exactly are merged."""
     announced = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
     if len(data) >= _STL_HEADER_BYTES and len(data) == _STL_HEADER_BYTES + _STL_RECORD.itemsize * announced:
         corners = np.frombuffer(data, _STL_RECORD, offset=_STL_HEADER_BYTES)["corners"].reshape(-1, 3)
@@ -203,11 +183,7 @@ def write_stl(mesh: Mesh) -> bytes:
 
 
 def _text_lines(data: bytes) -> Iterator[str]:
-    """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack.
-
-    Raises:
-        MeshError: A line is longer than any mesh needs.
-    """
+    """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack."""
     reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors="replace")
     number = 0
     while line := reader.readline(_LONGEST_LINE + 1):
@@ -244,11 +220,7 @@ def _is_count(word: str) -> bool:
 
 
 def _parsed_numbers(words: list[str], owner: str) -> list[float]:
-    """Return words as numbers.
-
-    Raises:
-        MeshError: A word is no number; the message starts with the owner, such as "vertex 7".
-    """
+    """Return words as numbers; an error begins with their owner, such as "vertex 7"."""
     try:
         if any("_" in word for word in words):
             raise ValueError("Python's spelling, not that of any mesh format")

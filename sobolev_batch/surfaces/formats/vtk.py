@@ -37,9 +37,6 @@ def parse_vtk(data: bytes, path: Path) -> Raw:
     Args:
         data: Contents of the file, legacy or XML.
         path: Path of the file, whose name shows which.
-
-    Raises:
-        MeshError: PyVista is missing, VTK cannot read all of the file, or it holds other things than flat cells.
     """
     suffix = Path(path.name.lower().removesuffix(".gz")).suffix
     if suffix != ".vtk":
@@ -134,9 +131,6 @@ def _triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indices:
         kinds: VTK's number for the type of each cell.
         corners: Vertex indices of all cells, one after the other.
         offsets: Place of each cell's first corner, and the end of the last one.
-
-    Raises:
-        MeshError: A cell has volume, curved sides or a wrong number of corners.
     """
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):

@@ -1,7 +1,12 @@
-"""Meshes with vertices elsewhere: `moved` and `noisy` ones, and those of a `flow`, against its integrated velocity."""
+"""Meshes of one mesh: coarser, moved and noisy ones, and those of a flow, against its integrated velocity."""
 
 from __future__ import annotations
 
+import re
+import sys
+from importlib.metadata import PackageNotFoundError
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,15 +14,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
-from sobolev_batch import Mesh, icosphere
+from sobolev_batch import Mesh, MeshError, StudyError, icosphere
 from sobolev_batch.surfaces.sources.derived import carried, with_noise
-from sobolev_batch.surfaces.sources.registry import parse_source
-from tests.support.members import BALL, listed, loaded, members
+from sobolev_batch.surfaces.sources.registry import Member, parse_source
+from tests.support.members import BALL, connectivity, listed, loaded, members
+from tests.support.mesh_files import off
+from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, CLOSED
 
 # The ball has radius 1.
 MOVED: dict[str, Any] = {"source": "moved", "mesh": BALL, "distances": [0.3, 0.1], "direction": [0, 3, 4]}
 NOISY: dict[str, Any] = {"source": "noisy", "mesh": BALL, "amplitudes": [0.02, 0.01], "seed": 5}
 FLOW: dict[str, Any] = {"source": "flow", "mesh": {"source": "icosphere", "levels": [2]}, "times": [0.0]}
+needs_pyacvd = pytest.mark.skipif(find_spec("pyacvd") is None, reason="remeshing needs the extra `studies`")
+KINDS = ["decimate", pytest.param("remesh", marks=needs_pyacvd)]
 
 
 def displacements(table: dict[str, Any]) -> list[np.ndarray]:
@@ -128,3 +137,202 @@ def test_what_the_vertices_depend_on_is_in_the_fingerprint() -> None:
 def test_a_vertex_at_the_centre_stays() -> None:
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
     np.testing.assert_array_equal(carried(points, 1.0, 5.0, 2.0)[0], 0.0)
+
+
+def test_decimated_meshes_have_the_counts_asked_for() -> None:
+    found = members({"source": "decimate", "mesh": BALL, "triangles": [320, 20, 80, 20]})
+    assert listed(found) == [("20", 0), ("80", 1), ("320", 2)]
+    made = [loaded(member) for member in found]
+    assert [len(mesh.triangles) for mesh in made] == [20, 80, 320]
+    for mesh in made:
+        assert mesh.counts == CLOSED
+    # Each is nearer to the original than the last; the coarsest is about an icosahedron.
+    errors = [abs(mesh.area / icosphere(3).area - 1) for mesh in made]
+    assert 0.25 > errors[0] > errors[1] > errors[2] > 0
+    assert errors[2] < 0.01
+
+
+def test_decimation_is_done_in_double_precision() -> None:
+    (member,) = members({"source": "decimate", "mesh": BALL, "triangles": [1278]})
+    mesh = loaded(member)
+    assert len(mesh.triangles) == 1278
+    # One edge was collapsed: all vertices but one are vertices of the original, to the last digit.
+    gaps = np.linalg.norm(mesh.vertices[:, None] - icosphere(3).vertices[None], axis=2).min(axis=1)
+    assert np.count_nonzero(gaps > 1e-12) <= 1
+
+
+@needs_pyacvd
+def test_remeshed_surfaces_are_even_and_have_about_the_counts_asked_for() -> None:
+    found = members({"source": "remesh", "mesh": BALL, "triangles": [320, 80, 80]})
+    assert listed(found) == [("80", 0), ("320", 1)]
+    for member, count in zip(found, (80, 320), strict=True):
+        mesh = loaded(member)
+        assert abs(len(mesh.triangles) - count) <= 4
+        assert (mesh.counts["boundary_edges"], mesh.counts["nonmanifold_edges"]) == (0, 0)
+        assert mesh.areas.std() < 0.5 * mesh.areas.mean()
+        assert mesh.area == pytest.approx(icosphere(3).area, rel=0.1)
+        assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(np.ones(len(mesh.vertices)), abs=0.06)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_reduction_gives_the_same_mesh_every_time(kind: str) -> None:
+    (member,) = members({"source": kind, "mesh": BALL, "triangles": [80]})
+    assert loaded(member).digest == loaded(member).digest
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_reduction_needs_one_mesh_of_more_triangles(kind: str) -> None:
+    for mesh, error, message in (
+        ({"source": "icosphere", "levels": [1]}, MeshError, "the mesh has 80 triangles and cannot be reduced to 80"),
+        ({"source": "sphere"}, MeshError, "sphere is no mesh; its triangles are needed"),
+        ({"source": "icosphere", "levels": [2, 3]}, StudyError, "the source makes 2: 2, 3"),
+    ):
+        with pytest.raises(error, match=message):
+            members({"source": kind, "mesh": mesh, "triangles": [80]})[0].load()
+
+
+def test_the_fingerprint_of_a_reduction_is_that_of_the_original_and_the_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = off(BOX_VERTICES, BOX_TRIANGLES)
+    (tmp_path / "box.off").write_bytes(content)
+    (tmp_path / "same.off").write_bytes(content)
+    (tmp_path / "box2.off").write_bytes(content.replace(b"4.0", b"8.0"))
+
+    def of(name: str, count: int) -> dict[str, Any]:
+        table = {"source": "decimate", "mesh": {"source": "files", "paths": [name]}, "triangles": [count]}
+        (member,) = members(table, tmp_path)
+        return dict(member.fingerprint())
+
+    assert of("box.off", 8) == of("same.off", 8)
+    assert of("box.off", 8) != of("box2.off", 8)
+    assert of("box.off", 8) != of("box.off", 6)
+    # It does not depend on what else is asked for.
+    table = {"source": "decimate", "mesh": {"source": "files", "paths": ["box.off"]}, "triangles": [4, 8]}
+    assert dict(members(table, tmp_path)[1].fingerprint()) == of("box.off", 8)
+    before = of("box.off", 8)
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.installed_version", lambda name: "99")
+    assert of("box.off", 8) != before
+
+
+def test_reductions_may_be_nested() -> None:
+    inner = {"source": "decimate", "mesh": BALL, "triangles": [320]}
+    (member,) = members({"source": "decimate", "mesh": inner, "triangles": [80]})
+    assert len(loaded(member).triangles) == 80
+
+
+def test_remeshing_without_its_library_shows_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(distribution: str) -> str:
+        raise PackageNotFoundError(distribution)
+
+    (member,) = members({"source": "remesh", "mesh": BALL, "triangles": [80]})
+    monkeypatch.setitem(sys.modules, "pyacvd", None)
+    monkeypatch.setattr("sobolev_batch.surfaces.sources.registry.version", version)
+    for use in (member.load, member.fingerprint):
+        with pytest.raises(MeshError, match=re.escape("pip install 'sobolev-batch[studies]'")):
+            use()
+
+
+def levels(surface: int, sphere: int, wanted: list[int]) -> tuple[Member, ...]:
+    table = {
+        "source": "spherical-levels",
+        "mesh": {"source": "icosphere", "levels": [surface]},
+        "sphere": {"source": "icosphere", "levels": [sphere]},
+        "levels": wanted,
+    }
+    return members(table)
+
+
+def test_the_levels_of_an_icosphere_are_the_coarser_icospheres() -> None:
+    found = levels(3, 3, [3, 1, 0, 2, 1])
+    assert listed(found) == [("0", 0), ("1", 1), ("2", 2), ("3", 3)]
+    for member in found:
+        mesh, expected = loaded(member), icosphere(member.level)
+        assert connectivity(mesh) == connectivity(expected)
+        assert mesh.area == pytest.approx(expected.area, rel=1e-14)
+
+
+def test_levels_take_vertices_from_the_surface_and_triangles_from_the_sphere(tmp_path: Path) -> None:
+    ball = icosphere(2)
+    # A potato: it is not convex, so that its own hull would leave vertices out.
+    radii = 1 + 0.5 * np.sin(5 * ball.vertices[:, :1])
+    (tmp_path / "potato.off").write_bytes(off(radii * ball.vertices, ball.triangles.tolist()))
+    # The map need not be centred at the origin, nor its radius be one.
+    (tmp_path / "sphere.off").write_bytes(off(100 * ball.vertices + 300, ball.triangles.tolist()))
+    table = {
+        "source": "spherical-levels",
+        "mesh": {"source": "files", "paths": ["potato.off"]},
+        "sphere": {"source": "files", "paths": ["sphere.off"]},
+        "levels": [1, 2],
+    }
+    coarse, fine = (loaded(member) for member in members(table, tmp_path))
+    assert np.array_equal(coarse.vertices, (radii * ball.vertices)[:42])
+    assert connectivity(coarse) == connectivity(icosphere(1))
+    assert connectivity(fine) == connectivity(ball)
+    assert fine.area == pytest.approx(Mesh(radii * ball.vertices, ball.triangles).area, rel=1e-14)
+
+
+def test_levels_need_enough_vertices() -> None:
+    (member,) = levels(2, 2, [3])
+    with pytest.raises(MeshError, match=r"level 3 needs the first 642 vertices .*, found 162 and 162"):
+        member.load()
+    (member,) = levels(3, 2, [1])
+    with pytest.raises(MeshError, match=r"level 1 needs the first 42 vertices .*, found 642 and 162"):
+        member.load()
+
+
+def test_levels_need_a_map_to_a_convex_surface(tmp_path: Path) -> None:
+    ball = icosphere(1)
+    dented = ball.vertices.copy()
+    dented[5] *= 0.5
+    (tmp_path / "dented.off").write_bytes(off(dented, ball.triangles.tolist()))
+    table = {
+        "source": "spherical-levels",
+        "mesh": {"source": "icosphere", "levels": [1]},
+        "sphere": {"source": "files", "paths": ["dented.off"]},
+        "levels": [1],
+    }
+    (member,) = members(table, tmp_path)
+    with pytest.raises(MeshError, match="the first 42 vertices of the map to the sphere are not in convex position"):
+        member.load()
+
+
+@pytest.mark.parametrize("key", ["mesh", "sphere"])
+def test_both_sources_of_levels_are_meshes_and_hear_of_the_reference_and_their_libraries(key: str) -> None:
+    table: dict[str, Any] = {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [1]}
+    with pytest.raises(MeshError, match="sphere is no mesh"):
+        members({**table, key: {"source": "sphere"}})[0].load()
+    remeshed = {"source": "remesh", "mesh": BALL, "triangles": [320]}
+    assert parse_source({**table, key: remeshed}).libraries == ("pyacvd",)
+    fitted = {"source": "fit", "mesh": BALL, "steps": 1}
+    with_target = parse_source({**table, key: {**fitted, "target": {"source": "sphere"}}})
+    assert parse_source({**table, key: fitted}).with_reference(parse_source({"source": "sphere"})) == with_target
+
+
+def test_the_fingerprint_of_a_level_is_that_of_both_meshes_and_the_level() -> None:
+    found = [levels(*key)[0].fingerprint_digest() for key in ((3, 3, [1]), (3, 3, [2]), (3, 2, [1]), (2, 3, [1]))]
+    assert len(set(found)) == 4
+    assert levels(3, 3, [1])[0].fingerprint_digest() == found[0]
+
+
+@pytest.mark.slow
+def test_the_levels_of_a_cortex() -> None:
+    pytest.importorskip("nilearn", reason="the cortical surface needs the extra `studies`")
+
+    def part(name: str) -> dict[str, Any]:
+        path = f"nilearn/datasets/data/fsaverage5/{name}_left.gii.gz"
+        return {"source": "files", "distribution": "nilearn", "paths": [path]}
+
+    table = {"source": "spherical-levels", "mesh": part("pial"), "sphere": part("sphere"), "levels": [0, 3, 5]}
+    found = members(table)
+    made = [loaded(member) for member in found]
+    assert [(len(mesh.vertices), len(mesh.triangles)) for mesh in made] == [(12, 20), (642, 1280), (10242, 20480)]
+    # The finest level is the surface itself, triangle by triangle.
+    whole = loaded(members(part("pial"))[0])
+    assert connectivity(made[2]) == connectivity(whole)
+    assert made[2].area == pytest.approx(whole.area, rel=1e-12)
+    for mesh in made:
+        assert (mesh.counts["boundary_edges"], mesh.counts["nonmanifold_edges"]) == (0, 0)
+    # In square millimetres; coarser levels lose folds.
+    assert 60_000 < whole.area < 120_000
+    assert made[0].area < made[1].area < made[2].area
