@@ -140,9 +140,7 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
     assert re.search(TABLE, completed.stdout)
     meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
     assert all(worker.startswith("tls://") for worker in meshes["worker"].values.tolist())
-
-
-def test_nothing_listens_beyond_loopback(cluster: Cluster) -> None:
+    # Nothing listens beyond loopback.
     assert {ip for ip, _ in listening(*(process.pid for process in cluster.processes))} == {"127.0.0.1"}
 
 
@@ -219,16 +217,3 @@ def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says:
         thread.join()
         for connection in connections:
             connection.close()
-
-
-def test_a_scheduler_does_not_start_unencrypted(home: Path) -> None:
-    """As when DASK_CONFIG names a file that is not there."""
-    completed = subprocess.run(
-        [sys.executable, "-m", "dask", "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0"],
-        env=environment(home, DASK_CONFIG=str(home / "nothing.yaml")),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert completed.returncode != 0
-    assert "TLS expects a `ssl_context`" in completed.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -66,17 +65,6 @@ def test_documented_options_exist() -> None:
         assert (ROOT / words[1]).is_file()
     # Not imported, since that changes the effect of Ctrl-C.
     assert importlib.util.find_spec("dask_jobqueue") is not None
-
-
-def test_kinds() -> None:
-    kinds = [(document["apiVersion"], document["kind"]) for document in documents()]
-    assert kinds == [
-        ("kubernetes.dask.org/v1", "DaskCluster"),
-        ("kubernetes.dask.org/v1", "DaskWorkerGroup"),
-        *[("networking.k8s.io/v1", "NetworkPolicy")] * 2,
-        ("v1", "ConfigMap"),
-        ("batch/v1", "Job"),
-    ]
 
 
 @pytest.mark.parametrize("name", ["worker", "scheduler", "gpu", "submit"])
@@ -147,9 +135,3 @@ def test_the_image() -> None:
     assert all((ROOT / source).exists() for source in sources)
     user = str(pods()["worker"]["securityContext"]["runAsUser"])
     assert f"USER {user}:{user}" in lines
-
-
-@pytest.mark.process
-@pytest.mark.parametrize(("shell", "name"), [("sh", "make-certificates"), ("bash", "slurm.sbatch")])
-def test_scripts_parse(shell: str, name: str) -> None:
-    assert subprocess.run([shell, "-n", FOLDER / name], capture_output=True, check=False).returncode == 0

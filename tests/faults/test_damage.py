@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +16,10 @@ from distributed import Client
 from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
+from tests.faults.conftest import FIELD
 from tests.support.commands import call, write_toml
 from tests.support.stores import assert_same_fields, assert_same_tables, put_back
 from tests.support.studies import small_table, variable
-
-FIELD = "fourier/fourier/c/{row}/0/0/0"
 
 
 def truncate(chunk: Path) -> None:
@@ -53,17 +52,6 @@ def swap_octaves(chunk: Path) -> None:
 
 DAMAGES = (truncate, empty, flip, delete, swap)
 Damage = Callable[[Path], None]
-
-
-@pytest.fixture(scope="module")
-def sound(finished_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(shutil.copytree(finished_store, tmp_path_factory.mktemp("damage") / "results.zarr"))
-
-
-@pytest.fixture
-def store(sound: Path) -> Iterator[Path]:
-    with put_back(sound):
-        yield sound
 
 
 def load(store: Path) -> None:
@@ -195,20 +183,6 @@ def test_texts_that_cannot_be_are_refused_before_they_take_memory(
     (store / "records/record/c/2").write_bytes(with_checksum(data))
     assert run(study, store, threads).computed == ("ico/2",)
     assert verify(store).is_sound
-
-
-def test_labels_are_read_once_for_any_number_of_damaged_records(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for row in range(5):
-        flip(store / f"records/record/c/{row}")
-    reads, read = [], Store.labels
-
-    def labels(opened: Store) -> tuple[str, ...]:
-        reads.append(opened.path)
-        return read(opened)
-
-    monkeypatch.setattr(Store, "labels", labels)
-    assert Store.open(store).records() == (None,) * 5
-    assert len(reads) == 1
 
 
 def test_sparse_chunks_and_stray_links(store: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from distributed import Client
 from sobolev_batch import DamageError, Study, open_store, run, status, table, verify
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.store_accessor import StoreAccessor
-from tests.support.stores import assert_same_fields, assert_same_tables, put_back
+from tests.faults.conftest import FIELD
+from tests.support.stores import assert_same_fields, assert_same_tables
 from tests.support.studies import small_table, variable
 
-FIELD = "fourier/fourier/c/{row}/0/0/0"
 RECORD = "records/record/c/{row}"
 # Pairs of chunks of equal length.
 PAIRS = [
@@ -29,22 +29,11 @@ PAIRS = [
 
 
 @pytest.fixture(scope="module")
-def sound(finished_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(shutil.copytree(finished_store, tmp_path_factory.mktemp("exchanged") / "results.zarr"))
-
-
-@pytest.fixture(scope="module")
 def earlier(sound: Path, threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same store before its fields were computed again, with other keys."""
     path = Path(shutil.copytree(sound, tmp_path_factory.mktemp("earlier") / "results.zarr"))
     run(Study.from_table(small_table(transform={"eps": 1e-7})), path, threads)
     return path
-
-
-@pytest.fixture
-def store(sound: Path) -> Iterator[Path]:
-    with put_back(sound):
-        yield sound
 
 
 def exchange(store: Path, one: str, other: str) -> None:

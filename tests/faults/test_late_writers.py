@@ -105,12 +105,5 @@ def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store
     assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
 
 
-def test_a_fence_goes_with_a_location() -> None:
-    fenced = Location("results.zarr").fenced(Lock.of_this_process().fence)
-    assert fenced.absolute().fence == fenced.fence
-    assert fenced == Location("results.zarr")
-    assert str(fenced) == "results.zarr"
-
-
 def _is_stopped(pid: int) -> bool:
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)

@@ -6,7 +6,6 @@ import random
 import socket
 import struct
 import threading
-import time
 import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -73,11 +72,10 @@ class Turn:
 
 @dataclass(frozen=True)
 class Request:
-    """A request, its time, and its failure, if any."""
+    """A request, and its failure, if any."""
 
     method: str
     path: str
-    seconds: float
     failure: Kind | None
 
 
@@ -89,7 +87,6 @@ class Server:
 
     Attributes:
         url: Endpoint.
-        listener: Function that is called at each request, before it is handled.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -97,7 +94,6 @@ class Server:
         from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
         from werkzeug.serving import make_server
 
-        self.listener: Callable[[], None] = lambda: None
         self._moto = DomainDispatcherApplication(create_backend_app)
         self._random = random.Random(seed)
         self._rule = HEALTHY
@@ -200,7 +196,6 @@ class Server:
 
     def _draw(self, method: str, path: str) -> Kind | None:
         """Return the kind of failure of a new request, if it is to fail."""
-        self.listener()
         with self._lock:
             turn = self._turn
             if turn and turn.method == method and turn.part in path:
@@ -208,7 +203,7 @@ class Server:
                 if self._turn is None:
                     self._rule, self._failed = turn.rule, Counter()
             kind = self._drawn(method, path)
-            self._requests.append(Request(method, path, time.monotonic(), kind))
+            self._requests.append(Request(method, path, kind))
             return kind
 
     def _drawn(self, method: str, path: str) -> Kind | None:

@@ -100,14 +100,6 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
             stop(process)
 
 
-def test_a_malformed_address_is_wrong_input(tmp_path: Path) -> None:
-    write_study(tmp_path)
-    done = call("submit", tmp_path / "study.toml", "--scheduler", "host")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: 'host' is not the address of a scheduler (missing port number")
-    assert done.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     ("store", "least"), [pytest.param("", 4, marks=pytest.mark.all), ("memory://of-threads", 2)], ids=["run", "threads"]
 )
