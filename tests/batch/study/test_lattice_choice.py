@@ -80,6 +80,19 @@ def test_another_accuracy_is_another_choice(client: Client, store_path: Path) ->
     assert variable(sb.open_store(store_path), "convergence", "within").all()
 
 
+def test_a_coarse_accuracy_of_a_far_mesh_needs_no_octaves(client: Client, store_path: Path) -> None:
+    study = asking(0.1, family=[{"name": "ico", "source": "icosphere", "levels": [0]}])
+    study = replace(study, orders=(-2.0,))
+    sb.run(study, store_path, client)
+    choice = stored_choice(store_path)
+    assert choice is not None
+    assert choice.tail is None
+    found = sb.open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/0", order=-2.0)
+    truth = sb.distance(sb.icosphere(0), sb.Sphere(), -2.0, rtol=1e-3)
+    assert found["within"]
+    assert abs(found["distance"] - truth["distance"].item()) <= found["error"] + truth["error"].item()
+
+
 def test_a_lattice_that_turns_out_too_small_grows(
     client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
