@@ -232,12 +232,6 @@ def test_all_real_types_make_the_same_mesh(dtype: str, index_dtype: str) -> None
     assert mesh.digest == Mesh(VERTICES, TRIANGLES).digest
 
 
-def test_single_precision_is_widened_not_rounded_again() -> None:
-    third = np.float32(1 / 3)
-    mesh = Mesh(np.array(VERTICES, dtype=np.float32) * third, TRIANGLES)
-    assert mesh.vertices[1, 0] == float(np.float32(3) * third)
-
-
 def test_arrays_are_copies_also_of_views() -> None:
     store, triangles = np.zeros((6, 3)), np.array(TRIANGLES)
     store[::2] = VERTICES

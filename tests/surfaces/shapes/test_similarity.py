@@ -80,13 +80,6 @@ def test_a_sphere_becomes_the_unit_sphere() -> None:
     assert Similarity.to_unit_ball(Sphere()).is_identity
 
 
-def test_a_mesh_of_a_sphere_goes_where_the_sphere_goes() -> None:
-    mesh = Mesh(4 * icosphere(2).vertices + [1.0, -2.0, 3.0], icosphere(2).triangles)
-    similarity = Similarity.to_unit_ball(mesh)
-    assert similarity.scale == pytest.approx(0.25, rel=1e-14)
-    assert similarity.origin == pytest.approx((1.0, -2.0, 3.0), rel=1e-14)
-
-
 @pytest.mark.slow
 @seeded
 @given(meshes())

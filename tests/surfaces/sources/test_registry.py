@@ -210,7 +210,7 @@ def test_fingerprints_of_different_sources_differ(tmp_path: Path) -> None:
     (tmp_path / "box.off").write_bytes(OFF_BOX)
     tables = [table for kind, table in KINDS.items() if kind != "remesh"]
     found = [dict(member.fingerprint()) for table in tables for member in members(table, tmp_path)]
-    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) == 23
+    assert len({json.dumps(fingerprint, sort_keys=True) for fingerprint in found}) == len(found) > len(tables)
 
 
 def identity(table: dict[str, Any], member: int = 0) -> str:
