@@ -11,7 +11,6 @@ from .batch.submit import submit as submit
 from .batch.verify import Verification as Verification
 from .batch.verify import verify as verify
 from .errors import AccuracyError as AccuracyError
-from .errors import AddressError as AddressError
 from .errors import BackendError as BackendError
 from .errors import ClusterError as ClusterError
 from .errors import DamageError as DamageError

@@ -81,10 +81,6 @@ class ClusterError(SobolevBatchError):
     """The Dask cluster cannot be reached, or stopped serving."""
 
 
-class AddressError(ClusterError, InputError):
-    """The address of a scheduler is malformed, or its network is not to be trusted."""
-
-
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, or the name of its type if it has none.
 

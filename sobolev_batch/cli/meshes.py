@@ -122,7 +122,7 @@ def compare_command(
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
     from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
-    from sobolev_batch.testing.witness import require_place, write_difference
+    from sobolev_batch.testing.verdict import require_place, write_difference
 
     if below is not None:
         context.exit(_judge_files(context, a, b, below))

@@ -5,7 +5,7 @@ pytest loads it in every session of an environment, so it imports nothing else b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from hashlib import sha256
 from itertools import count
@@ -31,47 +31,40 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addini(_INI, _HELP, default="")
 
 
-class SurfaceAssertion:
-    """`sobolev_batch.assert_same_surface` for one test, which knows where to write witness files."""
+@pytest.fixture
+def assert_same_surface(request: pytest.FixtureRequest) -> Callable[..., Verdict]:
+    """Assert that two surfaces are the same; if not, write where they differ, and name the files in the message."""
+    numbers = count(1)
 
-    def __init__(self, request: pytest.FixtureRequest) -> None:
-        self._request = request
-        self._paths = self._numbered_paths()
-
-    def __call__(self, a: SurfaceLike, b: SurfaceLike, **settings: Any) -> Verdict:
+    def check(a: SurfaceLike, b: SurfaceLike, **settings: Any) -> Verdict:
         """Raise an AssertionError unless two surfaces are the same; see `sobolev_batch.assert_same_surface`."""
         __tracebackhide__ = True
         from sobolev_batch.testing.verdict import assert_same_surface
 
-        return assert_same_surface(a, b, **{"witness": next(self._paths), **settings})
+        return assert_same_surface(a, b, **{"witness": _path(request, next(numbers)), **settings})
 
-    def _numbered_paths(self) -> Iterator[Path]:
-        """Yield the beginnings of the paths of this test's files, one for each comparison."""
-        from sobolev_batch.surfaces.sources.names import file_stem
-
-        node = self._request.node
-        # Parameters may be long, or differ in characters that names of files cannot have.
-        digest = sha256(node.nodeid.encode()).hexdigest()[:8]
-        for number in count(1):
-            stem = file_stem(number, node.name).partition("-")[2] or "test"
-            yield self._folder / f"{stem}-{digest}-{number}"
-
-    @property
-    def _folder(self) -> Path:
-        config = self._request.config
-        chosen = config.getoption(_OPTION) or config.getini(_INI)
-        if chosen:
-            return config.rootpath / str(chosen)
-        # Without its plug-in, pytest has no cache; and a project may lie where nothing can be written.
-        cache: pytest.Cache | None = getattr(config, "cache", None)
-        if cache is not None:
-            with suppress(OSError):
-                return cache.mkdir("sobolev-witness")
-        temporary: Path = self._request.getfixturevalue("tmp_path")
-        return temporary
+    return check
 
 
-@pytest.fixture
-def assert_same_surface(request: pytest.FixtureRequest) -> SurfaceAssertion:
-    """Assert that two surfaces are the same; if not, write where they differ, and name the files in the message."""
-    return SurfaceAssertion(request)
+def _path(request: pytest.FixtureRequest, number: int) -> Path:
+    """Return the beginning of the paths of the files of a comparison of this test."""
+    from sobolev_batch.surfaces.sources.names import file_stem
+
+    # Parameters may be long, or differ in characters that names of files cannot have.
+    digest = sha256(request.node.nodeid.encode()).hexdigest()[:8]
+    stem = file_stem(number, request.node.name).partition("-")[2] or "test"
+    return _folder(request) / f"{stem}-{digest}-{number}"
+
+
+def _folder(request: pytest.FixtureRequest) -> Path:
+    config = request.config
+    chosen = config.getoption(_OPTION) or config.getini(_INI)
+    if chosen:
+        return config.rootpath / str(chosen)
+    # Without its plug-in, pytest has no cache; and a project may lie where nothing can be written.
+    cache: pytest.Cache | None = getattr(config, "cache", None)
+    if cache is not None:
+        with suppress(OSError):
+            return cache.mkdir("sobolev-witness")
+    temporary: Path = request.getfixturevalue("tmp_path")
+    return temporary

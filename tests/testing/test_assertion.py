@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.testing.witness import write_difference
+from sobolev_batch.testing.verdict import write_difference
 
 
 def test_it_returns_the_verdict_of_equal_surfaces_and_writes_nothing(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from distributed.comm import connect
 from distributed.comm.addressing import parse_address, parse_host_port
 
 from sobolev_batch.batch.cluster import workers as workers_module
-from sobolev_batch.errors import AddressError, ClusterError, InputError, one_line
+from sobolev_batch.errors import ClusterError, InputError, one_line
 from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
 from sobolev_batch.parameters import byte_count, format_bytes
 
@@ -185,7 +185,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
             reaches their ports can run programs there and read the meshes.
 
     Raises:
-        AddressError: The address is malformed, or its network would have to be trusted.
+        InputError: The address is malformed, or its network would have to be trusted.
         ClusterError: Nothing answers there, or Dask's configuration does not fit.
     """
     if trust_network:
@@ -217,7 +217,7 @@ def require_private(name: str, who: str) -> None:
         who: Process that listens there, for the message.
 
     Raises:
-        AddressError: The address is malformed, or others may reach it.
+        InputError: The address is malformed, or others may reach it.
         ClusterError: The host does not exist.
     """
     scheme, host, port = _parts(name)
@@ -229,7 +229,7 @@ def require_private(name: str, who: str) -> None:
         raise ClusterError(f"no Dask scheduler answers at {name!r}: there is no host {host!r}") from error
     beyond = [str(place[0]) for *_, place in infos if not _is_loopback(str(place[0]))]
     if beyond:
-        raise AddressError(
+        raise InputError(
             f"{who} at {name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
             "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "
             "--trust-network (in Python trust_network=True) where nobody else is on that network"
@@ -293,5 +293,5 @@ def _is_loopback(host: str) -> bool:
     return (mapped or address).is_loopback
 
 
-def _malformed(name: str, reason: str) -> AddressError:
-    return AddressError(f"{name!r} is not the address of a scheduler ({reason}); one is tls://host:8786")
+def _malformed(name: str, reason: str) -> InputError:
+    return InputError(f"{name!r} is not the address of a scheduler ({reason}); one is tls://host:8786")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sobolev_batch import AddressError, ClusterError, InputError
+from sobolev_batch import ClusterError, InputError
 from sobolev_batch.batch.cluster.clients import remote_client, require_private
 
 MALFORMED = ["", "tcp://", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
@@ -17,7 +17,7 @@ MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "tcp://a 
 
 @pytest.mark.parametrize("name", MALFORMED)
 def test_malformed(name: str) -> None:
-    with pytest.raises(AddressError, match="is not the address of a scheduler"), remote_client(name, True):
+    with pytest.raises(InputError, match="is not the address of a scheduler"), remote_client(name, True):
         pass
 
 
@@ -34,10 +34,8 @@ def test_private(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["tcp://192.0.2.1:1", "192.0.2.1:1", "ws://[2001:db8::1]:1", "tcp://0.0.0.0:1"])
 def test_open_to_others(name: str) -> None:
-    with pytest.raises(AddressError, match="is neither encrypted nor on loopback") as caught, remote_client(name):
+    with pytest.raises(InputError, match="is neither encrypted nor on loopback") as caught, remote_client(name):
         pass
-    assert isinstance(caught.value, ClusterError)
-    assert isinstance(caught.value, InputError)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
@@ -50,7 +48,7 @@ def test_all_that_a_name_stands_for_counts(places: list[str], private: bool, mon
     if private:
         require_private("tcp://scheduler:8786", "the scheduler")
     else:
-        with pytest.raises(AddressError, match=r"\(192\.0\.2\.1\)"):
+        with pytest.raises(InputError, match=r"\(192\.0\.2\.1\)"):
             require_private("tcp://scheduler:8786", "the scheduler")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
-from sobolev_batch import AddressError, ClusterError, Study, open_store, run
+from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
@@ -89,7 +89,7 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
         with Client(address) as client:
             client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
         with (
-            pytest.raises(AddressError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"),
+            pytest.raises(InputError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"),
             remote_client(address),
         ):
             pass
