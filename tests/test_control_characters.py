@@ -21,7 +21,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.cli.output import overwrite, progress_bar
+from sobolev_batch.cli.common import overwrite, progress_bar
 from sobolev_batch.results.tables import FORMATS
 from sobolev_batch.results.tables.text import machine_table, printed_table, prose
 from sobolev_batch.surfaces.sources import files

@@ -14,7 +14,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import memory_limit
 from sobolev_batch.batch.cluster.workers import Workers, allowed_bytes
 from sobolev_batch.cli import cli
-from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
+from sobolev_batch.parameters import available_cores, machine_memory, require_machine_memory
 from sobolev_batch.spectral.transform.settings import thread_count
 from tests.support.studies import small_table
 
@@ -57,9 +57,9 @@ def make_root(root: Path, groups: str | None, files: dict[str, str]) -> Path:
 
 @pytest.mark.parametrize(("groups", "files", "limit"), MEMORY.values(), ids=MEMORY.keys())
 def test_limits_of_memory_count(groups: str | None, files: dict[str, str], limit: int | None, tmp_path: Path) -> None:
-    memory = MachineMemory.detect(make_root(tmp_path, groups, files))
-    assert memory.total_bytes == (TOTAL if limit is None else limit)
-    assert ("memory." in memory.source) == (limit is not None)
+    memory, source = machine_memory(make_root(tmp_path, groups, files))
+    assert memory == (TOTAL if limit is None else limit)
+    assert ("memory." in source) == (limit is not None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ LAYERS = (
     "visible",
     "errors",
     "parameters",
-    "machine",
     "surfaces",
     "spectral",
     "fitting",

@@ -31,7 +31,7 @@ from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.machine import available_cores, require_machine_memory
+from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.visible import reasons, table_html

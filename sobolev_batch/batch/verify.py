@@ -17,7 +17,7 @@ from sobolev_batch.batch.store.store import LABELS, QUALITY, RECORDS, ROOT, Stor
 from sobolev_batch.batch.store.tables import damaged_tables, rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
-from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import available_cores
 from sobolev_batch.visible import reasons, table_html
 
 _log = logging.getLogger(__name__)

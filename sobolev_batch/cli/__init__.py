@@ -12,15 +12,13 @@ import click
 
 # Importing these modules adds their commands to the group.
 from sobolev_batch.cli import meshes, stores, studies  # noqa: F401
+from sobolev_batch.cli.common import EXIT_INPUT, EXIT_OTHER, cli, echo, echo_lines, show_usage_error
 from sobolev_batch.cli.interruption import (
     SECONDS_TO_END,
     Deadline,
-    Terminated,
     end_process,
     ignore_requests,
 )
-from sobolev_batch.cli.options import EXIT_INPUT, EXIT_OTHER, cli
-from sobolev_batch.cli.output import echo, echo_lines, show_usage_error
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.visible import make_messages_visible
 
@@ -48,7 +46,7 @@ def main() -> None:
     except (KeyboardInterrupt, click.Abort):
         # Some work takes SIGTERM for an interrupt.
         _end(deadline.request or signal.SIGINT, command)
-    except Terminated:
+    except SystemExit:
         _end(signal.SIGTERM, command)
     except Exception as error:
         if debug:

@@ -18,10 +18,6 @@ SECONDS_TO_END = 1.0
 _SECONDS_TO_LEAVE_OUT = 0.5
 
 
-class Terminated(SystemExit):
-    """The process was asked to end by SIGTERM."""
-
-
 class Deadline:
     """The end of this process soon after a request to end, even while it computes.
 
@@ -46,11 +42,11 @@ class Deadline:
         self._is_met = threading.Event()
 
     def start(self) -> None:
-        """Raise KeyboardInterrupt and `Terminated` at requests from now on, and see that the process ends."""
+        """Raise KeyboardInterrupt at Ctrl-C and SystemExit at SIGTERM from now on, and see that the process ends."""
         # Python's tracker of semaphores outlives a process that ends at once and cleans up after it, with a warning
         # that would be the last word.
         sys.warnoptions.append("ignore:resource_tracker:UserWarning")
-        signal.signal(signal.SIGTERM, _raising(Terminated))
+        signal.signal(signal.SIGTERM, _raising(SystemExit))
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
             signal.signal(signal.SIGINT, _raising(KeyboardInterrupt))
         if hasattr(signal, "pthread_kill"):  # not on Windows

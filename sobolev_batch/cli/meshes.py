@@ -5,25 +5,29 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from threading import Event
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import (
+from sobolev_batch.cli.common import (
     EXIT_DIFFERENT,
     EXIT_UNDECIDED,
+    PATH,
     best_effort_option,
     cli,
+    echo,
+    echo_lines,
     fraction_of_norm,
     memory_option,
     orders_option,
+    progress_bar,
 )
-from sobolev_batch.cli.output import echo, echo_lines, progress_bar
+from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.fitting import DEFAULT_ORDER as DEFAULT_FIT_ORDER
 from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
@@ -56,8 +60,8 @@ _below_option = click.option(
 
 
 @cli.command("compare")
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=PATH)
+@click.argument("b", type=PATH)
 @orders_option("Print the distance of this order, which may be any below -1/2.", "-2")
 @click.option(
     "--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest attainable]"
@@ -86,7 +90,7 @@ _below_option = click.option(
 @click.option(
     "--witness",
     "witness_path",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="PATH",
     help="Write both meshes with the witness function of the first order at their vertices, for MeshLab: into "
     "PATH-a.ply and PATH-b.ply.",
@@ -223,12 +227,12 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
 
 
 @cli.command("fit", short_help="Move the vertices of START to bring it nearer to TARGET.")
-@click.argument("start", type=click.Path(path_type=Path))
-@click.argument("target", type=click.Path(path_type=Path))
+@click.argument("start", type=PATH)
+@click.argument("target", type=PATH)
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=PATH,
     required=True,
     help="Write the mesh to this file, .ply, .obj, .off or .stl.",
 )
@@ -295,7 +299,17 @@ def fit_command(
     require_comparable(own, goal)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(goal)
     method = fit if triangles is None else partial(refine, triangles=triangles)
-    with _Steps() as shown, Deadline.with_results(shown.has_begun):
+    has_begun = Event()
+    bar = progress_bar(1, "steps", show_count=False) if sys.stderr.isatty() else None
+
+    def show(progress: FitProgress) -> None:
+        has_begun.set()
+        if bar is not None:
+            bar.length = progress.steps
+            # Earlier rounds may have needed fewer steps than they had.
+            bar.update(progress.step - bar.pos)
+
+    with bar or nullcontext(), Deadline.with_results(has_begun.is_set):
         fitted = method(
             similarity.apply(own),
             similarity.apply(goal),
@@ -303,7 +317,7 @@ def fit_command(
             steps=steps,
             smoothing=smoothing,
             keep_boundary=keep_boundary,
-            notify=shown,
+            notify=show,
         )
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
     result = Mesh(vertices, fitted.mesh.triangles)
@@ -334,36 +348,6 @@ def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str
             f"so far from the origin, numbers in {path.name} have too few digits: vertices are off by up to "
             f"{moved:.1g}, and the distance is not that of the file; move the meshes to the origin, or write a .ply"
         )
-
-
-class _Steps:
-    """Shows the steps of a fit on a terminal."""
-
-    def __init__(self) -> None:
-        self._has_begun = False
-        self._bar: Any = progress_bar(1, "steps", show_count=False) if sys.stderr.isatty() else None
-
-    def has_begun(self) -> bool:
-        """Return whether a step has been taken."""
-        return self._has_begun
-
-    def __enter__(self) -> Self:
-        if self._bar is not None:
-            self._bar.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.__exit__(kind, error, trace)
-
-    def __call__(self, progress: FitProgress) -> None:
-        self._has_begun = True
-        if self._bar is not None:
-            self._bar.length = progress.steps
-            # Earlier rounds may have needed fewer steps than they had.
-            self._bar.update(progress.step - self._bar.pos)
 
 
 def _text(quality: FitQuality, scale: float) -> str:

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import (
+from sobolev_batch.cli.common import (
     EXIT_OTHER,
     EXIT_SOME_FAILED,
     cli,
+    echo,
+    echo_lines,
     folder_option,
     format_option,
     fraction_of_norm,
@@ -20,10 +22,11 @@ from sobolev_batch.cli.options import (
     meshes_option,
     orders_option,
     output_option,
+    progress_bar,
+    replace_line,
     store_argument,
     up_option,
 )
-from sobolev_batch.cli.output import ProgressLine, echo, echo_lines, progress_bar
 from sobolev_batch.errors import SobolevBatchError, StoreError
 from sobolev_batch.results.tables import Format
 
@@ -66,16 +69,16 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
     from sobolev_batch.results.status import status
 
     current = status(store)
-    line = ProgressLine()
+    shown = ""
     while follow and current.going_on:
-        line.show(current.progress)
+        shown = replace_line(current.progress, shown)
         time.sleep(_FOLLOW_SECONDS)
         current = status(store)
         if current.run_store and not current.going_on:
             # Between two objects of a collection, no run goes on for a moment.
             time.sleep(_FOLLOW_SECONDS)
             current = status(store)
-    line.close()
+    replace_line("", shown)
     echo_lines(current)
     if current.failed or current.not_compared:
         context.exit(EXIT_SOME_FAILED)

@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from sobolev_batch.cli.options import (
+from sobolev_batch.cli.common import (
     EXIT_SOME_FAILED,
+    PATH,
     best_effort_option,
     cli,
+    echo,
+    echo_lines,
     give_up_option,
     location,
     memory_option,
+    progress_reports,
     store_option,
     study_argument,
     trust_option,
 )
-from sobolev_batch.cli.output import Reporter, echo, echo_lines
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -34,10 +37,10 @@ _MOST_IMPRECISE = 10
 
 
 @cli.command("init", short_help="Write a study file for a folder of meshes.")
-@click.argument("folder", type=click.Path(path_type=Path), default=".")
+@click.argument("folder", type=PATH, default=".")
 @click.option(
     *("-o", "--output"),
-    type=click.Path(path_type=Path),
+    type=PATH,
     default="study.toml",
     show_default=True,
     help="Write the study to this file, which must not exist.",
@@ -109,17 +112,17 @@ def run_command(
         )
     parsed = _parsed(study, best_effort=best_effort)
     place = store or _made_default_store(parsed)
-    with Reporter() as reporter:
+    with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=reporter, reuse=reuse, give_up_after=give_up_after)
+                summary = run(parsed, place, client, on_progress=show, reuse=reuse, give_up_after=give_up_after)
         else:
             summary = run(
                 parsed,
                 place,
                 workers=workers,
                 memory=None if memory is None else f"{memory}B",
-                on_progress=reporter,
+                on_progress=show,
                 reuse=reuse,
                 give_up_after=give_up_after,
             )

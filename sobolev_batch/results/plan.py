@@ -21,8 +21,7 @@ from sobolev_batch.batch.study.lattice_choice import look_at_extents
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.workspace import complete_records
-from sobolev_batch.machine import available_cores
-from sobolev_batch.parameters import format_bytes
+from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.costs import SurfaceSize

@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
-from sobolev_batch.machine import available, available_cores
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance

@@ -24,8 +24,7 @@ from distributed.comm.addressing import parse_address, parse_host_port
 
 from sobolev_batch.batch.cluster import workers as workers_module
 from sobolev_batch.errors import ClusterError, InputError, one_line
-from sobolev_batch.machine import MachineMemory, available_cores, require_machine_memory
-from sobolev_batch.parameters import byte_count, format_bytes
+from sobolev_batch.parameters import available_cores, byte_count, format_bytes, machine_memory, require_machine_memory
 
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
@@ -54,7 +53,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.
-    limit = MachineMemory.detect().total_bytes // count if memory is None else memory_limit(memory, count)
+    limit = machine_memory()[0] // count if memory is None else memory_limit(memory, count)
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
         _shielded_from_interrupts() as unshield,

@@ -27,8 +27,7 @@ from sobolev_batch.batch.storage.lock import Lock
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreError
-from sobolev_batch.machine import MachineMemory
-from sobolev_batch.parameters import format_bytes
+from sobolev_batch.parameters import format_bytes, machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import CPU, INSTALL, Backend, gpu_backend
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, slowness
@@ -89,7 +88,7 @@ def allowed_bytes(limit: float | None) -> float:
     Args:
         limit: Memory limit of the worker; without one, the machine's memory, which no limit can exceed.
     """
-    total = MachineMemory.detect().total_bytes
+    total = machine_memory()[0]
     return _ALLOWED_FRACTION * min(limit or total, total) - _IDLE_BYTES
 
 
@@ -102,7 +101,7 @@ class Workers:
     @classmethod
     def of_this_machine(cls, count: int) -> Workers:
         """Return the workers of a cluster that a run without a scheduler would start here."""
-        allowed = allowed_bytes(MachineMemory.detect().total_bytes / count)
+        allowed = allowed_bytes(machine_memory()[0] / count)
         return cls((WorkerInfo("this machine", 1, allowed, "cpu", ""),) * count)
 
     @property

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import AccuracyError, InputError, MeshError, StudyError
-from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import available_cores
 from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target

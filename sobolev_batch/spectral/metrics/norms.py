@@ -14,8 +14,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.machine import available, available_cores
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve

@@ -11,8 +11,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import LatticeError, MeshError
-from sobolev_batch.machine import available_cores
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import available_cores, check_seed
 from sobolev_batch.spectral.adaptive.frequencies import Frequencies
 from sobolev_batch.spectral.adaptive.problem import support_of
 from sobolev_batch.spectral.adaptive.values import SurfaceValues

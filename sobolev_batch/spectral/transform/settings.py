@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.machine import available_cores
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import available_cores, is_whole_number
 from sobolev_batch.spectral.backends import CPU, DEFAULT_BATCH, Backend, ComplexDtype
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.machine import MachineMemory
-from sobolev_batch.parameters import format_bytes
+from sobolev_batch.parameters import format_bytes, machine_memory
 
 # What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
 Raw = tuple[NDArray[Any], NDArray[Any]]
@@ -68,11 +67,11 @@ def is_gzipped(path: Path) -> bool:
 
 def require_memory_to_read(needed_bytes: float) -> None:
     """Refuse a file, before it is read, that takes more memory than reading may."""
-    memory = MachineMemory.detect()
-    if needed_bytes > _MEMORY_PART * memory.total_bytes:
+    most, source = machine_memory()
+    if needed_bytes > _MEMORY_PART * most:
         raise MeshError(
             f"takes up to {format_bytes(needed_bytes)} of memory to read, and may take {_MEMORY_PART:.0%} of "
-            f"{format_bytes(memory.total_bytes)}, {memory.source}; read it where there is more, or give a coarser mesh"
+            f"{format_bytes(most)}, {source}; read it where there is more, or give a coarser mesh"
         )
 
 

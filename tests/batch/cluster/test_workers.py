@@ -13,7 +13,7 @@ from distributed import Client
 from sobolev_batch import ClusterError, InputError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, prepare_workers
-from sobolev_batch.machine import MachineMemory
+from sobolev_batch.parameters import machine_memory
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
 from tests.support.studies import small_table, variable
 
@@ -60,7 +60,7 @@ def test_workers_declare_their_memory(client: Client) -> None:
         assert declared == {MEMORY: member.allowed_bytes}
         assert GPU not in declared
         limit = workers[member.address]["memory_limit"]
-        assert limit == MachineMemory.detect().total_bytes // len(workers)
+        assert limit == machine_memory()[0] // len(workers)
         assert 0.5 < member.allowed_bytes / limit < 0.85
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import MeshError, read_mesh
-from sobolev_batch.machine import MachineMemory
+from sobolev_batch.surfaces.formats import parsing
 from sobolev_batch.surfaces.formats.readers import expected_size
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.mesh_attacks import ATTACKS
@@ -147,7 +147,7 @@ def test_files_beyond_the_bound_are_refused_unread(tmp_path: Path, ending: str, 
 @pytest.fixture
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine of 4 GB."""
-    monkeypatch.setattr(MachineMemory, "detect", lambda: MachineMemory(4 * 10**9, "all of this machine"))
+    monkeypatch.setattr(parsing, "machine_memory", lambda: (4 * 10**9, "all of this machine"))
 
 
 @pytest.mark.usefixtures("little_memory")
@@ -168,7 +168,7 @@ def test_packed_files_are_refused_as_soon_as_they_exceed_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "scan.obj.gz").write_bytes(gzip.compress(b"# comment\n" * 3_000_000 + os.urandom(1 << 19)))
-    monkeypatch.setattr(MachineMemory, "detect", lambda: MachineMemory(200_000_000, "all of this machine"))
+    monkeypatch.setattr(parsing, "machine_memory", lambda: (200_000_000, "all of this machine"))
     with pytest.raises(MeshError, match=r"scan\.obj\.gz: takes up to 15\d\.\dMB of memory to read, and may take 75% "):
         read_mesh(tmp_path / "scan.obj.gz")
 

@@ -1,4 +1,6 @@
-"""The command sobolev-batch, which has all others as subcommands, and the options that several of them have.
+"""The command sobolev-batch, which has all others as subcommands; the options and the output that they share.
+
+All that commands print passes through here, so that no name reaches a terminal as a command.
 
 The modules of commands import whatever computes inside of their functions: with it, a command would take seconds to
 show its help.
@@ -7,8 +9,11 @@ show its help.
 from __future__ import annotations
 
 import logging
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,16 +21,21 @@ import click
 
 from sobolev_batch.batch.cluster import GIVE_UP_AFTER, LEAST_GIVE_UP_AFTER
 from sobolev_batch.results.tables import FORMATS
+from sobolev_batch.visible import visible, visible_lines
 
 if TYPE_CHECKING:
+    from sobolev_batch.batch.cluster.execution import Progress
     from sobolev_batch.batch.storage.location import Location
 
 # Exit statuses; `end_process` has those after SIGINT and SIGTERM.
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED = 1, 2, 3
 # Of `compare --below`, beside 0 for files that are the same; like diff, which has 1 for files that differ.
 EXIT_DIFFERENT, EXIT_UNDECIDED = 1, 4
+PATH = click.Path(path_type=Path)
 # Loggers of the drivers of object storage.
 _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
+
+_CLEAR_LINE = "\r\x1b[K"
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -64,18 +74,13 @@ def _is_shown(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.ERROR or not record.name.startswith("distributed")
 
 
-class Numbers(click.ParamType):  # type: ignore[type-arg]
-    """One number, or several with commas between them."""
-
-    name = "numbers"
-
-    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> tuple[float, ...]:
-        """Return the numbers of an option."""
-        try:
-            # A default was converted already.
-            return value if isinstance(value, tuple) else tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is neither a number nor a list of numbers such as -4,-6", param, context)
+def _numbers(value: Any) -> tuple[float, ...]:
+    """Return one number, or several with commas between them."""
+    try:
+        # A default was converted already.
+        return value if isinstance(value, tuple) else tuple(float(part) for part in str(value).split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is neither a number nor a list of numbers such as -4,-6") from error
 
 
 def orders_option(text: str, default: str) -> Callable[[Command], Command]:
@@ -86,7 +91,7 @@ def orders_option(text: str, default: str) -> Callable[[Command], Command]:
 
     return click.option(
         *("--order", "orders"),
-        type=Numbers(),
+        type=_numbers,
         multiple=True,
         callback=flattened,
         metavar="ORDERS",
@@ -128,7 +133,7 @@ format_option = click.option(
     show_default=True,
     help="Print text, markdown or latex for people, csv or json for programs.",
 )
-study_argument = click.argument("study", type=click.Path(path_type=Path))
+study_argument = click.argument("study", type=PATH)
 best_effort_option = click.option(
     "--best-effort",
     is_flag=True,
@@ -150,7 +155,7 @@ trust_option = click.option(
 )
 folder_option = click.option(
     "--folder",
-    type=click.Path(path_type=Path),
+    type=PATH,
     default=".",
     help="Rebuild the meshes of the study with its relative paths starting here. [default: current folder]",
 )
@@ -165,7 +170,7 @@ up_option = click.option(
 
 def output_option(text: str, default: str) -> Callable[[Command], Command]:
     """Return the option --output of a command that writes files."""
-    return click.option("--output", type=click.Path(path_type=Path), default=default, show_default=True, help=text)
+    return click.option("--output", type=PATH, default=default, show_default=True, help=text)
 
 
 def memory_option(text: str) -> Callable[[Command], Command]:
@@ -178,3 +183,76 @@ def fraction_of_norm(text: str) -> float:
     from sobolev_batch.parameters import fraction
 
     return fraction(text)
+
+
+def echo(line: object = "", *, err: bool = False) -> None:
+    """Print one line, on standard error if asked."""
+    click.echo(visible(str(line)), err=err)
+
+
+def echo_lines(text: object, *, err: bool = False) -> None:
+    """Print a text of several lines, whose names are visible already."""
+    click.echo(visible_lines(str(text)), err=err)
+
+
+def overwrite(line: str = "") -> None:
+    """Replace the last line of the terminal; a longer one would wrap, and stay."""
+    click.echo(_CLEAR_LINE + visible(line)[: shutil.get_terminal_size().columns - 1], nl=False)
+
+
+def progress_bar(length: int, label: str, *, show_count: bool = True) -> Any:
+    """Return a bar on standard error."""
+    return click.progressbar(length=length, label=visible(label), file=sys.stderr, show_pos=show_count)
+
+
+def show_usage_error(error: click.ClickException) -> None:
+    """Print what is wrong with a command, as click words it."""
+    text = StringIO()
+    error.show(text)
+    echo_lines(text.getvalue().removesuffix("\n").replace(error.message, visible(error.message)), err=True)
+
+
+def replace_line(text: str, before: str) -> str:
+    """Show a text in the place of the one before on a terminal, elsewhere on a new line; return the text."""
+    if sys.stdout.isatty():
+        if text or before:
+            overwrite(text)
+    elif text not in ("", before):
+        echo(text)
+    return text
+
+
+@contextmanager
+def progress_reports() -> Iterator[Callable[[Progress], None]]:
+    """Give a function that shows progress on standard error: a bar on a terminal, elsewhere a line for each step."""
+    with ExitStack() as bars:
+        bar: Any = None
+
+        def show(progress: Progress) -> None:
+            nonlocal bar
+            part = f"{progress.part}: " if progress.part else ""
+            if progress.stage == "cluster":
+                echo(f"dashboard: {progress.label}", err=True)
+            elif not sys.stderr.isatty():
+                _print_step(progress, part)
+            elif progress.done == 0:
+                bars.close()
+                stage = {"fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}[progress.stage]
+                bar = bars.enter_context(progress_bar(progress.total, part + stage))
+            else:
+                bar.update(1)
+            if progress.done == progress.total:
+                bars.close()
+
+        yield show
+
+
+def _print_step(progress: Progress, part: str) -> None:
+    if progress.record is not None:
+        outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
+        count = f"[{progress.done}/{progress.total}]"
+        echo(f"{part}{count} {progress.label}: {progress.record.status}, {outcome}", err=True)
+    elif progress.stage == "reduction" and progress.done == progress.total:
+        echo(f"{part}tables reduced", err=True)
+    elif progress.stage == "proximity" and progress.done == progress.total:
+        echo(f"{part}{progress.total} Hausdorff and Chamfer distances measured", err=True)
