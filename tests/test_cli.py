@@ -371,7 +371,8 @@ def test_help_imports_nothing_that_computes() -> None:
 
 
 def test_shells_complete_commands_and_options() -> None:
-    script = [sys.executable, "-c", "from sobolev_batch.cli import cli; cli(prog_name='sobolev-batch')"]
+    program = "import sys; sys.argv = ['sobolev-batch']; from sobolev_batch.cli import main; main()"
+    script = [sys.executable, "-c", program]
     asked = {"_SOBOLEV_BATCH_COMPLETE": "bash_complete", "COMP_WORDS": "sobolev-batch table --o", "COMP_CWORD": "2"}
     done = subprocess.run(script, capture_output=True, text=True, check=False, env={**os.environ, **asked})
-    assert done.stdout.split() == ["plain,--order", "plain,--over-time"]
+    assert (done.returncode, done.stdout.split()) == (0, ["plain,--order", "plain,--over-time"])

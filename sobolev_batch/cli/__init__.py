@@ -46,7 +46,9 @@ def main() -> None:
     except (KeyboardInterrupt, click.Abort):
         # Some work takes SIGTERM for an interrupt.
         _end(deadline.request or signal.SIGINT, command)
-    except SystemExit:
+    except SystemExit as request:
+        if request.code != 128 + signal.SIGTERM:
+            raise
         _end(signal.SIGTERM, command)
     except Exception as error:
         if debug:

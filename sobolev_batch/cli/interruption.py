@@ -109,6 +109,6 @@ def _raising(error: type[BaseException]) -> Callable[[int, FrameType | None], No
         # Dask would print a traceback for each call that the request cancels, and for each worker that ends.
         for name in ("tornado.application", "distributed"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        raise error
+        raise error(128 + number)
 
     return handle
