@@ -233,15 +233,17 @@ def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_first_studies_of_hostile_folders(tmp_path: Path) -> None:
     (tmp_path / LABEL).mkdir()
-    for level in range(3):
-        sb.write_mesh(sb.icosphere(level), tmp_path / LABEL / f"a_{level}.ply")
-    (tmp_path / LABEL / os.fsdecode(b"b\xff.ply")).write_bytes(b"")
-    assert printed("init", ".", folder=tmp_path)[0] == 2
+    sb.write_mesh(sb.icosphere(0), tmp_path / LABEL / "a.ply")
+    (tmp_path / os.fsdecode(b"b\xff.ply")).write_bytes(b"")
     status, text = printed("init", LABEL, folder=tmp_path)
+    assert status == 2
+    assert f"{SHOWN_LABEL}: its path cannot be in a study file" in text
+    for level in range(3):
+        sb.write_mesh(sb.icosphere(level), tmp_path / f"a_{level}.ply")
+    status, text = printed("init", ".", folder=tmp_path)
     assert status == 0
     assert r"left out: b\udcff.ply: " in text
     assert not harmful((tmp_path / "study.toml").read_text(encoding="utf-8"))
-    assert sb.Study.from_toml(tmp_path / "study.toml").families
 
 
 def test_all_commands_print_through_one_module() -> None:

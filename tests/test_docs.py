@@ -45,13 +45,8 @@ def documented(value: Any) -> list[str]:
 
 
 def test_every_public_name_has_an_example() -> None:
-    values = [getattr(sb, name) for name in sb.__all__]
-    without = [
-        value.__name__
-        for value in values
-        if ">>>" not in str(value.__doc__) and not (isinstance(value, type) and issubclass(value, Exception))
-    ]
-    assert not without
+    for value in (getattr(sb, name) for name in sb.__all__):
+        assert ("" if isinstance(value, type) and issubclass(value, Exception) else ">>>") in value.__doc__, value
 
 
 @pytest.mark.process
@@ -141,3 +136,14 @@ def test_the_citation_is_of_this_version() -> None:
     assert paper["authors"][0]["family-names"] == "Koga"
     numerics = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
     assert paper["title"] in " ".join(numerics.split())
+
+
+def test_each_promise_names_its_tests() -> None:
+    text = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+)°? \|.*\|([^|]*)\|$", text, re.MULTILINE)
+    assert sorted(int(number) for number, _ in rows) == list(range(1, 27))
+    for number, tests in rows:
+        named = re.findall(r"`([\w/]+\.py)`", tests)
+        assert named, number
+        for name in named:
+            assert (ROOT / "tests" / name).exists(), name

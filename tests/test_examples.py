@@ -38,8 +38,6 @@ def run(name: str) -> None:
     ],
 )
 def test_examples_run(name: str) -> None:
-    if name.endswith(".proximity"):
-        pytest.importorskip("vtkmodules", reason="VTK comes with the extra 'vtk'")
     run(name)
 
 

@@ -1,12 +1,14 @@
-"""Memory and cores of the machine, with the limits of control groups, which a made-up file system stands in for."""
+"""Memory and cores of the machine, by control groups in a made-up file system; whole numbers that are NumPy's."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 import psutil
 import pytest
 
@@ -147,3 +149,19 @@ def test_workers_together_have_no_more_than_the_machine() -> None:
 def test_a_worker_that_was_started_with_more_than_there_is_has_what_there_is() -> None:
     assert allowed_bytes(1e15) == allowed_bytes(None) == Workers.of_this_machine(1).largest_allowed_bytes
     assert allowed_bytes(1e9) < allowed_bytes(None)
+
+
+@pytest.mark.slow
+def test_integers_of_numpy_are_whole_numbers() -> None:
+    few: Any = np.int64(3)
+    small: Any = np.int8(100)
+    goal: Any = np.int64(40)
+    assert sb.Lattice(1.0, small) == sb.Lattice(1.0, 100)
+    # As an integer of 8 bits, 100 times 100 is 16.
+    assert len(sb.Torus(2.0, 1.0).mesh(small, small).triangles) == 20_000
+    assert len(sb.icosphere(few).triangles) == 1280
+    fitted = sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=goal, steps=few)
+    assert 20 < len(fitted.mesh.triangles) <= 40
+    for wrong in (True, np.True_, 3.0, "3"):
+        with pytest.raises(sb.InputError, match="level must be an integer"):
+            sb.icosphere(wrong)  # type: ignore[arg-type]

@@ -32,3 +32,8 @@ def test_a_first_field_loads_little() -> None:
     assert not loaded & HEAVY
     parts = {name for name in loaded if name.startswith("scipy.") and name[6] != "_" and name.count(".") == 1}
     assert parts - {"scipy.version"} <= PARTS_OF_SCIPY
+
+
+def test_the_package_alone_imports_no_libraries() -> None:
+    code = "import sys, sobolev_batch; assert not {'numpy', 'xarray', 'dask', 'zarr'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

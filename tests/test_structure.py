@@ -1,4 +1,4 @@
-"""Imports of the package run one way, between its folders and within them."""
+"""Imports of the package run one way, between its folders and within them; its public names are one list."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
-import sobolev_batch
+import sobolev_batch as sb
 from tests.support.repository import PACKAGE, imported
 
 # Each may import those before it.
@@ -92,6 +92,9 @@ def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
         assert not {name.split(".")[0] for name in imported(file)} & {"dask", "distributed", "zarr"}, file
 
 
-def test_every_public_name_is_documented() -> None:
-    for name in sobolev_batch.__all__:
-        assert (getattr(sobolev_batch, name).__doc__ or "").strip(), name
+def test_names_are_sorted_and_unknown_ones_refused() -> None:
+    assert sb.__all__ == sorted(set(sb.__all__))
+    assert {"Study", "plan", "run", "status", "table", "matrix", "report", "plot"} <= set(sb.__all__)
+    assert dir(sb) == sb.__all__
+    with pytest.raises(AttributeError, match="nothing"):
+        sb.nothing  # type: ignore[attr-defined]  # noqa: B018

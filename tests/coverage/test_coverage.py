@@ -38,7 +38,6 @@ SAMPLE = range(22, 22 + len(KINDS))
 @pytest.fixture(scope="module")
 def sample() -> Tally:
     """Verdicts on one case of one pair of each kind, at its lowest order."""
-    pytest.importorskip("nilearn", reason="the cortical surface comes with the extra 'studies'")
     return Tally(tuple(verdict for index in SAMPLE for verdict in judge([cases_of(1, index)[-1]]).verdicts))
 
 

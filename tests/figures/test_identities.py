@@ -20,8 +20,6 @@ WORKFLOW = Path(__file__).parents[2] / "workflows/cortex.toml"
 LATTICE = sb.Lattice(5.0, 32)
 ORDERS = [-0.8, -2.0, -6.0]
 
-pytest.importorskip("nilearn", reason="the cortex comes with the extra 'studies'")
-
 
 @pytest.fixture(scope="module")
 def points() -> tuple[list[WeightedPoints], list[WeightedPoints]]:

@@ -16,7 +16,6 @@ import sobolev_batch as sb
 from sobolev_batch.fitting import sources
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import loaded, members
-from tests.support.repository import blocks
 
 SPHERE: dict[str, Any] = {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]}
 STARTS: dict[str, Any] = {"source": "ellipsoid", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1, 2]}
@@ -126,9 +125,3 @@ def test_a_reference_of_a_family_needs_a_target() -> None:
     study = {**table(), "reference": {"source": "family", "family": "start"}}
     with pytest.raises(sb.StudyError, match="family 'fitted': there is nothing to fit to"):
         sb.plan(sb.Study.from_table(study))
-
-
-def test_the_study_of_the_page_is_valid(tmp_path: Path) -> None:
-    (text,) = blocks("docs/fitting.md", "toml")
-    (tmp_path / "study.toml").write_text(text)
-    assert [family.name for family in sb.Study.from_toml(tmp_path / "study.toml").families] == ["decimated", "fitted"]

@@ -12,7 +12,6 @@ from tests.soak.corruptions import BAD, answer_to, corruptions
 from tests.soak.strikes import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, strikes_of
 from tests.soak.studies import differences
 
-pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
 pytestmark = pytest.mark.all
 
 

@@ -11,8 +11,6 @@ import trimesh
 import sobolev_batch as sb
 from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity
 
-pytest.importorskip("vtkmodules", reason="VTK comes with the extra 'vtk'")
-
 
 def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
     corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]]

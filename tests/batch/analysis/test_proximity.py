@@ -27,8 +27,6 @@ from sobolev_batch.batch.study.plan import make_plan
 from tests.support.stores import assert_same_fields, assert_same_tables
 from tests.support.studies import small_table, variable
 
-pytest.importorskip("pyvista", reason="VTK comes with the extra 'vtk'")
-
 MESHES = ("ico/0", "ico/1", "ico/2", "ico/3")
 
 

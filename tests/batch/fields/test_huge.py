@@ -24,7 +24,6 @@ SCALE = 0.009
 
 
 def original() -> Mesh:
-    pytest.importorskip("nilearn", reason="the cortical surface comes with nilearn")
     (member,) = CORTEX.reference.members(CORTEX.folder)  # type: ignore[union-attr]
     mesh = member.load()
     assert isinstance(mesh, Mesh)

@@ -40,10 +40,6 @@ from tests.support.object_storage import (
 from tests.support.stores import assert_same, full_disk
 from tests.support.studies import small_table
 
-pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
-pytest.importorskip("moto", reason="the server of these tests comes with the extra 'dev'")
-
-
 DOCUMENT = bytes(range(256)) * 400
 
 

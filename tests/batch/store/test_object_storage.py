@@ -35,8 +35,6 @@ from tests.support.object_storage import BUCKET, SECRET, TOKEN, Server, serving,
 from tests.support.stores import READER, assert_same
 from tests.support.studies import small_table, variable
 
-pytest.importorskip("s3fs", reason="the driver of s3:// URLs comes with the extra 's3'")
-
 pytestmark = pytest.mark.slow
 
 

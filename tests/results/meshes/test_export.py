@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import pyvista
 import trimesh
 from click.testing import CliRunner, Result
 from plyfile import PlyData
@@ -80,7 +81,6 @@ def vertex_areas(mesh: sb.Mesh) -> Any:
 
 @pytest.mark.slow
 def test_vtp_holds_the_same(spheres: Spheres, tmp_path: Path) -> None:
-    pyvista = pytest.importorskip("pyvista", reason="pyvista, of the extra vtk, is not installed")
     place, folder = spheres
     columns = read_ply(sb.write_witness(place, LABELS[1], tmp_path / "a.ply", folder=folder))
     there = pyvista.read(sb.write_witness(place, LABELS[1], tmp_path / "a.vtp", folder=folder))

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
+import pyvista
 import trimesh
 import xarray as xr
 from numpy.typing import NDArray
@@ -22,8 +24,6 @@ from tests.support.mesh_files import BOXES
 from tests.support.repository import ROOT
 from tests.support.shapes import AWKWARD_VERTICES, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, box
 
-meshio = pytest.importorskip("meshio")
-pyvista = pytest.importorskip("pyvista")
 try:
     import open3d
 except ImportError:

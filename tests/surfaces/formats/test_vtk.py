@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import pyvista
 
 from sobolev_batch import MeshError, read_mesh
 from tests.support.shapes import AWKWARD_VERTICES, BOX_AREA, BOX_MIXED, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, CLOSED
-
-pyvista = pytest.importorskip("pyvista")
 
 KINDS = [(suffix, binary) for suffix in (".vtk", ".vtp", ".vtu") for binary in (True, False)]
 

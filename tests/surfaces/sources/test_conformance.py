@@ -42,8 +42,6 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_sources_of_the_package_conform(folder: Path, kind: str) -> None:
-    if kind == "remesh":
-        pytest.importorskip("pyacvd", reason="remeshing needs the extra `studies`")
     check_source(parse_source(KINDS[kind]), folder)
 
 

@@ -1,0 +1,249 @@
+"""The pages run as printed, and do what they say: README, tutorial, gallery, queries, fitting, moving, testing."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.cli import cli
+from tests.support.commands import call
+from tests.support.gallery import run_blocks, run_icospheres
+from tests.support.repository import ROOT, blocks
+
+MOST_BYTES_OF_A_PICTURE = 100_000
+
+
+def test_the_study_file_is_valid(tmp_path: Path) -> None:
+    (study,) = blocks("README.md", "toml")
+    lattice = blocks("docs/studies.md", "toml")[1]
+    (tmp_path / "study.toml").write_text(study)
+    assert sb.Study.from_toml(tmp_path / "study.toml").orders == (-2.0, -4.0)
+    on_lattice = re.sub(r"^\[accuracy\].*?\n\n", lattice + "\n", study, flags=re.M | re.S)
+    (tmp_path / "study.toml").write_text(on_lattice)
+    assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(5.0, 64)
+
+
+@pytest.mark.process
+@pytest.mark.all
+def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
+    (example,) = blocks("README.md", "python")
+    small = (ROOT / "workflows" / "icosphere.toml").read_text().replace("M = 128", "M = 32")
+    (tmp_path / "workflows").mkdir()
+    (tmp_path / "storage").mkdir()
+    (tmp_path / "workflows" / "icosphere.toml").write_text(small.replace("3, 4, 5, 6, 7]", "3]"))
+    # The first block of docs/store.md opens the store, the others query it.
+    queries = "".join(blocks("docs/store.md", "python"))
+    indented = "".join(f"    {line}\n" for line in queries.splitlines())
+    (tmp_path / "example.py").write_text(example + indented)
+    completed = subprocess.run(
+        [sys.executable, "-W", "error", "example.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(r"icosphere/3 +0\.00", completed.stdout)
+
+
+@pytest.mark.all
+def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_icospheres(tmp_path, client)
+    monkeypatch.chdir(tmp_path)
+    (commands,) = blocks("docs/tutorial.md", "sh")
+    for line in commands.splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "sobolev-batch"
+        done = call(*arguments)
+        assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} >= {"pictures", "report.html"}
+
+    results = run_blocks("docs/tutorial.md")
+    assert results["certain"] is True
+    assert results["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
+    assert results["rates"].to_numpy() == pytest.approx(2, abs=0.05)
+    assert results["excess"] < 0
+    assert 0.5 < results["longest"] < 1
+    assert (results["w"].values < 0).all()
+
+    # The description of stores has every group and every variable of a store.
+    text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
+    for group in results["tree"].subtree:
+        for name in (*group.data_vars, *group.coords, *group.attrs):
+            assert f"`{name}`" in text, (group.path, name)
+
+
+def test_the_table_of_weights() -> None:
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (-\d+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+    assert len(rows) == 4
+    for order, *wavelengths in rows:
+        for weight, wavelength in zip((1 / 2, 1 / 10, 1 / 100), map(float, wavelengths), strict=True):
+            assert (1 + wavelength**-2) ** float(order) == pytest.approx(weight, rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("page", "families"),
+    [
+        ("docs/tutorial.md", ["decimated", "fitted"]),
+        ("docs/gallery.md", ["decimated", "noisy", "covered"]),
+        ("docs/fitting.md", ["decimated", "fitted"]),
+    ],
+)
+def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: Path) -> None:
+    (text,) = blocks(page, "toml")
+    (tmp_path / "study.toml").write_text(text)
+    assert [family.name for family in sb.Study.from_toml(tmp_path / "study.toml").families] == families
+
+
+def test_pictures_are_described_and_small() -> None:
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", text)
+    assert len(pictures) > 5
+    for description, path in pictures:
+        assert len(description) > 20
+        assert (ROOT / "docs" / path).stat().st_size <= MOST_BYTES_OF_A_PICTURE, path
+
+
+def test_commands_take_their_options() -> None:
+    for block in blocks("docs/gallery.md", "sh"):
+        for line in block.splitlines():
+            program, name, *arguments = shlex.split(line)
+            assert program == "sobolev-batch"
+            # Options and arguments are parsed, and nothing is run.
+            cli.commands[name].make_context(name, arguments).close()
+
+
+def test_the_code_runs(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_icospheres(tmp_path, client)
+    monkeypatch.chdir(tmp_path)
+    # A cow that is a ball through the place of the patch.
+    sb.write_mesh(sb.Similarity(0.38).apply(sb.icosphere(3)), "spot.obj")
+    results = run_blocks("docs/gallery.md")
+    original, twice = (len(results[name].triangles) for name in ("cow", "twice"))
+    assert original < twice < 1.1 * original
+    assert sb.read_mesh("twice.ply").area == pytest.approx(results["twice"].area)
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"matrix", "spectrum"}
+    (study,) = blocks("docs/gallery.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert list(members_of(sb.Study.from_toml("study.toml"))) == [
+        "decimated/1360",
+        "noisy/0.0015",
+        "covered/twice",
+        "reference",
+    ]
+
+
+def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = run_icospheres(tmp_path, client)
+    monkeypatch.chdir(tmp_path)
+    numbers = re.findall(r"^\*\*(\d+)\.", (ROOT / "docs" / "queries.md").read_text(encoding="utf-8"), re.M)
+    assert numbers == [str(i + 1) for i in range(10)]
+    assert len(blocks("docs/queries.md", "python")) == 13
+    found = run_blocks("docs/queries.md")
+
+    levels = [f"icosphere/{level}" for level in range(4)]
+    assert found["rates"].index.tolist() == levels
+    assert found["at_level"]["mesh"].values.tolist() == levels[3:]
+    assert found["nearest"].is_monotonic_increasing
+    assert found["part"].shape == (4, 4)
+    assert (found["whole"].loc[levels, levels] == found["part"].to_pandas()).all(axis=None)
+    lattice = found["fields"].sobolev.lattice
+    field, reference = (sb.fourier_transform(surface, lattice) for surface in (sb.icosphere(3), sb.Sphere()))
+    expected = sb.distance(field, reference, [-3.5, -2.25])["distance"].values
+    assert found["another"]["distance"].values == pytest.approx(expected, rel=1e-6)
+    assert found["norms"]["icosphere/1"] == pytest.approx(
+        sb.norm(sb.icosphere(1), -4, lattice=lattice)["norm"].item(), rel=1e-6
+    )
+    assert set(found["pair"]) == {levels[0], levels[3]}
+    assert found["along_axis"].loc[0.0].real == pytest.approx(sb.icosphere(3).area, rel=1e-6)
+    assert found["by_wavelength"].sum() == pytest.approx(1, rel=1e-10)
+    assert found["by_wavelength"].index.is_monotonic_increasing
+    # An inscribed mesh lacks area and lies inside: at its vertices, next to the sphere, the sphere has more.
+    assert (found["w"].values < 0).all()
+    assert (sb.read_mesh(tmp_path / "icosphere-3.ply").vertices == sb.icosphere(3).vertices).all()
+    assert 0 < found["share"].sel(mesh=levels[3], order=-10).item() < 1
+    exported = pd.read_csv(tmp_path / "convergence.csv")
+    assert len(exported) == 4 * len(study.orders)
+    squares = exported["area_part"] ** 2 + exported["shape_part"] ** 2
+    assert np.allclose(squares, exported["distance"] ** 2, rtol=1e-10)
+
+
+@pytest.mark.all
+def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert len(blocks("docs/fitting.md", "python")) == 4
+    results = run_blocks("docs/fitting.md")
+    fitted, start, target = (results[name] for name in ("fitted", "start", "target"))
+    assert fitted.after.distance < fitted.before.distance / 4
+    assert sb.read_mesh(tmp_path / "fitted.ply").area == pytest.approx(fitted.mesh.area)
+    refined = results["refined"]
+    assert 620 < len(refined.mesh.triangles) <= 640
+    assert refined.after.distance < fitted.after.distance
+    squared = sb.SquaredDistance.for_mesh(start, target, -4.0, lattice=sb.Lattice(8.0, 80))
+    assert results["found"]["squared_distance"].sel(order=-4.0) == pytest.approx(
+        squared.value(start.vertices), rel=1e-6
+    )
+    # Inscribed, the mesh lacks area everywhere: the distance falls outwards.
+    outwards = (results["found"]["gradient"].sel(order=-4.0).values * start.vertices).sum(axis=1)
+    assert (outwards < 0).all()
+
+
+@pytest.mark.all
+def test_the_page_of_reconstruction_runs_and_finds_the_shape() -> None:
+    results = run_blocks("docs/reconstruction.md")
+    assert results["found"].after.distance < results["found"].before.distance / 50
+    shape, mesh = results["shape"], results["found"].mesh
+    # The ears are there: their tips are where no point of the ball was.
+    tips = np.asarray(shape.vertices)[np.linalg.norm(shape.vertices, axis=1) > 0.95]
+    assert np.linalg.norm(np.asarray(mesh.vertices)[:, None] - tips, axis=2).min(axis=0).max() < 0.12
+
+
+@pytest.mark.all
+def test_the_page_about_surfaces_that_move_runs(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carried, files = blocks("docs/moving.md", "toml")
+    study = tomllib.loads(carried)
+    simulated = {**study, "family": [*study["family"], *tomllib.loads(files)["family"]]}
+    simulated["family"].append({**simulated["family"][0], "name": "fine", "times": [0.0, 0.25]})
+    monkeypatch.chdir(tmp_path)
+    Path("frames").mkdir()
+    Path("storage").mkdir()
+    for number, radius in ((0, 1.0), (0.25, 1.1)):
+        sb.write_mesh(
+            sb.Mesh(radius * np.asarray(sb.icosphere(2).vertices), sb.icosphere(2).triangles), f"frames/t{number}.ply"
+        )
+    sb.run(sb.Study.from_table(simulated), "storage/study.zarr", client)
+    results = run_blocks("docs/moving.md")
+    assert results["found"]["family"].values.tolist() == ["level 3", "simulated"]
+    assert results["found"]["remesh_time"].sel(family="simulated", order=-2.0).item() == 0.25
+
+
+def test_the_workflow_of_a_flow_is_a_valid_study() -> None:
+    study = sb.Study.from_toml(ROOT / "workflows/flow.toml")
+    levels = [family.source.members(ROOT) for family in study.families]
+    assert [len(members) for members in levels] == [14, 14, 14]
+
+
+@pytest.mark.slow
+def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert len(blocks("docs/testing.md", "python")) == 5
+    results = run_blocks("docs/testing.md")
+    assert capsys.readouterr().out.startswith("same surface: relative distance at most 0.0070 at order -4")
+    assert results["lost_face"].outcome == "different"
+    assert results["verdict"].outcome == "same"
+    # The fixture of the parametrised test is the assertion itself.
+    results["test_mesher"]((96, 48), sb.assert_same_surface)
