@@ -40,7 +40,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
 
 
 def main() -> None:
-    """Run the benchmarks that are asked for and print their table."""
+    """Run the requested benchmarks and print their table."""
     options = _options()
     effort = Effort(options.repeats, options.quick, options.large)
     rows: list[Row] = []

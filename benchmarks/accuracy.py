@@ -1,4 +1,4 @@
-"""A distance asked for by its accuracy: how long it takes and what a mesh takes in a store."""
+"""A distance to a given accuracy: how long it takes and what a mesh takes in a store."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SAMPLE_BYTES = 16
 
 
 def left_to_us(effort: Effort) -> Iterator[Row]:
-    """Item 2: the lattice chosen for the accuracy asked for, the error estimate included."""
+    """Item 2: the lattice chosen for a given accuracy, with the error estimate."""
     level, intervals = (4, 64) if effort.quick else (7, _PAPERS_INTERVALS)
     what = f"T_{level}, rtol {_RTOL:g}"
     if not _chooses_lattices():

@@ -22,7 +22,7 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 Reals = NDArray[np.float64]
 
 _RULE = gauss_rule(8)
-# Below 1.5 the kernel is so wide that so many points take several times as long.
+# Below 1.5 the kernel is so wide that the points of this rule take several times as long.
 _UPSAMPLINGS = (2.0, 1.5)
 
 

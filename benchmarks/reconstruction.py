@@ -44,7 +44,7 @@ class Reconstruction:
     orders: tuple[float, ...] = (-2.0,)
 
     def stages(self, order: float, steps: Sequence[int], effort: Effort) -> list[sb.Fit]:
-        """The fits with so many steps each."""
+        """The fits with each of these numbers of steps."""
         lattice = sb.Lattice(4.0, 24) if effort.quick else sb.Lattice(8.0, 96)
         field = sb.fourier_transform(self.target(), lattice)
         return [sb.fit(self.start(), field, order, steps=some) for some in steps]

@@ -58,7 +58,7 @@ def cushion(sphere: sb.Mesh) -> sb.Mesh:
 
 
 def tube_around_trefoil(around: int, across: int) -> sb.Mesh:
-    """Return a tube around a trefoil knot, of a grid with so many cells along it and across."""
+    """Return a tube around a trefoil knot, of a grid with this many cells along it and across."""
     t = np.linspace(0, 2 * np.pi, around, endpoint=False)
     curve = np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=1)
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -104,7 +104,7 @@ def meshlab_isotropic(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
     filters = meshlab(mesh)
     # The edge of equilateral triangles that cover the area.
     edge = np.sqrt(4 / np.sqrt(3) * mesh.area / triangles)
-    # Otherwise it keeps folds of more than 30 degrees as creases, of which a cortex has thousands.
+    # Otherwise it keeps folds of more than 30 degrees as creases, and a cortex has thousands.
     filters.meshing_isotropic_explicit_remeshing(targetlen=pymeshlab.PureValue(edge), iterations=10, featuredeg=180)
     return from_meshlab(filters)
 
