@@ -1,10 +1,12 @@
-"""Derivatives of squared distances against plain sums, differences, symmetries and finer lattices."""
+"""Derivatives of squared distances against plain sums, differences, symmetries, finer lattices; those of tensors."""
 
 from __future__ import annotations
 
 import re
+import sys
 from functools import cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from tests.support.moving_meshes import PlainSums
 
 Reals = NDArray[np.float64]
 
+BALL = sb.icosphere(1)
 SPHERE = sb.Sphere(0.7, (0.2, -0.1, 0.05))
 # A small lattice, so that plain sums are possible, with a period of 10.
 SMALL = sb.Lattice(0.5, 10)
@@ -215,3 +218,83 @@ def test_a_lattice_is_needed() -> None:
         sb.gradient(sb.icosphere(0), SPHERE, -2.0)
     with pytest.raises(sb.InputError, match="one order is needed, found 2"):
         sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
+
+
+# Both libraries are large, and no extra of `all` has them.
+@pytest.fixture
+def torch() -> Any:
+    return pytest.importorskip("torch", reason="PyTorch comes with the extra 'torch'")
+
+
+@pytest.fixture
+def jax() -> Any:
+    return pytest.importorskip("jax", reason="JAX comes with the extra 'jax'")
+
+
+@pytest.fixture(scope="module")
+def squared() -> sb.SquaredDistance:
+    return sb.SquaredDistance.for_mesh(BALL, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_torch_gives_the_same(torch: Any, squared: sb.SquaredDistance, dtype: str) -> None:
+    value, gradient = squared(BALL.vertices)
+    vertices = torch.tensor(np.array(BALL.vertices), dtype=getattr(torch, dtype), requires_grad=True)
+    found = sb.torch_function(squared)(vertices)
+    (3 * found).backward()
+    assert found.dtype == vertices.grad.dtype == vertices.dtype
+    tolerance = 1e-12 if dtype == "float64" else 1e-4
+    assert found.item() == pytest.approx(value, rel=tolerance)
+    np.testing.assert_allclose(vertices.grad.numpy(), 3 * gradient, rtol=0, atol=tolerance * np.abs(gradient).max())
+
+
+def test_torch_learns_in_a_loop(torch: Any, squared: sb.SquaredDistance) -> None:
+    function = sb.torch_function(squared)
+    radius = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    directions = torch.tensor(np.array(BALL.vertices))
+    optimizer = torch.optim.SGD([radius], lr=5e-4)
+    losses = []
+    for _ in range(30):
+        optimizer.zero_grad()
+        loss = function(radius * directions)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] / 50
+    with torch.no_grad():
+        assert function(radius * directions).item() == pytest.approx(squared.value(radius.item() * BALL.vertices))
+
+
+def test_torch_says_what_is_wrong(torch: Any, squared: sb.SquaredDistance) -> None:
+    with pytest.raises(sb.InputError, match="the mesh has 42 vertices"):
+        sb.torch_function(squared)(torch.zeros(5, 3))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_jax_gives_the_same(jax: Any, squared: sb.SquaredDistance, compiled: bool) -> None:
+    value, gradient = squared(BALL.vertices)
+    function: Any = jax.value_and_grad(lambda vertices: 3 * sb.jax_function(squared)(vertices))
+    found, slopes = (jax.jit(function) if compiled else function)(jax.numpy.asarray(np.array(BALL.vertices)))
+    assert float(found) == pytest.approx(3 * value, rel=1e-4)
+    np.testing.assert_allclose(np.asarray(slopes), 3 * gradient, rtol=0, atol=1e-4 * np.abs(gradient).max())
+    assert float(sb.jax_function(squared)(jax.numpy.asarray(np.array(BALL.vertices)))) == pytest.approx(value, rel=1e-4)
+
+
+def test_jax_learns_in_a_loop(jax: Any, squared: sb.SquaredDistance) -> None:
+    function, directions = sb.jax_function(squared), jax.numpy.asarray(np.array(BALL.vertices))
+    step = jax.jit(jax.value_and_grad(lambda radius: function(radius * directions)))
+    radius, losses = 1.0, []
+    for _ in range(20):
+        loss, slope = step(radius)
+        radius = radius - 5e-4 * float(slope)
+        losses.append(float(loss))
+    assert losses[-1] < losses[0] / 50
+
+
+@pytest.mark.parametrize(("library", "name"), [("torch", "PyTorch"), ("jax", "JAX")])
+def test_a_missing_library_is_named(
+    squared: sb.SquaredDistance, library: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(sb.InputError, match=rf"{name} is not installed; .* pip install 'sobolev-batch\[{library}\]'"):
+        getattr(sb, f"{library}_function")(squared)
