@@ -96,7 +96,7 @@ def test_the_table_of_weights() -> None:
 @pytest.mark.parametrize(
     ("page", "families"),
     [
-        ("docs/tutorial.md", ["decimated", "fitted"]),
+        ("docs/tutorial.md", ["given", "decimated"]),
         ("docs/gallery.md", ["decimated", "noisy", "covered"]),
         ("docs/fitting.md", ["decimated", "fitted"]),
     ],
