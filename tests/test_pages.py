@@ -24,7 +24,7 @@ from tests.support.repository import ROOT, blocks
 MOST_BYTES_OF_A_PICTURE = 100_000
 
 
-def test_the_study_file_is_valid(tmp_path: Path) -> None:
+def test_the_study_file_of_the_readme_is_valid(tmp_path: Path) -> None:
     (study,) = blocks("README.md", "toml")
     lattice = blocks("docs/studies.md", "toml")[1]
     (tmp_path / "study.toml").write_text(study)
@@ -36,7 +36,7 @@ def test_the_study_file_is_valid(tmp_path: Path) -> None:
 
 @pytest.mark.process
 @pytest.mark.all
-def test_the_python_example_and_the_queries_run(tmp_path: Path) -> None:
+def test_the_example_of_the_readme_and_the_queries_of_stores_run(tmp_path: Path) -> None:
     (example,) = blocks("README.md", "python")
     small = (ROOT / "workflows" / "icosphere.toml").read_text().replace("M = 128", "M = 32")
     (tmp_path / "workflows").mkdir()
@@ -107,7 +107,7 @@ def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: 
     assert [family.name for family in sb.Study.from_toml(tmp_path / "study.toml").families] == families
 
 
-def test_pictures_are_described_and_small() -> None:
+def test_pictures_of_the_gallery_are_described_and_small() -> None:
     text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", text)
     assert len(pictures) > 5
@@ -116,7 +116,7 @@ def test_pictures_are_described_and_small() -> None:
         assert (ROOT / "docs" / path).stat().st_size <= MOST_BYTES_OF_A_PICTURE, path
 
 
-def test_commands_take_their_options() -> None:
+def test_commands_of_the_gallery_take_their_options() -> None:
     for block in blocks("docs/gallery.md", "sh"):
         for line in block.splitlines():
             program, name, *arguments = shlex.split(line)
@@ -125,7 +125,7 @@ def test_commands_take_their_options() -> None:
             cli.commands[name].make_context(name, arguments).close()
 
 
-def test_the_code_runs(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_the_gallery_runs(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_icospheres(tmp_path, client)
     monkeypatch.chdir(tmp_path)
     # A cow that is a ball through the place of the patch.
@@ -181,7 +181,7 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.all
-def test_the_examples_run_and_come_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_about_fits_runs_and_comes_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert len(blocks("docs/fitting.md", "python")) == 4
     results = run_blocks("docs/fitting.md")
@@ -238,7 +238,9 @@ def test_the_workflow_of_a_flow_is_a_valid_study() -> None:
 
 
 @pytest.mark.slow
-def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_about_test_suites_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert len(blocks("docs/testing.md", "python")) == 5
     results = run_blocks("docs/testing.md")
