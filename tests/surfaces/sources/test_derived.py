@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from importlib.metadata import PackageNotFoundError
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,7 @@ from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, CLOSED
 MOVED: dict[str, Any] = {"source": "moved", "mesh": BALL, "distances": [0.3, 0.1], "direction": [0, 3, 4]}
 NOISY: dict[str, Any] = {"source": "noisy", "mesh": BALL, "amplitudes": [0.02, 0.01], "seed": 5}
 FLOW: dict[str, Any] = {"source": "flow", "mesh": {"source": "icosphere", "levels": [2]}, "times": [0.0]}
-needs_pyacvd = pytest.mark.skipif(find_spec("pyacvd") is None, reason="remeshing needs the extra `studies`")
-KINDS = ["decimate", pytest.param("remesh", marks=needs_pyacvd)]
+KINDS = ["decimate", "remesh"]
 
 
 def displacements(table: dict[str, Any]) -> list[np.ndarray]:
@@ -161,7 +159,6 @@ def test_decimation_is_done_in_double_precision() -> None:
     assert np.count_nonzero(gaps > 1e-12) <= 1
 
 
-@needs_pyacvd
 def test_remeshed_surfaces_are_even_and_have_about_the_counts_asked_for() -> None:
     found = members({"source": "remesh", "mesh": BALL, "triangles": [320, 80, 80]})
     assert listed(found) == [("80", 0), ("320", 1)]
@@ -317,8 +314,6 @@ def test_the_fingerprint_of_a_level_is_that_of_both_meshes_and_the_level() -> No
 
 @pytest.mark.slow
 def test_the_levels_of_a_cortex() -> None:
-    pytest.importorskip("nilearn", reason="the cortical surface needs the extra `studies`")
-
     def part(name: str) -> dict[str, Any]:
         path = f"nilearn/datasets/data/fsaverage5/{name}_left.gii.gz"
         return {"source": "files", "distribution": "nilearn", "paths": [path]}
