@@ -10,6 +10,10 @@ class SobolevBatchError(Exception):
     names the file or mesh, what was found, what was expected, and what to do.
     """
 
+    def __str__(self) -> str:
+        # The other arguments are those of attributes.
+        return str(self.args[0]) if self.args else ""
+
 
 class InputError(SobolevBatchError):
     """The input is wrong; computing again would not help."""
@@ -40,9 +44,6 @@ class AccuracyError(InputError):
         self.requested = requested
         self.reachable = reachable
 
-    def __str__(self) -> str:
-        return str(self.args[0])
-
 
 class StudyError(InputError):
     """A study file is malformed, or requests something that does not exist."""
@@ -68,9 +69,6 @@ class DamageError(StoreError):
         super().__init__(message, what, row)
         self.what = what
         self.row = row
-
-    def __str__(self) -> str:
-        return str(self.args[0])
 
 
 class BackendError(SobolevBatchError):
