@@ -1,8 +1,9 @@
-"""Places that cannot hold a store are refused before anything is computed."""
+"""Places that cannot hold a store, and lattices that no memory holds, are refused before anything is computed."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -36,3 +37,19 @@ def test_a_place_that_cannot_hold_a_store(place: str, message: str, tmp_path: Pa
     assert message.format(folder=tmp_path) in done.stderr
     assert "dashboard" not in done.stderr
     assert not (tmp_path / "typo").exists()
+
+
+@pytest.mark.process
+def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_path: Path) -> None:
+    study = write_toml(tmp_path)
+    study.write_text(study.read_text().replace("M = 16", "M = 1024"))
+    arguments = "--store", tmp_path / "large.zarr", "--workers", "1", "--memory", "700MB"
+    done = call("run", study, *arguments)
+    assert done.returncode == 1
+    expected = r"it takes about 777\.6MB in one task, and no worker has more than 295\.0MB"
+    assert re.search(expected, " ".join(done.stderr.split())), done.stderr
+    assert "[1/5]" not in done.stderr
+    # Where they are, too large a lattice is a matter of how many blocks.
+    planned = call("plan", study, "--store", tmp_path / "large.zarr")
+    assert planned.returncode == 0, planned.stderr
+    assert "chunks of the lattice: " in planned.stdout

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from fsspec import available_protocols
 from zarr.abc.store import ByteRequest
@@ -183,7 +183,7 @@ class Location:
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
         with self.access("written"):
-            for folder, _, names in os.walk(self.name):
+            for folder, _, names in () if self.scheme else os.walk(self.name):
                 for name in filter(_PARTIAL_FILE.search, names):
                     # It may have got its final name since, from a task that outlived its run.
                     (Path(folder) / name).unlink(missing_ok=True)
@@ -367,6 +367,12 @@ class RemoteStore(FsspecStore):
     """zarr's store behind a driver of fsspec."""
 
     largest_bytes = 0
+
+    def with_read_only(self, read_only: bool = False) -> Self:
+        """Return the same store, to be read only or not."""
+        store = super().with_read_only(read_only)
+        store.largest_bytes = self.largest_bytes
+        return store
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key or of a range of it, or None if it does not exist."""
