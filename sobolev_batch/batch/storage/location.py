@@ -370,7 +370,7 @@ class RemoteStore(FsspecStore):
 
     def with_read_only(self, read_only: bool = False) -> Self:
         """Return the same store, to be read only or not."""
-        store = super().with_read_only(read_only)
+        store = cast(Self, super().with_read_only(read_only))
         store.largest_bytes = self.largest_bytes
         return store
 
