@@ -166,12 +166,7 @@ def fit(
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `fit` finds, without measures of its distance.
-
-    Raises:
-        LatticeError: The mesh does not fit into the lattice of a field.
-        InputError: See `fit`.
-    """
+    """Return the mesh that `fit` finds, without measures of its distance."""
     problem = FitProblem.for_target(mesh, target, None, settings, execution)
     return problem.given_mesh(FitRun(problem).finish())
 
@@ -279,11 +274,7 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
 
 
 def start_quality(problem: FitProblem) -> FitQuality:
-    """Measure distances of the start.
-
-    Raises:
-        InputError: The field cannot serve the order.
-    """
+    """Measure distances of the start, and refuse a field that cannot serve the order."""
     before = measure_quality(problem, problem.start)
     if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
@@ -295,14 +286,7 @@ def start_quality(problem: FitProblem) -> FitQuality:
 
 
 def conclude(start: Mesh, before: FitQuality, run: FitRun, fitted: Mesh) -> Fit:
-    """Return a fit with its end, or with the start if that is nearer.
-
-    Args:
-        start: Mesh that was given.
-        before: Distances of the start.
-        run: Last run of the fit.
-        fitted: Prepared mesh at its end.
-    """
+    """Return a fit with its end, the prepared mesh of the last run, or with the start if that is nearer."""
     problem = run.problem
     mesh, remarks, end = problem.given_mesh(fitted), [], run.end
     try:

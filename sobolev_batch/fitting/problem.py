@@ -132,12 +132,7 @@ class FitProblem:
     def for_target(
         cls, mesh: Mesh, target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
     ) -> Self:
-        """Check mesh and target, and prepare them. The field of a surface is as accurate as the distance needs.
-
-        Raises:
-            LatticeError: The mesh or target does not fit into the lattice.
-            InputError: See `fit`.
-        """
+        """Check mesh and target, and prepare them. The field of a surface is as accurate as the distance needs."""
         require_comparable(mesh, target)
         start, place = welded(mesh)
         move = Similarity()
@@ -160,11 +155,7 @@ class FitProblem:
 
     @property
     def free_vertices(self) -> NDArray[np.int64]:
-        """Vertices that may move: those of triangles, without boundaries if these are kept.
-
-        Raises:
-            InputError: There are none.
-        """
+        """Vertices that may move: those of triangles, without boundaries if these are kept."""
         free = np.asarray(self.start.used_vertices)
         if self.settings.keep_boundary:
             edges = Edges.from_mesh(self.start)
@@ -174,11 +165,7 @@ class FitProblem:
         return free
 
     def given_mesh(self, mesh: Mesh) -> Mesh:
-        """Return a mesh with the vertices and triangles of the given one, at its place.
-
-        Args:
-            mesh: Prepared start with its vertices moved.
-        """
+        """Return the prepared start, with its vertices moved, at the place and with the triangles of the given mesh."""
         vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
         return Mesh(vertices, self.mesh.triangles)
 
@@ -224,11 +211,7 @@ class FitProblem:
 
 
 def require_comparable(mesh: Mesh, target: Operand) -> None:
-    """Refuse a mesh and target with which there is nothing to fit.
-
-    Raises:
-        InputError: See `fit`.
-    """
+    """Refuse a mesh and target that lie apart or are in different units."""
     if isinstance(target, xr.DataArray):
         quality = quality_of(target)
         extent = None if quality is None else quality.extent

@@ -96,12 +96,7 @@ def refine(
 
 
 def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `refine` finds, without measures of its distance.
-
-    Raises:
-        LatticeError: The mesh does not fit into the lattice of a field.
-        InputError: See `refine`.
-    """
+    """Return the mesh that `refine` finds, without measures of its distance."""
     make = _problems(target, None, settings, execution)
     last, fitted = _refine(_first_problem(mesh, triangles, make), triangles, make)
     return last.problem.given_mesh(fitted)
@@ -115,11 +110,7 @@ def _problems(
 
 
 def _first_problem(mesh: Mesh, goal: int, make: Callable[[Mesh], FitProblem]) -> FitProblem:
-    """Return the problem of the first round.
-
-    Raises:
-        InputError: See `refine`.
-    """
+    """Return the problem of the first round, and refuse a number of triangles that is out of range."""
     count = len(mesh.triangles)
     if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
         raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
@@ -174,12 +165,7 @@ def _split(mesh: Mesh, triangles: int, make: Callable[[Mesh], FitProblem]) -> Me
 
 
 def largest_while_refining(count: int, triangles: int) -> int:
-    """Return the largest number of triangles while a mesh is refined: scores come from a mesh of four times as many.
-
-    Args:
-        count: Number of triangles of the start.
-        triangles: Number of triangles to reach.
-    """
+    """Return the most triangles on the way from a count to another: scores come from a mesh of four times as many."""
     *before, last = [count, *_goals(count, triangles)]
     return max([last, *(4 * number for number in before)])
 
