@@ -98,10 +98,7 @@ def machine_memory(root: Path = _ROOT) -> tuple[int, str]:
     """Return the bytes that this process can have at most, and what sets them: the machine, or a control group.
 
     Containers, batch systems and systemd limit processes by control groups, of version 1 or 2. Dask looks at the
-    outermost group only, where a job of SLURM has its limits further in.
-
-    Args:
-        root: Folder of the file system in which /proc and /sys are looked for.
+    outermost group only, where a job of SLURM has its limits further in. The root has /proc and /sys.
     """
     most, source = psutil.virtual_memory().total, "all of this machine"
     for group in _control_groups(root, "memory"):
@@ -116,11 +113,7 @@ def machine_memory(root: Path = _ROOT) -> tuple[int, str]:
 
 
 def available_cores(root: Path = _ROOT) -> int:
-    """Return the number of cores that this process may use, by its affinity and the quotas of its control groups.
-
-    Args:
-        root: Folder of the file system in which /proc and /sys are looked for.
-    """
+    """Return the number of cores that this process may use, by its affinity and the quotas of its control groups."""
     try:
         count = len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows
@@ -135,30 +128,14 @@ def available_cores(root: Path = _ROOT) -> int:
 
 
 def available(memory: float | str) -> int:
-    """Return a size of memory in bytes, which this machine has.
-
-    Args:
-        memory: Number of bytes, or a text such as "4GB".
-
-    Raises:
-        InputError: It is neither, not positive, or more than there is.
-    """
+    """Return a size of memory in bytes, as `byte_count` does, and refuse more than this machine has."""
     count = byte_count(memory)
     require_machine_memory(count, "memory")
     return count
 
 
 def require_machine_memory(needed_bytes: float, what: str, advice: str = "") -> None:
-    """Refuse to take more memory than there is.
-
-    Args:
-        needed_bytes: Memory that is requested.
-        what: What requests it, as the subject of a message.
-        advice: What follows "ask for less" in the message.
-
-    Raises:
-        InputError: There is less, in all.
-    """
+    """Refuse to take more memory than there is, in a message about what takes it, with more advice."""
     most, source = machine_memory()
     if needed_bytes > most:
         raise InputError(

@@ -70,12 +70,7 @@ def _show_warning(
 
 
 def table_html(caption: str, rows: Iterable[tuple[str, str]]) -> str:
-    """Return a table of names and texts as HTML.
-
-    Args:
-        caption: Heading of the table.
-        rows: Name and text of each row; an empty name goes on with the row before.
-    """
+    """Return rows of names and texts as an HTML table; an empty name goes on with the row before."""
     cells = "".join(
         f"<tr><th {_CELL_STYLE}>{_escaped(name)}</th><td {_CELL_STYLE}>{_escaped(text)}</td></tr>"
         for name, text in rows

@@ -72,8 +72,7 @@ class Deadline:
     def with_results(cls, has_results: Callable[[], bool]) -> Iterator[None]:
         """Raise KeyboardInterrupt at each request, SIGTERM too, for work that ends with what it has.
 
-        Args:
-            has_results: Function that tells whether there is anything yet. It is called in another thread.
+        Another thread asks whether there is anything yet.
         """
         before = signal.signal(signal.SIGTERM, _raising(KeyboardInterrupt))
         deadline = cls._current or Deadline()
