@@ -352,7 +352,17 @@ def run_pilot(problem: Problem) -> Pilot:
         if not step.is_pilot:
             break
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
-    return Pilot(values, step.lattice, problem.dtype(step.lattice, target) == "complex64")
+    for rounds_left in reversed(range(_ROUNDS)):
+        dtype = problem.dtype(step.lattice, target)
+        solution, _ = _compute(problem, step.lattice, problem.samples(step.lattice), target, dtype)
+        solution, larger = _with_hidden_part(problem, solution, permits_octaves(problem.accuracy))
+        allowed = problem.accuracy.rtol * problem.accuracy.scale(values)
+        if np.all(solution.estimate.truncation <= allowed) or problem.accuracy.best_effort:
+            break
+        if larger is None or not rounds_left:
+            raise problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
+        step = _Step(larger, is_pilot=False)
+    return Pilot(values, step.lattice, dtype == "complex64")
 
 
 def _first_step(problem: Problem) -> _Step:
