@@ -101,12 +101,7 @@ def tapered_plates(rng: np.random.Generator) -> Pair:
     count, half = int(rng.integers(8, 41)), float(rng.uniform(0.1, 0.4))
     amount = 0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))
 
-    def stack(offset: float) -> Rectangles:
-        heights = (np.arange(count) + 0.5 + offset) / count - 0.5
-        halves = half * np.cos(np.pi * heights) ** 2
-        return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
-
-    return pair_of(rng, stack(0.0), stack(amount))
+    return pair_of(rng, *(Rectangles.tapered(count, 1 / count, half, offset) for offset in (0.0, amount)))
 
 
 def strips(rng: np.random.Generator) -> Pair:

@@ -68,6 +68,13 @@ class Rectangles:
         return cls.from_corners(*(((-half, -half, z), (half, half, z)) for z in heights))
 
     @classmethod
+    def tapered(cls, count: int, pitch: float, half: float, offset: float = 0.0) -> Self:
+        """Return parallel squares, smaller towards both ends, moved along their stack by a part of the pitch."""
+        heights = pitch * (np.arange(count) + 0.5 - count / 2 + offset)
+        halves = half * np.cos(np.pi * heights / (count * pitch)) ** 2
+        return cls.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
+
+    @classmethod
     def perforated(cls, count: int, thickness: float = 0.05) -> Self:
         """Return a unit plate with a grid of square holes, each half as wide as its cell."""
         pitch, half = 1 / count, thickness / 2

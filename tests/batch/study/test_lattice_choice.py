@@ -21,6 +21,7 @@ from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.spectral.adaptive.solve import run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
+from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table, variable
 
 # So high that one lattice is chosen, and no octaves.
@@ -64,6 +65,22 @@ def test_the_choice_is_kept_when_meshes_are_added(client: Client, store_path: Pa
     summary = sb.run(asking(family=[*more, far]), store_path, client)
     assert set(summary.failed) == {"far/far"}
     assert "that reach less far. Is this one in the same unit of length?" in summary.failed["far/far"]
+
+
+def test_a_period_beyond_a_small_lattice_leads_to_octaves(tmp_path: Path) -> None:
+    paths = [str(tmp_path / name) for name in ("first.ply", "moved.ply")]
+    for path, offset in zip(paths, (0.0, 0.5), strict=True):
+        mesh = Rectangles.tapered(35, 1 / 35, 0.3, offset).mesh()
+        trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).export(path)
+    table = small_table(
+        accuracy={"rtol": 0.1},
+        norm={"orders": [-5.0]},
+        reference={"source": "files", "paths": paths[:1]},
+        family=[{"name": "moved", "source": "files", "paths": paths[1:]}],
+    )
+    del table["lattice"]
+    choice = make_plan(sb.Study.from_table(table)).choice
+    assert choice.tail is not None
 
 
 @pytest.mark.all

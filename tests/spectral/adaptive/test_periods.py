@@ -13,20 +13,6 @@ from tests.support.rectangles import Rectangles
 Pair = tuple[Rectangles, Rectangles]
 
 
-def plates(offset: float) -> Rectangles:
-    """Squares at a pitch of 1/20, which are smaller towards both ends: no period is seen below a frequency of 20."""
-    heights = np.arange(-0.975, 1.0, 0.05) + offset
-    halves = 0.2 * np.cos(np.pi * heights / 2) ** 2
-    return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
-
-
-def fine_plates(offset: float) -> Rectangles:
-    """Squares at a pitch of 1/35, which are smaller towards both ends."""
-    heights = (np.arange(35) + 0.5 + offset) / 35 - 0.5
-    halves = 0.3 * np.cos(np.pi * heights) ** 2
-    return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
-
-
 def strips(offset: float) -> Rectangles:
     """Long strips at a pitch of 0.04, half as wide."""
     lefts = 0.04 * np.arange(25) + offset
@@ -39,9 +25,10 @@ def sheets(count: int, height: float) -> Rectangles:
     return Rectangles.from_corners(*(((-0.5, -0.5, z), (0.5, 0.5, z)) for z in heights))
 
 
+# Plates at a pitch of 1/20 show no period below a frequency of 20.
 PAIRS: dict[str, Callable[[], Pair]] = {
-    "plates": lambda: (plates(0.0), plates(1 / 40)),
-    "fine plates": lambda: (fine_plates(0.0), fine_plates(0.5)),
+    "plates": lambda: (Rectangles.tapered(40, 1 / 20, 0.2), Rectangles.tapered(40, 1 / 20, 0.2, 0.5)),
+    "fine plates": lambda: (Rectangles.tapered(35, 1 / 35, 0.3), Rectangles.tapered(35, 1 / 35, 0.3, 0.5)),
     "fins": lambda: (Rectangles.fins(30), Rectangles.fins(30).moved(0, 0, 1 / 60)),
     "strips": lambda: (strips(0.0), strips(0.02)),
     "layers": lambda: (sheets(3, 0.0), sheets(1, 5e-3)),

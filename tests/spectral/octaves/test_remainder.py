@@ -17,11 +17,8 @@ BOX = Rectangles.box((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2)).mesh()
 ORDERS = (-0.55, -1.0, -2.0)
 
 
-def plates(offset: float) -> Rectangles:
-    """Parallel squares at a pitch of 1/20, smaller and smaller towards both ends."""
-    heights = np.arange(-0.975, 1.0, 0.05) + offset
-    halves = 0.2 * np.cos(np.pi * heights / 2) ** 2
-    return Rectangles.from_corners(*(((-a, -a, z), (a, a, z)) for a, z in zip(halves, heights, strict=True)))
+# Half a pitch apart, plates at a pitch of 1/20 differ from |ξ| = 20 on only.
+PLATES, MOVED = (Rectangles.tapered(40, 1 / 20, 0.2, offset) for offset in (0.0, 0.5))
 
 
 def test_energies_of_one_surface_are_twice_its_area() -> None:
@@ -56,9 +53,8 @@ def test_one_rectangle_cut_along_either_diagonal_is_the_same_surface() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [-0.7, -1.0, -2.0, -3.0, -4.0])
 def test_periods_beyond_the_cutoff_are_seen(order: float) -> None:
-    # Half a pitch apart, the plates differ from |ξ| = 20 on only.
-    square, _ = plates(0.0).squared_distance(plates(1 / 40), [order])
-    meshes = [plates(0.0).mesh(), plates(1 / 40).mesh()]
+    square, _ = PLATES.squared_distance(MOVED, [order])
+    meshes = [PLATES.mesh(), MOVED.mesh()]
     for seed, cutoff in enumerate((8.0, 6.5)):
         (value,), (error,) = remainder(meshes, [1, -1], cutoff, [order], seed=seed).at([order])
         assert abs(value - square.item()) < error < 0.1 * value
@@ -90,9 +86,9 @@ def test_errors_cover_what_more_points_show() -> None:
 
 @pytest.mark.slow
 def test_lower_orders_are_bounded_by_the_lowest_one_that_is_computed() -> None:
-    pair = [plates(0.0).mesh(), plates(1 / 40).mesh()]
+    pair = [PLATES.mesh(), MOVED.mesh()]
     (value,), (error,) = remainder(pair, [1, -1], 12.0, [-6.0]).at([-6.0])
-    square, _ = plates(0.0).squared_distance(plates(1 / 40), [-6.0])
+    square, _ = PLATES.squared_distance(MOVED, [-6.0])
     assert value - error <= square.item() <= value + error
 
 
