@@ -37,7 +37,8 @@ def show(found: Sequence[Findings]) -> bool:
         for kind, order in product(KINDS, ORDERS)
     ]
     orders = [(f"all {order:g}", [v for v in verdicts if v.case.order == order]) for order in ORDERS]
-    rows = [_row(name, group) for name, group in (*groups, *orders, ("all", verdicts)) if group]
+    kinds = [(f"{kind}, all", [v for v in verdicts if v.case.kind == kind]) for kind in KINDS]
+    rows = [_row(name, group) for name, group in (*groups, *kinds, *orders, ("all", verdicts)) if group]
     headers = ["pair, order", "cases", "covered", "telling", "median ratio", "largest ratio", "least ratio"]
     click.echo(tabulate(rows, headers=headers, floatfmt=".3g"))
     for verdict in verdicts:
