@@ -15,7 +15,8 @@ from distributed.cli import dask_scheduler, dask_worker
 
 from sobolev_batch import Study
 from sobolev_batch.cli import cli
-from tests.support.recipes import FOLDER, ROOT, documented
+from tests.support.recipes import FOLDER, documented
+from tests.support.repository import ROOT
 
 COMMANDS: dict[tuple[str, ...], click.Command] = {
     ("dask", "scheduler"): dask_scheduler.main,

@@ -16,6 +16,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.results.status import Status
+from tests.support.stores import contents
 from tests.support.studies import small_table, variable
 
 ALL = ("f/a", "f/b", "reference")
@@ -107,14 +108,14 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(
     document = json.loads(root.read_text())
     document["attributes"]["schema_version"] = version
     root.write_text(json.dumps(document))
-    before = {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
+    before = contents(store_path)
     for use in (open_store, Status.from_store, lambda place: run(study_of(folder), place, client)):
         with pytest.raises(
             StoreError,
             match=f"its schema has version {version}, this program reads {SCHEMA_VERSION}; run the study",
         ):
             use(store_path)
-    assert before == {path: path.read_bytes() for path in store_path.rglob("*") if path.is_file()}
+    assert before == contents(store_path)
 
 
 def test_a_file_that_changes_while_the_study_goes_on(folder: Path, store_path: Path, client: Client) -> None:

@@ -18,7 +18,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.faults.conftest import FIELD
 from tests.support.commands import call, write_toml
-from tests.support.stores import assert_same_fields, assert_same_tables, put_back
+from tests.support.stores import assert_same_results, put_back
 from tests.support.studies import small_table, variable
 
 
@@ -73,8 +73,7 @@ def test_verify_names_the_mesh_and_run_repairs_it(
     assert sorted(verify(store).fields) == ["ico/1", "ico/2", "ico/3", "reference"]
     assert sorted(run(study, store, threads).computed) == ["ico/1", "ico/2", "ico/3", "reference"]
     assert verify(store).is_sound
-    assert_same_fields(store, finished_store)
-    assert_same_tables(store, finished_store)
+    assert_same_results(store, finished_store)
 
 
 @pytest.mark.parametrize(
@@ -137,8 +136,7 @@ def test_tables_and_coordinates_are_named_never_read_damaged_and_made_again(
     assert set(verify(store).tables) == {key.partition("/c/")[0] for _, key in SMALL}
     assert run(study, store, threads).computed == ()
     assert verify(store).is_sound
-    assert_same_fields(store, finished_store)
-    assert_same_tables(store, finished_store)
+    assert_same_results(store, finished_store)
     field = variable(open_store(store), "fourier", "fourier").sel(mesh="ico/2")
     assert np.isfinite(norm(field, -3.0)["error"].item())
 

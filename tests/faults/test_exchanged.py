@@ -16,7 +16,7 @@ from sobolev_batch import DamageError, Study, open_store, run, status, table, ve
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.store_accessor import StoreAccessor
 from tests.faults.conftest import FIELD
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results, contents
 from tests.support.studies import small_table, variable
 
 RECORD = "records/record/c/{row}"
@@ -38,9 +38,9 @@ def earlier(sound: Path, threads: Client, tmp_path_factory: pytest.TempPathFacto
 
 def exchange(store: Path, one: str, other: str) -> None:
     first, second = (store / name for name in (one, other))
-    contents = first.read_bytes(), second.read_bytes()
-    first.write_bytes(contents[1])
-    second.write_bytes(contents[0])
+    before = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(before)
 
 
 def restore(store: Path, earlier: Path, *names: str) -> None:
@@ -58,8 +58,7 @@ def assert_mended(store: Path, study: Study, right: Path, client: Client, *compu
     assert sorted(run(study, store, client).computed) == sorted(computed)
     assert verify(store).is_sound
     assert status(store).lost_records == ()
-    assert_same_fields(store, right)
-    assert_same_tables(store, right)
+    assert_same_results(store, right)
 
 
 def relabel(store: Path) -> None:
@@ -195,11 +194,11 @@ def test_a_root_that_cannot_be_read(store: Path, study: Study, finished_store: P
     for use in (open_store, status, verify):
         with pytest.raises(DamageError, match=r"zarr\.json is damaged"):
             use(store)
-    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    before = contents(store)
     other = Study.from_table(small_table(transform={"eps": 1e-7}))
     with pytest.raises(DamageError, match="no field of this study is found in the store"):
         run(other, store, threads)
-    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    assert contents(store) == before
     assert_mended(store, study, finished_store, threads)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sobolev_batch.batch.store.store import Store
 from tests.support.commands import call, read_until, started, write_toml
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results
 
 
 @pytest.mark.parametrize(
@@ -35,5 +35,4 @@ def test_the_next_run_computes_what_has_no_record(
     assert "taken over from process" in again.stderr
     assert again.stderr.count("complete, ") == 5 - complete
     assert f"{5 - complete} computed, {complete} reused" in again.stdout
-    assert_same_fields(store_path, finished_store)
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -14,8 +13,8 @@ from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.store.store import Store
 from tests.faults.fatal import Moment, fatal
-from tests.support.commands import TOML, write_toml
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.commands import write_toml
+from tests.support.stores import assert_same_results
 from tests.support.studies import variable
 
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
@@ -37,8 +36,7 @@ def test_the_result_is_that_of_a_clean_run(
         summary = run(study, store_path, client)
     assert moment.deaths == 1
     assert (summary.computed, summary.failed) == (LABELS, {})
-    assert_same_fields(store_path, finished_store)
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
     strays = list(store_path.rglob("*.partial"))
     assert len(strays) == (what == "rename")
     # The next run sweeps them.
@@ -69,11 +67,10 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
     assert "Traceback" not in done.stderr
     records = Store.open(store_path).records()
     assert [record.status for record in records if record] == ["complete", "complete", "failed", "complete", "complete"]
-    assert_same_fields(store_path, finished_store, besides={"ico/2"})
     assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
     # Without what kills its workers, it is computed and nothing else is.
     assert run(study, store_path, threads).computed == ("ico/2",)
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
 
 
 # Dask's configuration is this process's own; what the command inherits is the environment.
@@ -87,7 +84,3 @@ if __name__ == "__main__":
     from sobolev_batch.__main__ import main
     main()
 """
-
-
-def test_the_file_and_the_table_are_one_study(study: Study) -> None:
-    assert tomllib.loads(TOML) == study.table

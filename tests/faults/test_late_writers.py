@@ -9,17 +9,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from distributed import Client, wait
 
-from sobolev_batch import LockError, Study, run, verify
+from sobolev_batch import LockError, Mesh, Study, run, verify, write_mesh
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from tests.faults.fatal import Moment, fatal
+from tests.support.commands import TOML
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
+from tests.support.stores import assert_same_results, contents
 
 # Moved by so much, the mesh is another one, of equal size in the store.
 SHIFT = 0.125
@@ -32,30 +35,10 @@ if __name__ == "__main__":
     with Client(sys.argv[1]) as client:
         sb.run(sb.Study.from_toml(sys.argv[2]), sys.argv[3], client)
 """
-STUDY = """
-[study]
-name = "small"
-[lattice]
-xi_max = 3.0
-M = 16
-[norm]
-orders = [-2.0]
-[reference]
-source = "sphere"
-[[family]]
-name = "file"
-source = "files"
-paths = ["part.ply"]
-"""
 
 
-def write_mesh(folder: Path, shift: float) -> None:
-    mesh = [(shift, 0, 0), (1 + shift, 0, 0), (shift, 1, 0), (shift, 0, 1)]
-    triangles = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    header += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
-    lines = [" ".join(map(str, vertex)) for vertex in mesh] + [f"3 {i} {j} {k}" for i, j, k in triangles]
-    (folder / "part.ply").write_text(header + "\n".join(lines) + "\n")
+def write_part(folder: Path, shift: float) -> None:
+    write_mesh(Mesh(np.add(TETRAHEDRON_VERTICES, (shift, 0, 0)), TETRAHEDRON_TRIANGLES), folder / "part.ply")
 
 
 @pytest.mark.all
@@ -65,8 +48,9 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
 ) -> None:
     """Its worker is stopped, its driver killed, the mesh changed, another run done, and the worker continued."""
     study, store, undisturbed = tmp_path / "study.toml", tmp_path / "store.zarr", tmp_path / "undisturbed.zarr"
-    study.write_text(STUDY)
-    write_mesh(tmp_path, 0.0)
+    family = '[[family]]\nname = "file"\nsource = "files"\npaths = ["part.ply"]\n'
+    study.write_text(TOML.partition("[[family]]")[0] + family)
+    write_part(tmp_path, 0.0)
     monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", str(Path(__file__).with_name("fatal.py")))
     with (
         fatal(monkeypatch, Moment(what, 0, str(tmp_path / "stops"), number=signal.SIGSTOP)) as moment,
@@ -77,19 +61,18 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
         assert driver.poll() is None
         driver.kill()
         driver.wait()
-        write_mesh(tmp_path, SHIFT)
+        write_part(tmp_path, SHIFT)
         monkeypatch.delenv("DASK_DISTRIBUTED__WORKER__PRELOAD")
         assert run(Study.from_toml(study), store, workers=1).failed == {}
-        before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+        before = contents(store)
         os.kill(worker.pid, signal.SIGCONT)
         with Client(address) as client:
             # The worker has one thread: it has ended its task when it does another.
             wait(client.submit(os.getpid), timeout=PATIENCE_SECONDS)
-    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    assert contents(store) == before
     assert verify(store).is_sound
     run(Study.from_toml(study), undisturbed, workers=1)
-    assert_same_fields(store, undisturbed)
-    assert_same_tables(store, undisturbed)
+    assert_same_results(store, undisturbed)
 
 
 def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store: Path) -> None:

@@ -15,7 +15,7 @@ from distributed import Client
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.store.store import Store
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results
 
 
 @pytest.mark.parametrize(
@@ -28,8 +28,7 @@ def test_workers_and_threads(
     with cluster() as client:
         run(study, store_path, client)
     # Bit for bit; what is summed over tiles of other sizes, to rounding.
-    assert_same_fields(store_path, finished_store)
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
 
 
 # Two processes that do the same tasks at the same time, again and again.
@@ -75,7 +74,7 @@ def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_p
     for twin in twins:
         twin.communicate()
         assert twin.returncode == 0
-    assert_same_fields(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
     records, clean = Store.open(store_path).records(), Store.open(finished_store).records()
     for record, other in zip(records, clean, strict=True):
         assert record is not None

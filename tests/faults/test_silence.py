@@ -27,7 +27,7 @@ from tests.support.processes import (
     tcp_cluster,
     wait_until,
 )
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results
 
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
 
@@ -67,8 +67,7 @@ def test_what_a_silent_worker_has_is_told_and_done_by_others(
         summary = run(study, store_path, client, give_up_after=10)
     assert len(stopped.pids) == 1
     assert (summary.computed, summary.failed) == (LABELS, {})
-    assert_same_fields(store_path, finished_store)
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
     told = re.search(
         r"the worker (\S+) has said nothing since \d\d:\d\d:\d\d UTC, and has (.*?)\. Whoever", caplog.text
     )
@@ -86,7 +85,7 @@ def test_a_worker_of_a_cluster_of_ones_own_is_started_again(
         summary = run(study, store_path, client, give_up_after=10)
     assert len(stopped.pids) == 1
     assert (summary.computed, summary.failed) == (LABELS, {})
-    assert_same_fields(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
 
 
 @pytest.mark.all
@@ -119,7 +118,7 @@ def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path,
         stop(worker)
         stop(scheduler)
     assert "ico/0" in run(study, store_path, workers=1).reused
-    assert_same_fields(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
 
 
 @pytest.mark.all

@@ -17,21 +17,10 @@ import pytest
 from sobolev_batch import cli
 from sobolev_batch.cli.interruption import Deadline
 
+# The study of small_table, and a smaller one.
 TOML = """
-study.name = "small"
-norm.orders = [-10.0, -3.0]
-lattice = { xi_max = 3.0, M = 16 }
-reference.source = "sphere"
-[[family]]
-name = "ico"
-source = "icosphere"
-levels = [0, 1, 2, 3]
-"""
-
-# A smaller one, written in sections.
-STUDY = """
 [study]
-name = "cli"
+name = "small"
 [lattice]
 xi_max = 3.0
 M = 16
@@ -42,8 +31,9 @@ source = "sphere"
 [[family]]
 name = "ico"
 source = "icosphere"
-levels = [0, 1]
+levels = [0, 1, 2, 3]
 """
+STUDY = TOML.replace('"small"', '"cli"').replace("[0, 1, 2, 3]", "[0, 1]")
 
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 

@@ -8,37 +8,21 @@ import shlex
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.support.commands import TOML
+from tests.support.repository import ROOT
+
 FOLDER = ROOT / "workflows" / "clusters"
 CERTIFICATES = FOLDER / "make-certificates"
 
 # One mesh is a file beside the study: workers are started in another folder.
-STUDY = """
-[study]
-name = "small"
-[lattice]
-xi_max = 3.0
-M = 16
-[norm]
-orders = [-3.0]
-[reference]
-source = "sphere"
-[[family]]
-name = "ico"
-source = "icosphere"
-levels = [0, 1, 2, 3]
-[[family]]
-name = "file"
-source = "files"
-paths = ["tetrahedron.off"]
-"""
+FAMILY = '[[family]]\nname = "file"\nsource = "files"\npaths = ["tetrahedron.off"]\n'
 TETRAHEDRON = "OFF\n4 4 0\n1 1 1\n1 -1 -1\n-1 1 -1\n-1 -1 1\n3 0 1 2\n3 0 3 1\n3 0 2 3\n3 1 3 2\n"
 TABLE = r"(?s)ico/3 +1,280 .*file/tetrahedron +4 "  # in its table
 
 
 def write_study(folder: Path) -> None:
     """Write the study into a folder as study.toml."""
-    (folder / "study.toml").write_text(STUDY)
+    (folder / "study.toml").write_text(TOML.replace("-10.0, ", "") + FAMILY)
     (folder / "tetrahedron.off").write_text(TETRAHEDRON)
 
 

@@ -24,7 +24,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.records import Facts, ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results
 from tests.support.studies import small_table, variable
 
 MESHES = ("ico/0", "ico/1", "ico/2", "ico/3")
@@ -187,8 +187,7 @@ def test_a_worker_killed_in_the_middle(store_path: Path, finished: Path) -> None
         summary = sb.run(study_of(), store_path, client, on_progress=kill)
     assert killed.is_set()
     assert not summary.not_compared
-    assert_same_fields(store_path, finished)
-    assert_same_tables(store_path, finished)
+    assert_same_results(store_path, finished)
     assert_right(store_path, study_of())
 
 

@@ -16,7 +16,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import tables
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.spectral.budget import NormEstimate
-from tests.support.stores import assert_same_tables
+from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 
 
@@ -62,7 +62,7 @@ def test_tables_in_many_chunks_are_those_in_one(
     run(Study.from_table(small_table()), store_path, threads)
     assert len(list((store_path / "distances/distance/c").rglob("*"))) > 5
     assert verify(store_path).is_sound
-    assert_same_tables(store_path, finished_store)
+    assert_same_results(store_path, finished_store)
     assert open_store(store_path)["distances"].sizes["mesh"] == 5
 
 

@@ -22,7 +22,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, wait_until
-from tests.support.stores import assert_same_fields, assert_same_tables
+from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 
 pytestmark = pytest.mark.all
@@ -126,8 +126,7 @@ def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in(
     assert {record.worker for record in Store.open(store_path).records() if record} - {first}
     run(study, tmp_path / "undisturbed.zarr", client)
     assert [record.status for record in Store.open(store_path).records() if record] == ["complete"] * 5
-    assert_same_fields(store_path, tmp_path / "undisturbed.zarr")
-    assert_same_tables(store_path, tmp_path / "undisturbed.zarr")
+    assert_same_results(store_path, tmp_path / "undisturbed.zarr")
 
 
 def end_lifetime(dask_worker: Worker) -> None:
