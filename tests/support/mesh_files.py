@@ -9,6 +9,7 @@ import base64
 import json
 import struct
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import nibabel
@@ -285,4 +286,18 @@ BOXES: dict[str, Content] = {
     "freesurfer": ("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, VOLUME)),
     "freesurfer without volume": (".rh.white", freesurfer(BOX_VERTICES, BOX_TRIANGLES)),
     "gifti by columns": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), ordering="F")),
+}
+
+# Of each form: the end of a file's name, and what writes vertices and faces.
+WRITERS: dict[str, tuple[str, Callable[..., bytes]]] = {
+    "ply ascii": (".ply", ply),
+    "ply little": (".ply", partial(ply, encoding=LITTLE)),
+    "ply big": (".ply", partial(ply, encoding=BIG)),
+    "obj": (".obj", obj),
+    "off": (".off", off),
+    "stl ascii": (".stl", stl_text),
+    "stl binary": (".stl", stl_binary),
+    "glb": (".glb", lambda vertices, faces: Gltf([[(vertices, faces, None)]], [{"mesh": 0}]).glb()),
+    "gifti": (".gii", lambda vertices, faces: gifti(vertices, np.array(faces, np.int32).reshape(-1, 3))),
+    "freesurfer": ("_lh.pial", freesurfer),
 }

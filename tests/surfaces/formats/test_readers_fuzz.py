@@ -45,19 +45,7 @@ _NUMBERS = ["-1", "0", "1", "2", "7", "8", "9", "255", "256", "65536", "-2147483
 _NUMBERS += ["9223372036854775807", "18446744073709551616", "9" * 40, "9" * 400, "9" * 5000, "1e300", "1e999", "nan"]
 _NUMBERS += ["-inf", "1_0", "0x10", "1.5", "", "-", "²", "１"]
 _WORDS = [*_NUMBERS, "v", "f", "facet", "vertex", "endloop", "solid", "3", "0 1 2", "\n", "\n3 "]
-_TOKENS = [
-    b"\0",
-    b"\n",
-    b" ",
-    b'"',
-    b"\xff",
-    b"\xff\xff\xff\xff",
-    b"\xff\xff\xff\x7f",
-    b"\0\0\xc0\x7f",
-    b"[",
-    b"{}",
-    b"<",
-]
+_TOKENS = [b"\0", b"\n", b" ", b'"', b"\xff", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"[", b"{}"]
 _TOKENS += [b"end_header\n", b"element face 9\n", b"property list int double vertex_indices\n", b"f 1 2 3 4 5\n", b"#"]
 _TOKENS += [b"<", b"null", b'"byteStride":0,', b"<Data>", b"</DataArray>", b"&a;", b'Dim0="99"', b"\xf0\x9f\x98\x80"]
 

@@ -1,11 +1,11 @@
-"""The source `files`: paths, globs, installed distributions; names and fingerprints."""
+"""The source `files`: paths, globs and where they lead, installed distributions; names and fingerprints."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,69 +15,170 @@ from pydantic import ValidationError
 
 from sobolev_batch import MeshError, Study, StudyError
 from sobolev_batch.surfaces.sources.files import file_digest
+from sobolev_batch.surfaces.sources.names import caseless_key
 from tests.support.members import listed, loaded, members
 from tests.support.mesh_files import box_scene, off
-from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
+from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
+from tests.support.studies import small_table
 
 OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
-OFF_TETRAHEDRON = off(TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES)
 
 
-def test_files_are_sorted_by_path_and_named_by_stem(tmp_path: Path) -> None:
-    for name in ("b.off", "a.off.gz", "C.OFF", "10.off", "9.off"):
-        (tmp_path / name).write_bytes(OFF_BOX)
-    found = members({"source": "files", "paths": ["b.off", "a.off.gz", "C.OFF", "10.off", "9.off"]}, tmp_path)
-    assert listed(found) == [("10", -1), ("9", -1), ("C", -1), ("a", -1), ("b", -1)]
+def names_of(folder: Path, *paths: str) -> list[str]:
+    return [member.name for member in members({"source": "files", "paths": list(paths)}, folder)]
+
+
+def refused(folder: Path, *paths: str) -> str:
+    with pytest.raises(StudyError) as caught:
+        names_of(folder, *paths)
+    message = str(caught.value)
+    assert message.startswith("paths: ")
+    assert message.isprintable()
+    return message
+
+
+def put(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(OFF_BOX)
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        # Sorted by path and named by stem.
+        (["b.off", "a.off.gz", "C.OFF", "10.off", "9.off"], ["10", "9", "C", "a", "b"]),
+        # Where stems are alike, file names; where those are alike, paths.
+        (["a.off", "a.obj", "b.off"], ["a.obj", "a.off", "b"]),
+        (["c.off", "c.off.gz"], ["c.off", "c.off.gz"]),
+        (["one/A.off", "two/a.off", "two/b.off"], ["/one/A.off", "/two/a.off", "b"]),
+        (["a.off", "a.obj", "a.off.obj"], None),
+        (["a.ply", "a.off", "a.ply.gz", "x/a.off", "a.ply.off"], None),
+        (["a.off", "a.obj", "a.off.GZ"], None),
+    ],
+    ids=str,
+)
+def test_names_are_short_and_never_alike(tmp_path: Path, files: list[str], names: list[str] | None) -> None:
+    put(tmp_path, *files)
+    found = names_of(tmp_path, *files)
+    assert len({caseless_key(name) for name in found}) == len(files)
+    assert all(one.endswith(end) for one, end in zip(found, names or found, strict=True)), found
+    assert all(len(one) == len(end) for one, end in zip(found, names or found, strict=True) if "/" not in end), found
 
 
 def test_paths_start_at_the_folder_unless_they_are_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir("/")
-    study, elsewhere = tmp_path / "study", tmp_path / "elsewhere"
-    (study / "deep").mkdir(parents=True)
-    elsewhere.mkdir()
-    (study / "deep" / "one.off").write_bytes(OFF_BOX)
-    (elsewhere / "two.off").write_bytes(OFF_BOX)
-    paths = ["deep/one.off", str(elsewhere / "two.off"), "../elsewhere/two.off"]
-    for path in paths:
-        (member,) = members({"source": "files", "paths": [path]}, study)
+    put(tmp_path, "study/deep/one.off", "elsewhere/two.off")
+    for path in ("deep/one.off", str(tmp_path / "elsewhere/two.off"), "../elsewhere/two.off"):
+        (member,) = members({"source": "files", "paths": [path]}, tmp_path / "study")
         assert loaded(member).area == BOX_AREA
 
 
 def test_a_named_file_may_be_missing_until_it_is_read(tmp_path: Path) -> None:
     (member,) = members({"source": "files", "paths": ["missing.off"]}, tmp_path)
-    assert member.name == "missing"
+    assert listed((member,)) == [("missing", -1)]
     for use in (member.load, member.fingerprint):
         with pytest.raises(MeshError, match=re.escape(f"{tmp_path / 'missing.off'}: cannot be read: No such file")):
             use()
 
 
-def names_of(tmp_path: Path, *files: str) -> list[str]:
-    for name in files:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(OFF_BOX)
-    return [member.name for member in members({"source": "files", "paths": list(files)}, tmp_path)]
-
-
-def test_stems_that_collide_give_way_to_file_names_and_then_to_paths(tmp_path: Path) -> None:
-    assert names_of(tmp_path, "a.off", "a.obj", "b.off") == ["a.obj", "a.off", "b"]
-    assert names_of(tmp_path, "c.off", "c.off.gz") == ["c.off", "c.off.gz"]
-    found = names_of(tmp_path, "one/a.off", "two/a.off", "two/b.off")
-    assert found[2] == "b"
-    assert [name.endswith(path) for name, path in zip(found, ["one/a.off", "two/a.off"], strict=False)] == [True] * 2
+@pytest.mark.parametrize(
+    "stem", ["a\nb", "a\x1b[2Jb", "a\u202eb", "a\u200bb", "a\u2028b", " a", "a\\b", "a\x85b", "\udcff"]
+)
+def test_stems_that_would_be_misleading_labels_are_refused(tmp_path: Path, stem: str) -> None:
+    try:
+        put(tmp_path, f"{stem}.off")
+    except OSError:
+        pytest.skip("this file system has no such names")
+    # What is no Unicode cannot be named in a study, but a glob finds it.
+    for path in ("*.off", f"{stem}.off")[: 1 if stem == "\udcff" else 2]:
+        message = refused(tmp_path, path)
+        assert "is no label: it " in message
+        assert message.endswith("; rename the file")
 
 
 @pytest.mark.parametrize(
-    "files",
+    ("globs", "names"),
     [
-        ["a.off", "a.obj", "a.off.obj"],
-        ["a.ply", "a.off", "a.ply.gz", "x/a.off", "a.ply.off"],
-        ["a.off", "a.obj", "a.off.GZ"],
+        (["*.off"], "ab"),
+        (["?.o*"], "abc"),
+        (["[bc].*"], "bc"),
+        (["**/*.off"], "abde"),
+        (["deep/**"], "de"),
+        (["deep/*/*.off"], "d"),
+        ([".*.off"], [".hidden"]),
+        # What two of them find is there once.
+        (["a.off", "*.off", "[a].off", "./a.off"], "ab"),
     ],
-    ids=str,
 )
-def test_names_are_never_alike(tmp_path: Path, files: list[str]) -> None:
-    found = names_of(tmp_path, *files)
-    assert len(set(found)) == len(files)
+def test_globs_find_files_in_order(tmp_path: Path, globs: list[str], names: Sequence[str]) -> None:
+    # The wildcards in the name of the folder are letters.
+    folder = tmp_path / "run [1] *"
+    put(folder, "b.off", "a.off", "c.obj", "deep/e.off", "deep/deeper/d.off", ".hidden.off", ".deep/f.off")
+    (folder / "folder.off").mkdir()
+    assert names_of(folder, *globs) == list(names)
+
+
+@pytest.mark.parametrize(("one", "other"), [("A", "a"), ("caf\u00e9", "cafe\u0301"), ("STRASSE", "straße")])
+def test_twins_in_one_folder_are_refused(tmp_path: Path, one: str, other: str) -> None:
+    put(tmp_path, f"{one}.off", f"{other}.off")
+    if len(list(tmp_path.iterdir())) < 2:
+        pytest.skip("this file system does not tell them apart")
+    message = refused(tmp_path, "*.off")
+    assert "differ only in case or in the encoding of accents; rename one" in message
+    assert one in message
+    assert other in message
+
+
+def test_globs_do_not_leave_their_folder_through_links(tmp_path: Path) -> None:
+    put(tmp_path, "study/meshes/a.off", "elsewhere/secret.off")
+    folder = tmp_path / "study"
+    (folder / "meshes" / "link.off").symlink_to("../../elsewhere/secret.off")
+    for glob in ("meshes/*.off", "**/*.off", "meshes/l*"):
+        message = refused(folder, glob)
+        assert "a link out of" in message
+        assert "secret.off" in message
+        assert message.endswith("name such files by their paths")
+    # A path that is named is meant, wherever it leads.
+    assert names_of(folder, "meshes/link.off", "../elsewhere/secret.off") == ["secret", "link"]
+    (folder / "meshes" / "link.off").unlink()
+    # A link within the folder leads to nothing that was not there.
+    (folder / "meshes" / "inner.off").symlink_to("a.off")
+    assert names_of(folder, "meshes/*.off") == ["a", "inner"]
+
+
+def test_globs_do_not_leave_their_folder_through_linked_folders(tmp_path: Path) -> None:
+    put(tmp_path, "study/a.off", "elsewhere/secret.off")
+    folder = tmp_path / "study"
+    (folder / "up").symlink_to("../elsewhere")
+    assert names_of(folder, "**/*.off") == ["a"]
+    assert "a link out of" in refused(folder, "*/*.off")
+    assert "goes back up behind a wildcard" in refused(folder, "u*/../../elsewhere/*.off")
+    # What stands before the wildcard is named by the study, and therefore meant.
+    assert names_of(folder, "up/*.off") == names_of(folder, "../elsewhere/*.off") == ["secret"]
+    assert names_of(folder, f"{tmp_path}/elsewhere/*.off") == ["secret"]
+
+
+def test_loops_of_links_and_repeated_wildcards_end(tmp_path: Path) -> None:
+    put(tmp_path, *(f"{'d/' * depth}a{depth}.off" for depth in range(12)))
+    for name in ("one", "two"):
+        (tmp_path / "d" / name).symlink_to(".")
+    assert len(names_of(tmp_path, "**/*.off")) == 12
+    assert len(names_of(tmp_path, "/".join(["**"] * 12) + "/*.off")) == 12
+
+
+@pytest.mark.parametrize("glob", ["*.ply", "none/*.off", "fold*", "*" * 300 + "z", "a[.off", "**/none/*", "a*\n"])
+def test_globs_that_match_nothing_are_refused(tmp_path: Path, glob: str) -> None:
+    put(tmp_path, "a.off", "folder/b.txt")
+    message = refused(tmp_path, "a.off", glob)
+    assert f"matches no file below {tmp_path}" in message
+    assert message.endswith("correct it, or put files there")
+
+
+def test_paths_that_no_file_can_have_are_refused(tmp_path: Path) -> None:
+    assert "NUL" in refused(tmp_path, "a\0b.off")
+    assert "NUL" in refused(tmp_path, "a\0*.off")
+    assert "1000 are allowed" in refused(tmp_path, "x" * 5000 + ".off")
 
 
 def fingerprint(tmp_path: Path, name: str) -> dict[str, Any]:
@@ -102,17 +203,10 @@ def test_the_fingerprint_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["other.off", "deep/box.off", "OTHER.OFF", "box.v2.off", "2026.01.31.off"])
-def test_the_fingerprint_of_a_file_is_not_that_of_its_name(tmp_path: Path, name: str) -> None:
-    (tmp_path / "deep").mkdir()
-    (tmp_path / "box.off").write_bytes(OFF_BOX)
-    shutil.copy(tmp_path / "box.off", tmp_path / name)
-    assert fingerprint(tmp_path, name) == fingerprint(tmp_path, "box.off")
-
-
-def test_the_same_bytes_in_another_format_are_another_surface(tmp_path: Path) -> None:
-    for name in ("box.off", "box.ply", "box.off.gz"):
-        (tmp_path / name).write_bytes(OFF_BOX)
-    found = [json.dumps(fingerprint(tmp_path, name)) for name in ("box.off", "box.ply", "box.off.gz")]
+def test_the_fingerprint_of_a_file_is_not_that_of_its_name_but_of_its_format(tmp_path: Path, name: str) -> None:
+    put(tmp_path, "box.off", "box.ply", "box.off.gz", name)
+    found = [json.dumps(fingerprint(tmp_path, one)) for one in ("box.off", "box.ply", "box.off.gz", name)]
+    assert found[3] == found[0]
     assert len(set(found)) == 3
 
 
@@ -132,11 +226,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder in which the distribution `shapes-for-tests` is installed."""
     site = tmp_path / "site"
     info = site / "shapes_for_tests-3.4.dist-info"
-    (site / "shapes" / "data").mkdir(parents=True)
-    info.mkdir()
-    (site / "shapes" / "data" / "box.off").write_bytes(OFF_BOX)
-    (site / "shapes" / "data" / "tetrahedron.off").write_bytes(OFF_TETRAHEDRON)
-    (site / "shapes" / "data" / "unrecorded.off").write_bytes(OFF_BOX)
+    info.mkdir(parents=True)
+    put(site / "shapes" / "data", "box.off", "unrecorded.off", "tetrahedron.off")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: shapes-for-tests\nVersion: 3.4\n")
     (info / "RECORD").write_text("shapes/data/box.off,,\nshapes/data/tetrahedron.off,,\n")
     # Importing it would be an error.
@@ -146,11 +237,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_files_of_a_distribution_are_found_without_importing_it(installed: Path, tmp_path: Path) -> None:
-    table = {
-        "source": "files",
-        "distribution": "shapes-for-tests",
-        "paths": ["shapes/data/tetrahedron.off", "shapes/data/box.off"],
-    }
+    paths = ["shapes/data/tetrahedron.off", "shapes/data/box.off"]
+    table = {"source": "files", "distribution": "shapes-for-tests", "paths": paths}
     found = members(table, tmp_path / "nowhere")
     assert listed(found) == [("box", -1), ("tetrahedron", -1)]
     assert loaded(found[0]).area == BOX_AREA
@@ -174,46 +262,41 @@ def test_a_distribution_must_be_installed(tmp_path: Path, name: str) -> None:
         members({"source": "files", "distribution": name, "paths": ["a.off"]}, tmp_path)
 
 
-def _frames(folder: Path, *names: str) -> None:
-    for name in names:
-        (folder / name).write_bytes(off([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+FRAMES = ["s1_t10.off", "s1_t2.5.off", "s1_t0.off"]
 
 
-def test_times_come_from_names_or_from_a_list(tmp_path: Path) -> None:
-    _frames(tmp_path, "s1_t10.off", "s1_t2.5.off", "s1_t0.off")
-    table = {"source": "files", "paths": ["*.off"]}
-    found = [(member.name, member.time) for member in members({**table, "times": "names"}, tmp_path)]
-    assert found == [("s1_t0", 0.0), ("s1_t2.5", 2.5), ("s1_t10", 10.0)]
-    found = [(member.name, member.time) for member in members({**table, "times": [3, 1.5, 2]}, tmp_path)]
-    assert found == [("s1_t2.5", 1.5), ("s1_t10", 2.0), ("s1_t0", 3.0)]
-    assert all(member.time is None for member in members(table, tmp_path))
-
-
-def test_times_in_names_may_have_powers_of_ten(tmp_path: Path) -> None:
-    _frames(tmp_path, "t_1e-3.off", "t_2.5E+2.off", "t-7.off")
-    found = members({"source": "files", "paths": ["*.off"], "times": "names"}, tmp_path)
-    assert [member.time for member in found] == [1e-3, 7.0, 250.0]
+@pytest.mark.parametrize(
+    ("files", "times", "names", "found"),
+    [
+        (FRAMES, "names", ["s1_t0", "s1_t2.5", "s1_t10"], [0.0, 2.5, 10.0]),
+        (FRAMES, [3, 1.5, 2], ["s1_t2.5", "s1_t10", "s1_t0"], [1.5, 2.0, 3.0]),
+        (FRAMES, None, ["s1_t0", "s1_t10", "s1_t2.5"], [None] * 3),
+        (["t_1e-3.off", "t_2.5E+2.off", "t-7.off"], "names", ["t_1e-3", "t-7", "t_2.5E+2"], [1e-3, 7.0, 250.0]),
+    ],
+)
+def test_times_come_from_names_or_from_a_list(
+    tmp_path: Path, files: list[str], times: Any, names: list[str], found: list[float | None]
+) -> None:
+    put(tmp_path, *files)
+    table = {"source": "files", "paths": ["*.off"], **({} if times is None else {"times": times})}
+    assert [(member.name, member.time) for member in members(table, tmp_path)] == list(zip(names, found, strict=True))
 
 
 @pytest.mark.parametrize("times", ["Names", [], 3, [0, 1, "2"]])
 def test_times_of_another_kind_are_refused(times: Any) -> None:
     with pytest.raises(StudyError, match=r"times: (must be a list of numbers|each time must be a finite number)"):
-        Study.from_table(
-            {
-                "study": {"name": "moving"},
-                "lattice": {"xi_max": 2.0, "M": 8},
-                "norm": {"orders": [-2.0]},
-                "reference": {"source": "sphere"},
-                "family": [{"name": "frames", "source": "files", "paths": ["*.off"], "times": times}],
-            }
-        )
+        Study.from_table(small_table(family=[{"name": "f", "source": "files", "paths": ["*.off"], "times": times}]))
 
 
-def test_times_that_do_not_belong_to_files_are_refused(tmp_path: Path) -> None:
-    _frames(tmp_path, "a1.off", "b1.off", "c.off")
-    with pytest.raises(StudyError, match="times: 2 times are given for 3 files; give one for each"):
-        members({"source": "files", "paths": ["*.off"], "times": [1, 2]}, tmp_path)
-    with pytest.raises(StudyError, match=r"the name of the file 'c\.off' has no number; list the times instead"):
-        members({"source": "files", "paths": ["*.off"], "times": "names"}, tmp_path)
-    with pytest.raises(StudyError, match="several files have the time 1"):
-        members({"source": "files", "paths": ["[ab]1.off"], "times": "names"}, tmp_path)
+@pytest.mark.parametrize(
+    ("glob", "times", "message"),
+    [
+        ("*.off", [1, 2], "times: 2 times are given for 3 files; give one for each"),
+        ("*.off", "names", r"the name of the file 'c\.off' has no number; list the times instead"),
+        ("[ab]1.off", "names", "several files have the time 1"),
+    ],
+)
+def test_times_that_do_not_belong_to_files_are_refused(tmp_path: Path, glob: str, times: Any, message: str) -> None:
+    put(tmp_path, "a1.off", "b1.off", "c.off")
+    with pytest.raises(StudyError, match=message):
+        members({"source": "files", "paths": [glob], "times": times}, tmp_path)
