@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.spectral.spheres import sphere_inner_product
 from tests.faults.test_damage import delete, flip, swap_octaves, truncate
+from tests.support.stores import put_back
 from tests.support.studies import small_table, variable
 
 Reals = NDArray[np.float64]
@@ -35,9 +35,8 @@ def asking(rtol: float = 5e-2, **changes: Any) -> dict[str, Any]:
         {"name": "ico", "source": "icosphere", "levels": LEVELS},
         {"name": "ball", "source": "sphere", "radius": BALL.radius},
     ]
-    table = small_table(accuracy={"rtol": rtol}, norm={"orders": list(ORDERS)}, family=families, **changes)
-    del table["lattice"]
-    return table
+    norm = {"orders": list(ORDERS)}
+    return small_table(accuracy={"rtol": rtol}, lattice=None, norm=norm, family=families, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -158,39 +157,31 @@ def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Pa
     assert found == pytest.approx(other["distance"].values, rel=0.05)
 
 
-@pytest.mark.parametrize("damage", [truncate, flip, delete, swap_octaves])
-def test_damaged_octaves_are_named_and_computed_again(
-    damage: Callable[[Path], None], store: Path, octave_store: Path, client: Client
+def test_damaged_octaves_frequencies_and_labels_are_named_and_made_again(
+    store: Path, octave_store: Path, client: Client
 ) -> None:
     row = Store.open(store).labels().index("ico/2")
-    damage(store / f"octaves/octaves/c/{row}/0")
-    found = sb.verify(store)
-    assert set(found.fields) == {"ico/2"}
-    summary = sb.run(sb.Study.from_table(asking()), store, client)
-    assert summary.computed == ("ico/2",)
+    for damage in (truncate, flip, delete, swap_octaves):
+        with put_back(store):
+            damage(store / f"octaves/octaves/c/{row}/0")
+            assert set(sb.verify(store).fields) == {"ico/2"}, damage
+    swap_octaves(store / f"octaves/octaves/c/{row}/0")
+    for name in ("weight", "mesh"):
+        flip(next((store / f"octaves/{name}/c").rglob("[0-9]")))
+    assert set(sb.verify(store).tables) == {"octaves/weight", "octaves/mesh"}
+    assert sb.run(sb.Study.from_table(asking()), store, client).computed == ("ico/2",)
     assert sb.verify(store).is_sound
-    fresh, whole = (sb.open_store(path)["convergence"]["distance"].values for path in (store, octave_store))
-    assert fresh == pytest.approx(whole, rel=1e-9, nan_ok=True)
-
-
-def test_damaged_octaves_are_found_by_the_reduction_too(store: Path, client: Client) -> None:
-    row = Store.open(store).labels().index("ico/2")
+    after, before = (sb.open_store(path) for path in (store, octave_store))
+    found, expected = (variable(tree, "convergence", "distance").values for tree in (after, before))
+    assert found == pytest.approx(expected, rel=1e-9, nan_ok=True)
+    for name in ("weight", "mesh"):
+        assert np.array_equal(variable(after, "octaves", name), variable(before, "octaves", name))
+    # Another order asks for new tables: the reduction finds damage too.
     flip(store / f"octaves/octaves/c/{row}/0")
-    # Another order asks for new tables.
-    table = asking()
-    table["norm"]["orders"] = [*ORDERS, -2.5]
-    assert "ico/2" in sb.run(sb.Study.from_table(table), store, client).computed
+    more = asking()
+    more["norm"]["orders"] = [*ORDERS, -2.5]
+    assert "ico/2" in sb.run(sb.Study.from_table(more), store, client).computed
     assert sb.verify(store).is_sound
-
-
-@pytest.mark.parametrize("name", ["weight", "mesh"])
-def test_damaged_frequencies_and_labels_are_named_and_written_again(name: str, store: Path, client: Client) -> None:
-    before = sb.open_store(store)["octaves"].to_dataset()[name].values
-    flip(next((store / f"octaves/{name}/c").rglob("[0-9]")))
-    assert set(sb.verify(store).tables) == {f"octaves/{name}"}
-    sb.run(sb.Study.from_table(asking()), store, client)
-    assert sb.verify(store).is_sound
-    assert np.array_equal(sb.open_store(store)["octaves"].to_dataset()[name].values, before)
 
 
 def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client) -> None:

@@ -139,19 +139,6 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     assert sb.run(study, store_path, client).computed == ("f/bad",)
 
 
-def test_meshes_added_to_a_study_join_its_store(client: Client, store_path: Path) -> None:
-    table = small_table(lattice={"xi_max": 3.0, "M": 40})
-    sb.run(sb.Study.from_table(table), store_path, client)
-    more = [*table["family"], {"name": "late", "source": "sphere", "radius": 0.5}]
-    summary = sb.run(sb.Study.from_table({**table, "family": more}), store_path, client)
-    assert summary.computed == ("late/sphere",)
-    tree = sb.open_store(store_path)
-    assert variable(tree, "convergence", "distance").sizes["mesh"] == 6
-    exact = sb.distance(sb.Sphere(0.5), sb.Sphere(), -10.0)["distance"].item()
-    found = variable(tree, "convergence", "distance").sel(mesh="late/sphere", order=-10.0).item()
-    assert found == pytest.approx(exact, rel=1e-6)
-
-
 def test_lattices_of_several_chunks(client: Client, study: sb.Study, finished_store: Path, store_path: Path) -> None:
     sb.run(replace(study, largest_chunk_bytes=8_000), store_path, client)
     chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))

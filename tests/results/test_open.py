@@ -16,11 +16,6 @@ from sobolev_batch.batch.store.tables import hide_tables
 from tests.support.studies import small_table
 
 
-def test_opening_nothing(tmp_path: Path) -> None:
-    with pytest.raises(sb.StoreError, match="it holds no store of a study"):
-        sb.open_store(tmp_path)
-
-
 def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
     tree = sb.open_store(finished_store)
     for function in (sb.table, sb.status, lambda store: sb.matrix(store, -10)):

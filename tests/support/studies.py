@@ -12,7 +12,7 @@ SMALL_LATTICE = Lattice(3.0, 16)
 
 
 def small_table(**changes: Any) -> dict[str, Any]:
-    """Return a study of four icospheres that takes a second."""
+    """Return a study of four icospheres that takes a second; sections that are None are left out."""
     table: dict[str, Any] = {
         "study": {"name": "small"},
         "lattice": {"xi_max": SMALL_LATTICE.xi_max, "M": SMALL_LATTICE.M},
@@ -20,7 +20,7 @@ def small_table(**changes: Any) -> dict[str, Any]:
         "reference": {"source": "sphere"},
         "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]}],
     }
-    return {**table, **changes}
+    return {key: value for key, value in {**table, **changes}.items() if value is not None}
 
 
 def variable(tree: xr.DataTree, group: str, name: str) -> xr.DataArray:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
-from sobolev_batch import ClusterError, InputError, Study, open_store, run
+from sobolev_batch import ClusterError, InputError, Study, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
@@ -26,30 +24,6 @@ from tests.support.processes import (
     tcp_cluster,
 )
 from tests.support.recipes import write_study
-from tests.support.studies import variable
-
-
-@pytest.fixture
-def tcp_scheduler() -> Iterator[str]:
-    """The address of a `dask scheduler` with two `dask worker` processes."""
-    with tcp_cluster([], []) as (address, _):
-        yield address
-
-
-@pytest.mark.all
-def test_a_study_on_a_scheduler_with_two_workers_over_tcp(
-    tcp_scheduler: str, study: Study, finished_store: Path, store_path: Path
-) -> None:
-    with remote_client(tcp_scheduler) as client:
-        summary = run(study, store_path, client)
-    assert len(summary.computed) == 5
-    ours, theirs = open_store(store_path), open_store(finished_store)
-    assert np.array_equal(variable(ours, "fourier", "fourier").values, variable(theirs, "fourier", "fourier").values)
-    assert np.array_equal(
-        variable(ours, "distances", "distance").values, variable(theirs, "distances", "distance").values
-    )
-    workers = set(variable(ours, "meshes", "worker").values.tolist())
-    assert len(workers) == 2
 
 
 @pytest.mark.slow

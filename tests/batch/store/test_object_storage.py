@@ -111,9 +111,7 @@ def test_requests_grow_by_eight_for_a_mesh(server: Server, threads: Client, url:
 
 
 def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
-    table = small_table(accuracy={"rtol": 0.3}, norm={"orders": [-8.0]})
-    del table["lattice"]
-    plan = make_plan(Study.from_table(table))
+    plan = make_plan(Study.from_table(small_table(accuracy={"rtol": 0.3}, lattice=None, norm={"orders": [-8.0]})))
     store = prepare_store(url, plan)
     prefix = key_of(url)
     empty = server.keys(prefix)

@@ -87,8 +87,8 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
 
 
 def test_the_best_effort_of_a_collection_is_in_its_table() -> None:
-    own = table(accuracy={"rtol": 1e-2}, object=[{"name": "ball"}], reference={"source": "sphere"}, family=ICO)
-    del own["lattice"]
+    accuracy = {"accuracy": {"rtol": 1e-2}, "lattice": None}
+    own = table(**accuracy, object=[{"name": "ball"}], reference={"source": "sphere"}, family=ICO)
     best = sb.StudyCollection.from_table(own).with_best_effort()
     assert best.table["accuracy"] == best.studies["ball"].table["accuracy"] == {"rtol": 1e-2, "best_effort": True}
 
@@ -123,8 +123,7 @@ def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> N
         "cow,reference,../objects/cow.ply,\ncow,quick,../out/quick/cow_100.ply,0.5\n"
         "bee,reference,../objects/bee9.ply,\nbee,quick,../out/quick/bee9_100.ply,0.25\n"
     )
-    listed = small_table(objects={"meshes": "lists/meshes.csv"})
-    del listed["reference"], listed["family"]
+    listed = small_table(objects={"meshes": "lists/meshes.csv"}, reference=None, family=None)
     found = sb.StudyCollection.from_table(listed, folder=folder)
     assert methods(found) == {"cow": ["quick"], "bee": ["quick"]}
     (member,) = found.studies["bee"].families[0].source.members(folder)
@@ -170,8 +169,7 @@ def test_refusals_name_the_place(folder: Path, changes: dict[str, Any], message:
 def test_objects_may_have_numbers_for_names(folder: Path) -> None:
     lines = "object,method,path\n001,reference,objects/cow.ply\n001,10,out/quick/cow_100.ply\n"
     (folder / "meshes.csv").write_text(lines)
-    listed = small_table(objects={"meshes": "meshes.csv"})
-    del listed["reference"], listed["family"]
+    listed = small_table(objects={"meshes": "meshes.csv"}, reference=None, family=None)
     assert methods(sb.StudyCollection.from_table(listed, folder=folder)) == {"001": ["10"]}
     listed["objects"] = {"meshes": pd.read_csv(folder / "meshes.csv")}
     listed["reference"] = {"source": "files", "paths": ["objects/cow.ply"]}

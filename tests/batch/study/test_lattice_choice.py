@@ -30,9 +30,8 @@ original = run_pilot
 
 
 def asking(rtol: float = RTOL, **changes: Any) -> sb.Study:
-    table = small_table(accuracy={"rtol": rtol}, norm={"orders": [-10.0, -4.0]}, **changes)
-    del table["lattice"]
-    return sb.Study.from_table(table)
+    own = {"accuracy": {"rtol": rtol}, "lattice": None, "norm": {"orders": [-10.0, -4.0]}}
+    return sb.Study.from_table(small_table(**{**own, **changes}))
 
 
 def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client, store_path: Path) -> None:
@@ -72,15 +71,10 @@ def test_a_period_beyond_a_small_lattice_leads_to_octaves(tmp_path: Path) -> Non
     for path, offset in zip(paths, (0.0, 0.5), strict=True):
         mesh = Rectangles.tapered(35, 1 / 35, 0.3, offset).mesh()
         trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).export(path)
-    table = small_table(
-        accuracy={"rtol": 0.1},
-        norm={"orders": [-5.0]},
-        reference={"source": "files", "paths": paths[:1]},
-        family=[{"name": "moved", "source": "files", "paths": paths[1:]}],
-    )
-    del table["lattice"]
-    choice = make_plan(sb.Study.from_table(table)).choice
-    assert choice.tail is not None
+    reference = {"source": "files", "paths": paths[:1]}
+    family = [{"name": "moved", "source": "files", "paths": paths[1:]}]
+    study = asking(0.1, norm={"orders": [-5.0]}, reference=reference, family=family)
+    assert make_plan(study).choice.tail is not None
 
 
 @pytest.mark.all
@@ -98,9 +92,8 @@ def test_another_accuracy_is_another_choice(client: Client, store_path: Path) ->
 
 
 def test_a_coarse_accuracy_of_a_far_mesh_needs_no_octaves(client: Client, store_path: Path) -> None:
-    study = asking(0.1, family=[{"name": "ico", "source": "icosphere", "levels": [0]}])
-    study = replace(study, orders=(-2.0,))
-    sb.run(study, store_path, client)
+    family = [{"name": "ico", "source": "icosphere", "levels": [0]}]
+    sb.run(asking(0.1, norm={"orders": [-2.0]}, family=family), store_path, client)
     choice = stored_choice(store_path)
     assert choice is not None
     assert choice.tail is None
@@ -140,10 +133,9 @@ def test_what_falls_short_in_the_end_is_marked(
 
 
 def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client, store_path: Path) -> None:
-    table = small_table(accuracy={"rtol": 1e-7, "memory": "700MB"}, norm={"orders": [-2.0]})
-    del table["lattice"]
+    study = asking(accuracy={"rtol": 1e-7, "memory": "700MB"}, norm={"orders": [-2.0]})
     with pytest.raises(sb.AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2 .* can be reached"):
-        sb.run(sb.Study.from_table(table), store_path, client)
+        sb.run(study, store_path, client)
     assert not store_path.exists()
 
 

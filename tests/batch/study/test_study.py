@@ -132,9 +132,7 @@ def test_names_may_be_of_any_script(name: str) -> None:
 
 @pytest.mark.parametrize("memory", ["4GB", 4_000_000_000, 4e9])
 def test_memory_is_a_size(memory: str | float) -> None:
-    table = small_table(accuracy={"rtol": 0.1, "memory": memory})
-    del table["lattice"]
-    study = Study.from_table(table)
+    study = Study.from_table(small_table(accuracy={"rtol": 0.1, "memory": memory}, lattice=None))
     assert study.accuracy is not None
     assert study.accuracy.allowed_bytes == 4e9
 

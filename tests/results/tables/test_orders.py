@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pandas as pd
 import pytest
-from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.analysis.reducer import Reducer
@@ -77,17 +75,6 @@ def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytes
     assert sb.matrix(stores[0], -3).attrs["order"] == -3.0
     with pytest.raises(AttributeError, match="norms"):
         sb.table(stores[0], -3.7)
-
-
-@pytest.mark.slow
-def test_a_damaged_field_is_named(tmp_path: Path, threads: Client) -> None:
-    store = tmp_path / "s.zarr"
-    sb.run(sb.Study.from_table(small_table()), store, threads)
-    chunk = next(path for path in (store / "fourier" / "fourier" / "c").rglob("*") if path.is_file())
-    chunk.write_bytes(chunk.read_bytes()[:-1] + b"x")
-    with pytest.raises(sb.DamageError, match=r"field .*ico"):
-        sb.table(store, -3.7)
-    assert len(sb.table(store, -3.0))
 
 
 @pytest.mark.slow
