@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import platform
+import shutil
 import signal
 import subprocess
 from collections import defaultdict
@@ -29,7 +30,7 @@ from tests.support.studies import small_table
 # A test that asks for one of these fixtures, or calls one of these functions, has the marker.
 _SIGNS = {
     "process": {
-        *("client", "cluster", "driving", "finished_store", "mixed", "s3_client"),
+        *("client", "cluster", "copy", "driving", "finished_store", "mixed", "s3_client"),
         *("local_client", "started", "tcp_cluster"),
     },
     "all": {"browser", "reader"},
@@ -139,6 +140,12 @@ def finished_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> 
     path = tmp_path_factory.mktemp("finished") / "results.zarr"
     run(Study.from_table(small_table()), path, client)
     return path
+
+
+@pytest.fixture
+def copy(finished_store: Path, store_path: Path) -> Path:
+    """A copy of that store, which a test may change."""
+    return Path(shutil.copytree(finished_store, store_path))
 
 
 @pytest.fixture(scope="session")

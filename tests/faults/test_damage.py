@@ -183,15 +183,19 @@ def test_texts_that_cannot_be_are_refused_before_they_take_memory(
     assert verify(store).is_sound
 
 
-def test_sparse_chunks_and_stray_links(store: Path) -> None:
-    os.truncate(store / FIELD.format(row=2), 1 << 42)
-    (store / "norms" / ".#lock").symlink_to("/nonexistent")
-    assert verify(store).fields == {"ico/2": "it is not there, or of another length"}
-    (store / "norms" / ".#lock").unlink()
-
-
 def test_files_larger_than_any_memory_are_named_and_made_again(store: Path, study: Study, threads: Client) -> None:
-    sparse = ("records/record/c/2", "meshes/name/c/0", "fourier/mesh/c/0", "norms/norm/c/0/0", "meshes/area/zarr.json")
+    # A stray link of an editor is no damage.
+    (store / "norms" / ".#lock").symlink_to("/nonexistent")
+    assert verify(store).is_sound
+    (store / "norms" / ".#lock").unlink()
+    sparse = (
+        "records/record/c/2",
+        "meshes/name/c/0",
+        "fourier/mesh/c/0",
+        "norms/norm/c/0/0",
+        "meshes/area/zarr.json",
+        FIELD.format(row=2),
+    )
     for name in sparse:
         content = (store / name).read_bytes()
         os.truncate(store / name, 1 << 42)

@@ -6,7 +6,6 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -67,9 +66,16 @@ def relabel(store: Path) -> None:
     there.write("fourier/mesh", ..., np.array(there.labels()[::-1], dtype=object))
 
 
+def trade(store: Path) -> None:
+    for name in (FIELD, RECORD):
+        exchange(store, name.format(row=1), name.format(row=2))
+    assert status(store).lost_records == ("ico/1", "ico/2")
+
+
 @pytest.mark.parametrize(
     ("change", "labels"),
     [
+        (lambda store, earlier: trade(store), ("ico/1", "ico/2")),
         *((lambda store, earlier, pair=pair: exchange(store, *pair), ()) for pair in PAIRS),
         (lambda store, earlier: exchange(store, FIELD.format(row=1), FIELD.format(row=2)), ("ico/1", "ico/2")),
         (lambda store, earlier: relabel(store), ()),
@@ -86,16 +92,6 @@ def test_what_is_in_another_place_or_of_an_earlier_state_is_named_and_mended(
     assert tuple(found.fields) == labels
     assert labels or found.tables
     assert_mended(store, study, finished_store, threads, *labels)
-
-
-def test_fields_that_trade_places_with_their_records(
-    store: Path, study: Study, finished_store: Path, threads: Client
-) -> None:
-    for name in (FIELD, RECORD):
-        exchange(store, name.format(row=1), name.format(row=2))
-    assert status(store).lost_records == ("ico/1", "ico/2")
-    assert list(verify(store).fields) == ["ico/1", "ico/2"]
-    assert_mended(store, study, finished_store, threads, "ico/1", "ico/2")
 
 
 def test_an_earlier_field_with_its_record(
@@ -139,13 +135,14 @@ def test_metadata_of_one_node(name: str, store: Path, study: Study, finished_sto
     assert_mended(store, study, finished_store, threads)
 
 
-def altered(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
-    def alter(store: Path) -> None:
-        root = json.loads((store / "zarr.json").read_text())
-        change(root)
-        (store / "zarr.json").write_text(json.dumps(root))
-
-    return alter
+def alter(store: Path, *place: str, value: object) -> None:
+    """Write another value into the metadata at the root."""
+    root = node = json.loads((store / "zarr.json").read_text())
+    for name in place[:-1]:
+        node = node[name]
+    assert node.get(place[-1]) != value
+    node[place[-1]] = value
+    (store / "zarr.json").write_text(json.dumps(root))
 
 
 @pytest.mark.parametrize(
@@ -160,30 +157,24 @@ def altered(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
 def test_metadata_at_the_root_that_were_altered(
     place: tuple[str, ...], value: object, store: Path, study: Study, finished_store: Path, threads: Client
 ) -> None:
-    def change(root: dict[str, Any]) -> None:
-        for name in place[:-1]:
-            root = root[name]
-        assert root[place[-1]] != value
-        root[place[-1]] = value
-
-    altered(change)(store)
+    alter(store, *place, value=value)
     assert not verify(store).is_sound
     restore(store, finished_store, "records/record")
     assert_mended(store, study, finished_store, threads)
 
 
 @pytest.mark.parametrize(
-    "metadata",
+    ("name", "value"),
     [
-        {"fill_value": "x"},
-        {"codecs": [{"name": "bytes"}]},
-        {"dimension_names": ["a", "b", "c"]},
-        {"data_type": "float32"},
-        {"shape": [3]},
+        ("fill_value", "x"),
+        ("codecs", [{"name": "bytes"}]),
+        ("dimension_names", ["a", "b", "c"]),
+        ("data_type", "float32"),
+        ("shape", [3]),
     ],
 )
-def test_metadata_that_make_no_sense_are_damage(metadata: dict[str, Any], store: Path) -> None:
-    altered(lambda root: root["consolidated_metadata"]["metadata"]["meshes/area"].update(metadata))(store)
+def test_metadata_that_make_no_sense_are_damage(name: str, value: object, store: Path) -> None:
+    alter(store, "consolidated_metadata", "metadata", "meshes/area", name, value=value)
     with pytest.raises(DamageError):
         open_store(store)["meshes"].to_dataset().load()
 

@@ -54,7 +54,7 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
     monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", str(Path(__file__).with_name("fatal.py")))
     with (
         fatal(monkeypatch, Moment(what, 0, str(tmp_path / "stops"), number=signal.SIGSTOP)) as moment,
-        tcp_cluster([]) as (address, (worker,)),
+        tcp_cluster([]) as (address, (_, worker)),
     ):
         driver = subprocess.Popen([sys.executable, "-c", DRIVER, address, str(study), str(store)])
         wait_until(lambda: moment.pids and _is_stopped(worker.pid))

@@ -17,16 +17,7 @@ from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Watch
 from tests.faults.fatal import Moment, fatal
-from tests.support.processes import (
-    PATIENCE_SECONDS,
-    SCHEDULER,
-    WORKER,
-    dask,
-    scheduler_address,
-    stop,
-    tcp_cluster,
-    wait_until,
-)
+from tests.support.processes import tcp_cluster, wait_until
 from tests.support.stores import assert_same_results
 
 LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
@@ -90,33 +81,30 @@ def test_a_worker_of_a_cluster_of_ones_own_is_started_again(
 
 @pytest.mark.all
 def test_a_worker_that_was_stopped_before_the_run_is_given_up(study: Study, store_path: Path) -> None:
-    with tcp_cluster([], []) as (address, workers), Client(address) as client:
-        os.kill(workers[0].pid, signal.SIGSTOP)
+    with tcp_cluster([], []) as (address, (_, worker, _)), Client(address) as client:
+        os.kill(worker.pid, signal.SIGSTOP)
         try:
             assert run(study, store_path, client, give_up_after=10).computed == LABELS
         finally:
-            os.kill(workers[0].pid, signal.SIGCONT)
+            os.kill(worker.pid, signal.SIGCONT)
 
 
 @pytest.mark.all
 def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path, finished_store: Path) -> None:
-    scheduler = dask(*SCHEDULER)
-    address = scheduler_address(scheduler)
-    worker = dask("worker", address, *WORKER)
+    with tcp_cluster([]) as (address, (scheduler, _)):
 
-    def stop_scheduler(progress: object) -> None:
-        if getattr(progress, "label", "") == "ico/1":
-            os.kill(scheduler.pid, signal.SIGSTOP)
+        def stop_scheduler(progress: object) -> None:
+            if getattr(progress, "label", "") == "ico/1":
+                os.kill(scheduler.pid, signal.SIGSTOP)
 
-    try:
-        with Client(address, timeout=5) as client:
-            client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
-            with pytest.raises(ClusterError, match="the same command goes on from what is stored"):
+        try:
+            with (
+                Client(address, timeout=5) as client,
+                pytest.raises(ClusterError, match="the same command goes on from what is stored"),
+            ):
                 run(study, store_path, client, on_progress=stop_scheduler, give_up_after=10)
-    finally:
-        os.kill(scheduler.pid, signal.SIGCONT)
-        stop(worker)
-        stop(scheduler)
+        finally:
+            os.kill(scheduler.pid, signal.SIGCONT)
     assert "ico/0" in run(study, store_path, workers=1).reused
     assert_same_results(store_path, finished_store)
 

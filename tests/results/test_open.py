@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -32,16 +31,15 @@ def test_an_open_tree_finds_its_fields_from_any_folder(finished_store: Path, mon
     assert sb.status(tree).complete
 
 
-def test_tables_of_two_states_are_not_mixed(finished_store: Path, store_path: Path, threads: Client) -> None:
-    shutil.copytree(finished_store, store_path)
-    tree = sb.open_store(store_path)
+def test_tables_of_two_states_are_not_mixed(copy: Path, threads: Client) -> None:
+    tree = sb.open_store(copy)
     before = [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)]
     # As a run does before it replaces them.
-    hide_tables(Store.open(store_path))
+    hide_tables(Store.open(copy))
     for function in (sb.table, sb.matrix):
         with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
             function(tree, -5.0)
-    sb.run(Study.from_table(small_table()), store_path, threads)
+    sb.run(Study.from_table(small_table()), copy, threads)
     assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before
 
 

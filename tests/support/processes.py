@@ -86,16 +86,15 @@ def forked_workers() -> Iterator[None]:
 
 @contextmanager
 def tcp_cluster(*workers: list[str]) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """Give the address of a scheduler, and its workers, each with further options."""
-    scheduler = dask(*SCHEDULER)
-    processes: list[subprocess.Popen[str]] = []
+    """Give the address of a scheduler, and its process before those of workers with further options; all end."""
+    processes = [dask(*SCHEDULER)]
     try:
-        address = scheduler_address(scheduler)
+        address = scheduler_address(processes[0])
         processes += [dask("worker", address, *WORKER, *options) for options in workers]
         if workers:
             with Client(address) as client:
                 client.wait_for_workers(len(workers), timeout=PATIENCE_SECONDS)
         yield address, processes
     finally:
-        for process in reversed([scheduler, *processes]):
+        for process in reversed(processes):
             stop(process)

@@ -13,16 +13,7 @@ from sobolev_batch import ClusterError, InputError, Study, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
-from tests.support.processes import (
-    PATIENCE_SECONDS,
-    SCHEDULER,
-    WORKER,
-    dask,
-    listening,
-    scheduler_address,
-    stop,
-    tcp_cluster,
-)
+from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, listening, tcp_cluster
 from tests.support.recipes import write_study
 
 
@@ -55,10 +46,7 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     listening = ["--listen-address", f"tcp://127.0.0.1:{port}", "--contact-address", f"tcp://0.0.0.0:{port}"]
-    scheduler = dask(*SCHEDULER)
-    processes = [scheduler]
-    try:
-        address = scheduler_address(scheduler)
+    with tcp_cluster() as (address, processes):
         processes.append(dask("worker", address, *WORKER[2:], *listening))
         with Client(address) as client:
             client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
@@ -69,9 +57,6 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
             pass
         with remote_client(address, trust_network=True) as client:
             assert client.submit(abs, -1).result() == 1
-    finally:
-        for process in reversed(processes):
-            stop(process)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, descr
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
-from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop
+from tests.support.processes import tcp_cluster
 from tests.support.studies import small_table
 
 
@@ -130,26 +130,18 @@ def test_failures_of_the_store_end_all(cluster: Cluster) -> None:
 def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, threads: Client) -> None:
     family = [{"name": f"ball{i}", "source": "sphere", "radius": 0.5 + 0.001 * i} for i in range(200)]
     study = Study.from_table(small_table(family=family, norm={"orders": [-3.0], "pairs": "reference"}))
-    scheduler = dask(*SCHEDULER)
-    processes = [scheduler]
+    with tcp_cluster([]) as (address, (scheduler, _)):
 
-    def end(progress: Progress) -> None:
-        if progress.stage == "fields" and progress.done == 3:
-            scheduler.kill()
-            scheduler.wait()
+        def end(progress: Progress) -> None:
+            if progress.stage == "fields" and progress.done == 3:
+                scheduler.kill()
+                scheduler.wait()
 
-    try:
-        address = scheduler_address(scheduler)
-        processes.append(dask("worker", address, *WORKER))
         client = Client(address)
-        client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
         # Now that it is connected: it looks a second for a scheduler that is gone, instead of half a minute.
         client._timeout = 1
         with pytest.raises(ClusterError, match=r"the scheduler at .* was lost; the same command goes on"):
             run(study, store_path, client, on_progress=end)
-    finally:
-        for process in reversed(processes):
-            stop(process)
     records = Store(store_path).records()
     assert all(record is None or record.status == "complete" for record in records)
     assert sum(record is not None for record in records) >= 3

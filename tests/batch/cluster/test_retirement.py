@@ -17,39 +17,26 @@ from typing import Any
 import pytest
 from distributed import Client, Worker
 
-from sobolev_batch import Study, icosphere, run
+from sobolev_batch import Study, icosphere, run, write_mesh
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.support import gate
-from tests.support.processes import PATIENCE_SECONDS, SCHEDULER, WORKER, dask, scheduler_address, stop, wait_until
+from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster, wait_until
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 
 pytestmark = pytest.mark.all
 
 
-class Cluster:
-    """A scheduler and workers, each a process, started one by one."""
-
-    def __init__(self, scheduler: subprocess.Popen[str], address: str) -> None:
-        self.processes = [scheduler]
-        self.address = address
-
-    def start(self, *options: str) -> subprocess.Popen[str]:
-        self.processes.append(dask("worker", self.address, *WORKER, "--preload", gate.__file__, *options))
-        return self.processes[-1]
+Cluster = tuple[str, list[subprocess.Popen[str]]]
+GATED = ["--preload", gate.__file__]
 
 
 @pytest.fixture
 def cluster() -> Iterator[Cluster]:
-    scheduler = dask(*SCHEDULER)
-    made: Cluster | None = None
-    try:
-        made = Cluster(scheduler, scheduler_address(scheduler))
-        yield made
-    finally:
-        for process in reversed(made.processes if made else [scheduler]):
-            stop(process)
+    """A scheduler with one worker."""
+    with tcp_cluster(GATED) as started:
+        yield started
 
 
 @pytest.fixture
@@ -58,11 +45,7 @@ def study(tmp_path: Path) -> Study:
     folder = tmp_path / "meshes"
     folder.mkdir()
     for level in range(4):
-        mesh = icosphere(level)
-        lines = ["OFF", f"{len(mesh.vertices)} {len(mesh.triangles)} 0"]
-        lines += [" ".join(map(repr, vertex)) for vertex in mesh.vertices.tolist()]
-        lines += [f"3 {a} {b} {c}" for a, b, c in mesh.triangles.tolist()]
-        (folder / f"{level}.off").write_text("\n".join(lines) + "\n")
+        write_mesh(icosphere(level), folder / f"{level}.off")
     family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
     return Study.from_table(small_table(family=family), folder=folder)
 
@@ -95,23 +78,23 @@ class Gate:
 def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in(
     way: str, cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
 ) -> None:
-    leaving = cluster.start()
+    address, processes = cluster
+    leaving = processes[1]
     left = threading.Event()
     gates: list[Gate] = []
-    with Client(cluster.address) as ours, following(ours, "remove-worker", left), ThreadPoolExecutor(1) as pool:
-        ours.wait_for_workers(1, timeout=PATIENCE_SECONDS)
+    with Client(address) as ours, following(ours, "remove-worker", left), ThreadPoolExecutor(1) as pool:
         (first,) = ours.scheduler_info()["workers"]
 
         def replace() -> None:
             gates[0].await_one()
             if way == "retired":
-                cluster.start()
+                processes.append(dask("worker", address, *WORKER, *GATED))
                 ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
                 ours.retire_workers([first])
             else:
                 ours.run(end_lifetime)
                 assert left.wait(timeout=PATIENCE_SECONDS)
-                cluster.start()
+                processes.append(dask("worker", address, *WORKER, *GATED))
 
         def disturb(progress: Progress) -> None:
             if progress.stage == "cluster":

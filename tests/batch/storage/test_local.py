@@ -19,11 +19,6 @@ from sobolev_batch.results.status import Status
 from tests.support.studies import small_table, variable
 
 
-@pytest.fixture
-def copy(finished_store: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(finished_store, tmp_path / "copy.zarr"))
-
-
 def lead_away(path: Path, target: str | Path) -> None:
     """Put a link in the place of a file or folder."""
     if path.is_dir():

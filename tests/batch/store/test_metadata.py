@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,11 +19,6 @@ from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
 
 Document = dict[str, Any]
-
-
-@pytest.fixture
-def copy(finished_store: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(finished_store, tmp_path / "copy.zarr"))
 
 
 def change(store: Path, node: str, how: Callable[[Document], None]) -> None:

@@ -19,16 +19,12 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.support.repository import blocks
-from tests.support.stores import READER
+from tests.support.stores import READER, contents
 from tests.support.studies import small_table
 
 
 def small_plan(**changes: object) -> Plan:
     return make_plan(Study.from_table(small_table(**changes)))
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_fields_that_were_not_computed_are_nan_and_zeros_are_kept(store_path: Path) -> None:
@@ -53,10 +49,10 @@ def test_refuses_the_store_of_another_study_and_leaves_it_alone(
     store_path: Path, changes: dict[str, object], message: str
 ) -> None:
     prepare_store(store_path, small_plan())
-    before = snapshot(store_path)
+    before = contents(store_path)
     with pytest.raises(StoreError, match=message):
         prepare_store(store_path, small_plan(**changes))
-    assert snapshot(store_path) == before
+    assert contents(store_path) == before
 
 
 def test_new_meshes_become_new_rows(store_path: Path) -> None:

@@ -21,22 +21,14 @@ from sobolev_batch.results.figures.drawing import PLOTS, clustered_order, embedd
 from sobolev_batch.results.figures.plots import write_plots
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
-
-DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+from tests.support.trees import distances_of, tree_of
 
 
 @pytest.fixture
 def pairs(tree: xr.DataTree) -> xr.DataTree:
     """The same with the distances of all pairs, and names that matplotlib would take for a formula, or for hidden."""
     labels, families = ["$^$/0", "$^$/1", "_f/2", "reference"], ["$^$", "$^$", "_f", "reference"]
-    places = np.array([0.4, 0.1, np.nan, 0.0])
-    distance = np.abs(places[:, None] - places)[..., None] * np.array([1.0, 2.0])
-    tree["distances"] = xr.DataTree(
-        xr.Dataset(
-            dict.fromkeys(DISTANCES, (("mesh", "other", "order"), distance)),
-            coords={"mesh": labels, "other": labels, "order": [-10.0, -2.5]},
-        )
-    )
+    tree["distances"] = xr.DataTree(distances_of([0.4, 0.1, np.nan, 0.0], labels, {-10.0: 1.0, -2.5: 2.0}))
     for group in ("convergence", "meshes", "fourier"):
         named = tree[group].to_dataset().assign_coords(mesh=labels)
         tree[group] = xr.DataTree(named.assign(family=("mesh", families)) if group == "meshes" else named)
@@ -214,21 +206,7 @@ def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
 
 def store_of(points: np.ndarray) -> xr.DataTree:
     """A store whose meshes are points, in ten families; the first is the reference."""
-    labels = ["reference", *(f"f{i % 10}/mesh {i}" for i in range(1, len(points)))]
-    meshes = xr.Dataset(
-        {
-            "family": ("mesh", [label.split("/")[0] for label in labels]),
-            "status": ("mesh", ["complete"] * len(labels)),
-        },
-        coords={"mesh": labels},
-    )
-    distances = cdist(points, points)[..., None]
-    pairs = xr.Dataset(
-        dict.fromkeys(DISTANCES, (("mesh", "other", "order"), distances)),
-        coords={"mesh": labels, "other": labels, "order": [-2.0]},
-    )
-    convergence = xr.Dataset(coords={"mesh": labels, "order": [-2.0]}, attrs={"reference": "reference"})
-    return xr.DataTree.from_dict({"/meshes": meshes, "/distances": pairs, "/convergence": convergence})
+    return tree_of(points, ["reference", *(f"f{i % 10}/mesh {i}" for i in range(1, len(points)))], {-2.0: 1.0})
 
 
 def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -304,20 +303,16 @@ def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.all
-def test_a_page_shows_one_state_of_a_store(
-    finished_store: Path, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(finished_store, store_path)
-
+def test_a_page_shows_one_state_of_a_store(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def make_views_while_a_run_begins(*arguments: Any, **options: Any) -> Any:
         views = make_views(*arguments, **options)
-        hide_tables(Store.open(store_path))
+        hide_tables(Store.open(copy))
         return views
 
     monkeypatch.setattr(build, "make_views", make_views_while_a_run_begins)
     page = tmp_path / "page.html"
     with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
-        sb.report(store_path, page)
+        sb.report(copy, page)
     assert not page.exists()
 
 

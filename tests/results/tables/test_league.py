@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import permutations, product
 from typing import Any
 
@@ -18,18 +18,11 @@ from tests.support.leagues import method_rows
 
 SIZES = (100, 400, 1600)
 
-Ranked = Callable[..., League]
 
-
-@pytest.fixture
-def ranked() -> Ranked:
-    """A function that makes the league of some tables."""
-
-    def make(tables: Mapping[str, pd.DataFrame], **arguments: Any) -> League:
-        (made,) = leagues_of(tables, list(tables), **arguments)
-        return made
-
-    return make
+def ranked(tables: Mapping[str, pd.DataFrame], **arguments: Any) -> League:
+    """Return the league of some tables."""
+    (made,) = leagues_of(tables, list(tables), **arguments)
+    return made
 
 
 def of_powers(factors: Mapping[str, float], scale: float, rate: float = 2.0) -> pd.DataFrame:
@@ -39,7 +32,7 @@ def of_powers(factors: Mapping[str, float], scale: float, rate: float = 2.0) -> 
     )
 
 
-def test_factors_between_methods_are_found_whatever_the_objects(ranked: Ranked) -> None:
+def test_factors_between_methods_are_found_whatever_the_objects() -> None:
     rng = np.random.default_rng(3)
     tables = {
         f"object{i}": of_powers({"a": 1.0, "b": 1.5 * np.exp(0.01 * rng.standard_normal())}, scale)
@@ -57,7 +50,7 @@ def test_factors_between_methods_are_found_whatever_the_objects(ranked: Ranked) 
     assert pair["nearer"] == "a"
 
 
-def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
+def test_methods_are_compared_at_equal_sizes() -> None:
     first = {n: 1.0 / n for n in SIZES}
     # The same curve, sampled elsewhere: with fewer triangles each, at which a mean of distances would be larger.
     second = {n: 1.0 / n for n in (50, 150, 500, 2000)}
@@ -68,7 +61,7 @@ def test_methods_are_compared_at_equal_sizes(ranked: Ranked) -> None:
     np.testing.assert_allclose(made.table["relative"], 1 / 400)
 
 
-def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes(ranked: Ranked) -> None:
+def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes() -> None:
     # The k-th meshes of the objects differ in size: a mean of these would put b below a.
     plain = method_rows({"a": {n: 1.0 / n for n in (100, 400, 1600)}, "b": {n: 2.0 / n for n in (400, 1600, 6400)}})
     made = ranked({"x": plain, "y": method_rows({"a": {n: 3.0 / n for n in SIZES}, "b": {n: 6.0 / n for n in SIZES}})})
@@ -79,7 +72,7 @@ def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes(ra
         assert (np.diff(places) > 0).all()
 
 
-def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
+def test_errors_of_distances_hide_a_difference() -> None:
     distances = {"a": dict.fromkeys(SIZES, 1.0), "b": dict.fromkeys(SIZES, 1.1)}
     sharp, blurred = (ranked({f"{i}": method_rows(distances, error) for i in range(8)}) for error in (1e-3, 0.1))
     assert sharp.pairs["nearer"].item() == "a"
@@ -89,7 +82,7 @@ def test_errors_of_distances_hide_a_difference(ranked: Ranked) -> None:
     assert blurred.table["last_rank"].tolist() == [2, 2]
 
 
-def test_a_distance_below_its_error_bounds_nothing(ranked: Ranked) -> None:
+def test_a_distance_below_its_error_bounds_nothing() -> None:
     tables = {f"{i}": method_rows({"a": {100: 1e-3}, "b": {100: 1.0}}, error=2.0) for i in range(6)}
     made = ranked(tables)
     assert np.isinf(made.table["high"]).all()
@@ -122,7 +115,7 @@ def test_objects_that_cannot_be_compared_are_left_out_and_named(
     np.testing.assert_allclose(made.table["rate"], 2.0)
 
 
-def test_methods_may_be_chosen_and_must_be_known(ranked: Ranked) -> None:
+def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
     assert ranked({"x": POWERS, "y": one}, methods=["a"]).objects == ("x", "y")
     with pytest.raises(sb.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"):
@@ -131,7 +124,7 @@ def test_methods_may_be_chosen_and_must_be_known(ranked: Ranked) -> None:
         ranked({"x": POWERS}, methods=["c"])
 
 
-def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate(ranked: Ranked) -> None:
+def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate() -> None:
     near = method_rows({"a": {1000: 1.0}, "b": {1100: 2.0}})
     made = ranked({"x": near, "z": near})
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
@@ -140,7 +133,7 @@ def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate(ranked: Ranked)
     np.testing.assert_allclose(ranked({"x": POWERS, "steep": steep}).table["rate"], 2.0)
 
 
-def test_objects_are_named_with_the_orders_that_leave_them_out(ranked: Ranked) -> None:
+def test_objects_are_named_with_the_orders_that_leave_them_out() -> None:
     plain = of_powers({"a": 1, "b": 2}, 1.0)
     exact = method_rows({"a": dict.fromkeys(SIZES, 1e-8), "b": {n: 1.0 / n for n in SIZES}})
     every, some = ranked({"x": plain, "box": plain}), ranked({"x": plain, "box": exact})
@@ -148,20 +141,20 @@ def test_objects_are_named_with_the_orders_that_leave_them_out(ranked: Ranked) -
     assert "box is left out: a reproduced it" in format_league([some, some])
 
 
-def test_few_objects_are_said_to_be_too_few(ranked: Ranked) -> None:
+def test_few_objects_are_said_to_be_too_few() -> None:
     plain = of_powers({"a": 1, "b": 2}, 1.0)
     five, six = (ranked({f"{i}": plain for i in range(count)}) for count in (5, 6))
     assert "The test cannot tell 2 methods from chance with 5 objects; take 6 or more." in format_league([five])
     assert "a is 2 times nearer than b" in format_league([six])
 
 
-def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size(ranked: Ranked) -> None:
+def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size() -> None:
     close = method_rows({"a": {1000: 0.0100, 1001: 0.0102}, "b": {1150: 0.0100}})
     made = ranked(dict.fromkeys("stuvwxyz", close))
     assert made.table.set_index("method").loc["a", "relative"] == pytest.approx(0.0102)
 
 
-def test_meshes_of_one_size_all_count(ranked: Ranked) -> None:
+def test_meshes_of_one_size_all_count() -> None:
     tables = method_rows({"a": {1000: 0.01}, "b": {1000: 0.015}})
     more = [tables[tables["family"] == "a"].assign(relative=relative) for relative in (0.03, 0.03)]
     made = ranked(dict.fromkeys("stuvwxyz", pd.concat([tables, *more], ignore_index=True)))
@@ -169,7 +162,7 @@ def test_meshes_of_one_size_all_count(ranked: Ranked) -> None:
     assert made.table["relative"].iloc[1] == pytest.approx((0.01 * 0.03 * 0.03) ** (1 / 3))
 
 
-def test_one_object_has_no_intervals_and_no_ranks(ranked: Ranked) -> None:
+def test_one_object_has_no_intervals_and_no_ranks() -> None:
     made = ranked({"x": of_powers({"a": 1, "b": 2}, 1.0)})
     assert made.table[["low", "high"]].isna().all(axis=None)
     assert made.table[["rank", "last_rank"]].to_numpy().tolist() == [[1, 2], [1, 2]]

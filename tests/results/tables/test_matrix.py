@@ -14,35 +14,14 @@ from sobolev_batch import InputError, matrix
 from sobolev_batch.results.store_accessor import distances_at
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.matrix import format_matrix, matrix_frame, pairs_of
+from tests.support.trees import ERRORS, tree_of
 
-ORDERS = [-4.0, -2.0]
 
-
-def made(count: int, failed: int = 1, others: str = "all") -> xr.DataTree:
+def made(count: int, failed: int = 1) -> xr.DataTree:
     """Meshes on a line, at 1, 2, 3, ..., and the reference at zero."""
-    labels = [f"f/{i}" for i in range(count)] + ["reference"]
     places = np.append(np.arange(1.0, count + 1), 0.0)
     places[failed] = np.nan
-    chosen = labels if others == "all" else ["reference"]
-    there = places if others == "all" else places[-1:]
-    distance = np.abs(places[:, None] - there)[..., None] * np.array([1.0, 10.0])
-    names = ("error", "truncation", "aliasing", "discretisation", "statistical")
-    distances = xr.Dataset(
-        {
-            "distance": (("mesh", "other", "order"), distance),
-            **dict.fromkeys(names, (("mesh", "other", "order"), distance / 100)),
-        },
-        coords={"mesh": labels, "other": chosen, "order": ORDERS},
-    )
-    status = np.array(["complete"] * len(labels), dtype=object)
-    status[failed] = "failed"
-    return xr.DataTree.from_dict(
-        {
-            "/distances": distances,
-            "/meshes": xr.Dataset({"status": ("mesh", status)}, coords={"mesh": labels}),
-            "/convergence": xr.Dataset(attrs={"reference": "reference"}),
-        }
-    )
+    return tree_of(places, [*(f"f/{i}" for i in range(count)), "reference"], {-4.0: 1.0, -2.0: 10.0})
 
 
 def test_frame_becomes_the_matrix() -> None:
@@ -77,7 +56,7 @@ def test_text_has_brackets_and_fits_a_terminal() -> None:
 def test_people_get_per_cents_of_the_reference(style: Format) -> None:
     tree = made(4)
     columns = {"norm": (("mesh", "order"), np.full((5, 2), 50.0)), "error": (("mesh", "order"), np.full((5, 2), 0.5))}
-    norms = xr.Dataset(columns, coords={"mesh": tree["meshes"]["mesh"], "order": ORDERS})
+    norms = xr.Dataset(columns, coords={"mesh": tree["meshes"]["mesh"], "order": [-4.0, -2.0]})
     text = format_matrix(xr.DataTree.from_dict({**tree.to_dict(), "/norms": norms}), style, [-4.0])
     assert "Sobolev distances of order -4, in % of the norm of reference" in text
     # 3 of 50, and (0.03 + 0.06 * 0.5)/49.5 = 0.0012.
@@ -97,7 +76,7 @@ def test_programs_get_lines_of_pairs() -> None:
         "mesh": "f/0",
         "other": "f/2",
         "distance": 2.0,
-        **dict.fromkeys(("error", "truncation", "aliasing", "discretisation", "statistical"), 0.02),
+        **dict.fromkeys(ERRORS, 0.02),
     }
     assert records[1]["distance"] is None
 
@@ -109,7 +88,8 @@ def test_many_meshes_are_for_programs() -> None:
 
 
 def test_distances_to_the_reference_alone() -> None:
-    tree = made(4, others="reference")
+    tree = made(4)
+    tree["distances"] = xr.DataTree(tree["distances"].to_dataset().sel(other=["reference"]))
     assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
     text = format_matrix(tree, "text", [-4.0])
     assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == ["3", "f/2", "3.00(3)"]
