@@ -30,7 +30,7 @@ from tests.support.studies import small_table
 # A test that asks for one of these fixtures, or calls one of these functions, has the marker.
 _SIGNS = {
     "process": {
-        *("client", "cluster", "copy", "driving", "finished_store", "mixed", "s3_client"),
+        *("client", "cluster", "copy", "driving", "finished_store", "s3_client"),
         *("local_client", "started", "tcp_cluster"),
     },
     "all": {"browser", "reader"},

@@ -18,32 +18,20 @@ from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.support.commands import call
+from tests.support.leagues import GONE, balls, methods_of
 from tests.support.studies import small_table
 
 
-def spheres(**radii: float) -> list[dict[str, Any]]:
-    return [
-        {"name": label, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
-        for label, radius in radii.items()
-    ]
-
-
-GONE = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"]}}
-
-
 def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:
-    families = [
-        {"name": "ico", "source": "icosphere", "levels": [1, 2]},
-        {"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
-    ]
-    return sb.StudyCollection.from_table(small_table(study={"name": name}, object=objects, family=families))
+    study = {"name": name}
+    return sb.StudyCollection.from_table(small_table(study=study, object=objects, family=methods_of()))
 
 
 @pytest.fixture(scope="module")
 def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The store of a collection of which one object has lost its reference."""
     path = tmp_path_factory.mktemp("collection") / "balls.zarr"
-    summary = sb.run(collection([*spheres(a=1.0), GONE, *spheres(b=1.1)]), path, client)
+    summary = sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), path, client)
     assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in labels()}
     assert list(summary.failed) == ["gone"]
     assert "the reference cannot be made: nowhere.ply" in summary.failed["gone"].replace(str(Path.cwd()) + "/", "")
@@ -55,7 +43,7 @@ def labels() -> list[str]:
 
 
 def test_each_object_has_a_store_of_its_own(store: Path, client: Client, tmp_path: Path) -> None:
-    alone = collection(spheres(b=1.1)).studies["b"]
+    alone = collection(balls(b=1.1)).studies["b"]
     sb.run(alone, tmp_path / "alone.zarr", client)
     assert sb.table(store / "b").equals(
         sb.table(tmp_path / "alone.zarr").assign(seconds=sb.table(store / "b")["seconds"])
@@ -120,7 +108,7 @@ def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
 @pytest.mark.slow
 def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
-    made = collection([*spheres(a=1.0), GONE, *spheres(b=1.1)])
+    made = collection([*balls(a=1.0), GONE, *balls(b=1.1)])
     plan = sb.plan(made, tmp_path / "s.zarr")
     assert list(plan.objects) == ["a", "b"]
     assert plan.objects["b"].store == str(tmp_path / "s.zarr" / "b")
@@ -182,18 +170,18 @@ def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(store: Path, t
 
 
 def test_fields_of_another_collection_are_taken_over_by_object(store: Path, tmp_path: Path, client: Client) -> None:
-    summary = sb.run(collection(spheres(a=1.0, b=1.1), "again"), tmp_path / "again.zarr", client, reuse=[store])
+    summary = sb.run(collection(balls(a=1.0, b=1.1), "again"), tmp_path / "again.zarr", client, reuse=[store])
     assert summary.computed == ()
     assert len(summary.reused) == 10
     assert sb.table(tmp_path / "again.zarr/b")["distance"].equals(sb.table(store / "b")["distance"])
 
 
 def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
-    summary = sb.run(collection(spheres(a=1.0, b=1.1, c=1.2)), store, client)
+    summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, client)
     assert set(summary.computed) == {f"c/{label}" for label in labels()}
     assert summary.failed == {}
     with pytest.raises(sb.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
-        sb.run(collection(spheres(a=1.0), "other"), store, client)
+        sb.run(collection(balls(a=1.0), "other"), store, client)
 
 
 def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
@@ -220,7 +208,7 @@ def test_a_study_against_another_finds_what_became_farther(tmp_path: Path, clien
     }
     for path, family in studies.items():
         lattice = {"xi_max": 4.0, "M": 32}
-        table = small_table(object=spheres(**radii), family=family, lattice=lattice)
+        table = small_table(object=balls(**radii), family=family, lattice=lattice)
         sb.run(sb.StudyCollection.from_table(table), path, client)
     change = sb.compare_studies(new, old, -3).to_dict("records")[0]
     assert change["verdict"] == "farther"

@@ -15,6 +15,7 @@ from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.commands import call, command
+from tests.support.leagues import GONE, balls
 from tests.support.processes import tcp_cluster, wait_until
 from tests.support.recipes import write_study
 from tests.support.studies import small_table
@@ -70,11 +71,7 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
 
 @pytest.mark.process
 def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -> None:
-    objects = [
-        {"name": "ball", "reference": {"source": "sphere"}},
-        {"name": "gone", "reference": {"source": "files", "paths": ["no.ply"]}},
-    ]
-    collection = sb.StudyCollection.from_table(small_table(object=objects), folder=tmp_path)
+    collection = sb.StudyCollection.from_table(small_table(object=[*balls(ball=1.0), GONE]), folder=tmp_path)
     store, address = tmp_path / "all.zarr", client.scheduler.address
     submission = sb.submit(collection, store, client)
     assert (submission.surfaces, submission.missing) == (5, 5)

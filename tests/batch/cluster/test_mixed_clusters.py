@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +30,6 @@ def device(monkeypatch: pytest.MonkeyPatch) -> str:
     return name
 
 
-@pytest.fixture
-def mixed(device: str) -> Iterator[str]:
-    """Three workers: two that find the host's one GPU, one that finds none."""
-    with tcp_cluster(PRETEND, PRETEND, []) as (address, _):
-        yield address
-
-
 def study_on(backend: str, **changes: Any) -> Study:
     family = [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3, 4]}]
     return Study.from_table(small_table(transform={"backend": backend}, family=family, **changes))
@@ -49,9 +41,10 @@ def meshes(store: Path) -> xr.Dataset:
 
 
 def test_one_device_serves_one_worker_and_studies_use_what_there_is(
-    mixed: str, finished_store: Path, tmp_path: Path
+    device: str, finished_store: Path, tmp_path: Path
 ) -> None:
-    with remote_client(mixed) as client:
+    # Two find the host's one GPU, one finds none.
+    with tcp_cluster(PRETEND, PRETEND, []) as (address, _), remote_client(address) as client:
         workers = prepare_workers(client)
         assert sorted(member.backend for member in workers.members) == ["cpu", "cpu", "gpu"]
         notes = sorted(member.note for member in workers.members if member.backend == "cpu")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import dask
@@ -15,14 +14,7 @@ from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, prepare_workers
 from sobolev_batch.parameters import machine_memory
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
-from tests.support.studies import small_table, variable
-
-
-@pytest.fixture
-def boastful_cluster() -> Iterator[str]:
-    """A scheduler with two workers, of which one declares a GPU that it does not have."""
-    with tcp_cluster([], ["--resources", "GPU=1"]) as (address, _):
-        yield address
+from tests.support.studies import small_table
 
 
 def study_on(backend: str) -> Study:
@@ -32,9 +24,10 @@ def study_on(backend: str) -> Study:
 @pytest.mark.all
 @pytest.mark.process
 def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
-    boastful_cluster: str, store_path: Path
+    store_path: Path,
 ) -> None:
-    with remote_client(boastful_cluster) as client:
+    # One of the workers declares a GPU that it does not have.
+    with tcp_cluster([], ["--resources", "GPU=1"]) as (address, _), remote_client(address) as client:
         with pytest.raises(ClusterError) as caught:
             run(study_on("gpu"), store_path, client)
         message = str(caught.value)
@@ -86,11 +79,6 @@ def test_the_memory_of_local_workers_can_be_given() -> None:
 def test_a_memory_that_no_worker_can_live_in(memory: str) -> None:
     with pytest.raises(InputError, match=r"memory (of a worker )?must be .*found "):
         local_client(1, memory).__enter__()
-
-
-def test_a_study_on_the_cpu_asks_for_nothing(client: Client, store_path: Path) -> None:
-    run(study_on("cpu"), store_path, client)
-    assert set(variable(open_store(store_path), "meshes", "backend").values.tolist()) == {"closed form", "finufft"}
 
 
 def _die_once(marker: Path) -> str:

@@ -11,9 +11,9 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from distributed import Client
 
 from sobolev_batch import Sphere, Study, check_source, fourier_transform, open_store, run
-from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.surfaces.sources import registry
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.mesh_files import off
@@ -59,29 +59,28 @@ def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("packages")
-def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path) -> None:
+def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path, threads: Client) -> None:
     (study_text,) = (text for text in blocks(PAGE, "toml") if text.startswith("[study]"))
 
     def computed(text: str) -> tuple[str, ...]:
         (tmp_path / "study.toml").write_text(text)
-        return run(Study.from_toml(tmp_path / "study.toml"), tmp_path / "results.zarr", client).computed
+        return run(Study.from_toml(tmp_path / "study.toml"), tmp_path / "results.zarr", threads).computed
 
     on_unit = study_text + '\n[scaling]\nmode = "none"\n'
-    with thread_client(1) as client:
-        assert computed(on_unit) == ("ball/wavy-ball", "reference")
-        study = Study.from_toml(tmp_path / "study.toml")
-        assert study.lattice is not None
-        ball = variable(open_store(tmp_path / "results.zarr"), "fourier", "fourier").sel(mesh="ball/wavy-ball").values
-        assert np.abs(ball - fourier_transform(Sphere(), study.lattice).values).max() < 1e-8 * 4 * np.pi
-        assert computed(on_unit) == ()
-        assert computed(on_unit.replace("height = 0.1", "height = 0.11")) == ("reference",)
-        distances = variable(open_store(tmp_path / "results.zarr"), "convergence", "distance")
-        assert 0.01 < distances.sel(mesh="ball/wavy-ball").item() < 3
+    assert computed(on_unit) == ("ball/wavy-ball", "reference")
+    study = Study.from_toml(tmp_path / "study.toml")
+    assert study.lattice is not None
+    ball = variable(open_store(tmp_path / "results.zarr"), "fourier", "fourier").sel(mesh="ball/wavy-ball").values
+    assert np.abs(ball - fourier_transform(Sphere(), study.lattice).values).max() < 1e-8 * 4 * np.pi
+    assert computed(on_unit) == ()
+    assert computed(on_unit.replace("height = 0.1", "height = 0.11")) == ("reference",)
+    distances = variable(open_store(tmp_path / "results.zarr"), "convergence", "distance")
+    assert 0.01 < distances.sel(mesh="ball/wavy-ball").item() < 3
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("packages")
-def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path) -> None:
+def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path, threads: Client) -> None:
     def write_archive(**scales: float) -> None:
         with ZipFile(tmp_path / "scans.zip", "w") as archive:
             for name, scale in scales.items():
@@ -94,13 +93,12 @@ def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path) -> None:
         "reference": {"source": "sphere"},
         "family": [{"name": "scan", "source": "zip", "archive": "scans.zip"}],
     }
-    with thread_client(1) as client:
-        write_archive(small=0.2, large=0.3)
-        study = Study.from_table(table, folder=tmp_path)
-        store = tmp_path / "results.zarr"
-        assert run(study, store, client).computed == ("scan/boxes/large.off", "scan/boxes/small.off", "reference")
-        write_archive(small=0.1, large=0.3)
-        assert run(study, store, client).computed == ("scan/boxes/small.off",)
+    write_archive(small=0.2, large=0.3)
+    study = Study.from_table(table, folder=tmp_path)
+    store = tmp_path / "results.zarr"
+    assert run(study, store, threads).computed == ("scan/boxes/large.off", "scan/boxes/small.off", "reference")
+    write_archive(small=0.1, large=0.3)
+    assert run(study, store, threads).computed == ("scan/boxes/small.off",)
 
 
 @pytest.mark.usefixtures("packages")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +12,6 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
 from tests.support.smooth_shapes import roof, roof_derivatives
@@ -21,13 +19,6 @@ from tests.support.studies import variable
 
 RING = {"R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}
 EGG = {"axes": [2.0, 1.4, 0.8]}
-
-
-@pytest.fixture(scope="module")
-def threads() -> Iterator[Client]:
-    """Threads of this process."""
-    with thread_client(2) as client:
-        yield client
 
 
 def torus_table(**changes: Any) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import re
 import sys
 import time
 import tracemalloc
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -61,34 +60,25 @@ SENTENCES = [
 # Key, value, and what the message holds: the place and what is allowed.
 PLACES: list[tuple[str, Any, str]] = [
     ("study", "scans", "study must be a table"),
-    ("study.name", 3, r"\[study\]: name must be text in quotes, found 3"),
     ("study.name", "", r"\[study\]: name: 1 to 100 visible characters are needed.*it is empty"),
     ("study.name", "a/b", "without / and .*it holds '/', found 'a/b'"),
-    ("study.title", "x" * 2000, r"\[study\]: title: .* 2000 characters, 1000 are allowed"),
     ("lattice.M", 17, "M must be an even integer from 2 to 2048, found 17"),
     ("lattice.M", True, r"\[lattice\]: M must be a whole number, found true"),
-    ("lattice.xi_max", float("nan"), r"\[lattice\]: xi_max must be a finite number"),
     ("norm.orders", [-0.5], r"\[norm\]: .* orders below -1/2, found -0.5"),
     ("norm.orders", [-1.0 - k for k in range(101)], "orders: at most 100 entries are allowed, found 101"),
-    ("norm.orders", [date(2026, 1, 1)], r"\[norm\]: entry 1 of orders must be a number"),
     ("transform.eps", 1e-20, "eps must lie between 1e-14 and 0.1"),
     ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
-    ("reference", {}, r"\[reference\]: source is missing"),
     ("reference", sb.Sphere(), "reference must be a table"),
     ("reference", {"source": "spere"}, r"\[reference\]: no source is named 'spere'; known are .*; did you mean 'sphe"),
     ("reference", {"source": "sphere", "center": [0, 0]}, r"\[reference\]: entry 3 of center is missing"),
     ("reference", {"source": "torus", "R": 1.0, "r": 2.0}, r"\[reference\]: .*0 < r < R"),
-    ("family", {"name": "a"}, r"\[\[family\]\] must be a list"),
     ("family", ["files"], r"\[\[family\]\] 1 must be a table"),
-    ("family.0.level", [1], rf"{re.escape(FAMILY)}: level is unknown; did you mean levels\?"),
-    ("family.0.colour", 1, "colour is unknown; known are levels, source, name, order_by"),
     ("family", [{**DECIMATED, "mesh": "a.ply"}], r"no mesh is named 'a.ply'; the study has no section \[mesh.NAME\]"),
     ("family", [{**DECIMATED, "mesh": ["a.ply"]}], "mesh: must be a table that names a source"),
     ("mesh", {"a/b": {"source": "sphere"}}, r"^\[mesh.a/b\]: .*it holds '/'"),
     ("mesh", {"ball": {"source": "sphere", "radius": "x"}}, r"^\[mesh.ball\]: radius must be a number, found 'x'$"),
     ("mesh", {"ball": {**DECIMATED, "mesh": "bal"}}, r"^\[mesh.ball\]: no mesh is named 'bal'; did you mean ball\?"),
     ("mesh", {"a": {"source": "fit", "mesh": "b"}, "b": {"source": "fit", "mesh": "a"}}, "'a' is made from itself, or"),
-    ("mesh", 3, "mesh must be a table"),
     ("mesh", {"a": 3, "b": {"mesh": "a"}}, r"^\[mesh.a\] must be a table, found 3; \[mesh.b\] must be a table"),
     ("family", [{**DECIMATED, "mesh": {"source": "files", "path": []}}], r"named 'd'\): mesh.path is unknown; .*paths"),
     ("family", [{**DECIMATED, "mesh": {"paths": ["a.ply"]}}], "source is missing"),

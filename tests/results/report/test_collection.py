@@ -16,7 +16,7 @@ from sobolev_batch.results.report import collection as collection_module
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.tables.league import leagues_of
 from tests.support.browser import Browser, browser
-from tests.support.leagues import method_rows
+from tests.support.leagues import GONE, balls, method_rows, methods_of
 from tests.support.studies import small_table
 
 SCRIPT = "<script>window.ran=1</script>"
@@ -25,17 +25,8 @@ SCRIPT = "<script>window.ran=1</script>"
 @pytest.fixture(scope="module")
 def store() -> str:
     """Two spheres by two methods, and an object that has lost its reference."""
-    objects = [
-        {"name": name, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
-        for name, radius in (("ball", 1.0), ("large", 1.1))
-    ]
-    families = [
-        {"name": "ico", "source": "icosphere", "levels": [1, 2]},
-        {"name": "=egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},
-    ]
-    gone = {"name": "gone", "reference": {"source": "files", "paths": ["nowhere.ply"]}}
     study = {"name": "balls", "title": f"Balls {SCRIPT}"}
-    table = small_table(study=study, object=[*objects, gone], family=families)
+    table = small_table(study=study, object=[*balls(ball=1.0, large=1.1), GONE], family=methods_of("=egg"))
     place = "memory://balls-report.zarr"
     assert list(sb.run(sb.StudyCollection.from_table(table), place).failed) == ["gone"]
     return place
@@ -69,6 +60,7 @@ def test_the_page_opens_with_the_league(reader: Browser, page: Path, store: str)
     assert reader.tell("document.querySelector('main table').id") == "table-league"
     drawn = reader.tell("document.getElementById('chart-league').data.map(line => line.y.length)")
     assert drawn == [5, 5]
+    assert reader.relative_columns() == {"table-league": True, "table-objects": True}
     assert reader.texts("#failed tbody th") == ["gone"]
     assert reader.texts("#table-objects tbody:not([hidden]) th.label") == ["ball", "large"]
 
@@ -85,13 +77,6 @@ def test_tables_are_those_of_the_league(reader: Browser, store: str, tmp_path: P
         pd.testing.assert_frame_equal(
             found[numbers], known[numbers].reset_index(drop=True), check_exact=True, check_dtype=False
         )
-
-
-@pytest.mark.parametrize("width", [390, 1280])
-def test_method_and_distance_are_seen_at_every_width(reader: Browser, page: Path, width: int) -> None:
-    reader.open(page, width=width)
-    assert reader.tell("document.documentElement.scrollWidth") <= width
-    assert reader.relative_columns() == {"table-league": True, "table-objects": True}
 
 
 @pytest.mark.slow
