@@ -225,16 +225,20 @@ def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -
     assert (pair["error"] < 1e-6).all()
 
 
-def test_octaves_are_the_same_in_a_task_of_their_own(client: Client, tmp_path: Path) -> None:
+def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client: Client, tmp_path: Path) -> None:
     # Small chunks: several blocks, and a task for the octaves of each mesh.
     table = {**with_lattice(2), "family": [{"name": "ico", "source": "icosphere", "levels": [2]}]}
     study = sb.Study.from_table(table)
     sb.run(study, tmp_path / "whole.zarr", client)
     sb.run(replace(study, largest_chunk_bytes=1 << 17), tmp_path / "blocks.zarr", client)
     whole, blocks = (sb.open_store(tmp_path / name) for name in ("whole.zarr", "blocks.zarr"))
+    assert len(list((tmp_path / "blocks.zarr/fourier/fourier/c/0").rglob("0"))) > 1
     assert np.array_equal(variable(whole, "octaves", "octaves"), variable(blocks, "octaves", "octaves"))
-    found, expected = (variable(tree, "convergence", "distance").values for tree in (blocks, whole))
-    assert found == pytest.approx(expected, rel=1e-8, nan_ok=True)
+    found, expected = (variable(tree, "fourier", "fourier").values for tree in (blocks, whole))
+    assert np.allclose(found, expected, rtol=0, atol=1e-8)
+    for group, name in (("convergence", "distance"), ("norms", "norm"), ("distances", "distance")):
+        found, expected = (variable(tree, group, name).values for tree in (blocks, whole))
+        assert found == pytest.approx(expected, rel=1e-8, nan_ok=True)
     assert sb.verify(tmp_path / "blocks.zarr").is_sound
 
 

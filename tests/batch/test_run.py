@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.analysis import tabulate
 from sobolev_batch.batch.cluster.execution import Progress
-from tests.support.mesh_files import off
 from tests.support.studies import SMALL_LATTICE, small_table, variable
 
 
@@ -139,20 +137,6 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     assert sb.run(study, store_path, client).computed == ("f/bad",)
 
 
-def test_lattices_of_several_chunks(client: Client, study: sb.Study, finished_store: Path, store_path: Path) -> None:
-    sb.run(replace(study, largest_chunk_bytes=8_000), store_path, client)
-    chunks = list((store_path / "fourier" / "fourier" / "c" / "2").rglob("0"))
-    assert len(chunks) > 1
-    blocks, whole = sb.open_store(store_path), sb.open_store(finished_store)
-    assert np.allclose(
-        variable(blocks, "fourier", "fourier").values, variable(whole, "fourier", "fourier").values, rtol=0, atol=1e-8
-    )
-    for group, name in (("convergence", "distance"), ("norms", "norm"), ("distances", "distance")):
-        assert np.allclose(
-            variable(blocks, group, name).values, variable(whole, group, name).values, rtol=1e-6, atol=1e-9
-        )
-
-
 def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
     table = small_table(norm={"orders": [-10.0, -3.0], "pairs": "reference"})
     sb.run(sb.Study.from_table(table), store_path, client)
@@ -160,19 +144,3 @@ def test_distances_to_the_reference_alone(client: Client, finished_store: Path, 
     assert found["other"].values.tolist() == ["reference"]
     whole = variable(sb.open_store(finished_store), "distances", "distance").sel(other=["reference"])
     assert np.allclose(found.to_numpy(), whole.to_numpy(), rtol=1e-12, atol=0)
-
-
-def test_near_twins_keep_their_digits(client: Client, tmp_path: Path, store_path: Path) -> None:
-    mesh = sb.icosphere(2)
-    for name, factor in (("a", 1.0), ("b", 1.0 + 1e-7)):
-        moved = sb.Mesh(mesh.vertices * np.array([factor, 1, 1]), mesh.triangles)
-        (tmp_path / f"{name}.off").write_bytes(off(moved.vertices, moved.triangles.tolist()))
-    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
-    table = small_table(family=family, transform={"eps": 1e-13}, norm={"orders": [-3.0]})
-    sb.run(sb.Study.from_table(table, folder=tmp_path), store_path, client)
-    found = variable(sb.open_store(store_path), "distances", "distance").sel(mesh="f/a", other="f/b", order=-3.0).item()
-    # Twins apart by 1e-7 against the same pair apart by 1e-4, where nothing cancels.
-    lattice = sb.Study.from_table(table).lattice
-    wide = sb.Mesh(mesh.vertices * np.array([1.0 + 1e-4, 1, 1]), mesh.triangles)
-    expected = 1e-3 * sb.distance(mesh, wide, -3.0, lattice=lattice)["distance"].item()
-    assert found == pytest.approx(expected, rel=1e-3)

@@ -16,7 +16,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.accessor import SobolevAccessor
 from sobolev_batch.spectral.fields import Quality
-from tests.support.studies import SMALL_LATTICE, variable
+from tests.support.studies import variable
 
 ORDERS = [-1.5, -7.0]
 
@@ -40,16 +40,6 @@ def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) ->
     assert own.lattice == sb.Lattice(4.0, 32)
     # A surface beside a field is transformed on its lattice.
     assert own.distance(sb.Sphere(), -2)["distance"].item() == pytest.approx(own.distance(b, -2)["distance"].item())
-
-
-def test_stored_fields_at_any_order(finished_store: Path) -> None:
-    tree = xr.open_datatree(finished_store, engine="zarr")
-    stored = variable(tree, "fourier", "fourier")
-    field, reference = stored.sel(mesh="ico/3"), stored.sel(mesh="reference")
-    fresh = sb.distance(sb.icosphere(3), sb.Sphere(), -3.5, lattice=SMALL_LATTICE)
-    found = field.sobolev.distance(reference, -3.5)
-    assert found["distance"].item() == pytest.approx(fresh["distance"].item(), rel=1e-6)
-    assert np.isfinite(found["error"].item())
 
 
 def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:

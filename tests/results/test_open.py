@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
@@ -41,10 +40,3 @@ def test_tables_of_two_states_are_not_mixed(copy: Path, threads: Client) -> None
             function(tree, -5.0)
     sb.run(Study.from_table(small_table()), copy, threads)
     assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before
-
-
-def test_a_tree_from_nowhere_has_no_status(tree: xr.DataTree) -> None:
-    with pytest.raises(
-        sb.InputError, match=r"does not say where it was opened; open it with sobolev_batch\.open_store"
-    ):
-        sb.status(tree)

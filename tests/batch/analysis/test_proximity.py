@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 import threading
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from sobolev_batch.batch.analysis import proximity as module
 from sobolev_batch.batch.analysis.proximity import measure_proximity
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.store.records import Facts, ProximityRecord, Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan
 from tests.support.stores import assert_same_results
@@ -194,11 +193,3 @@ def test_a_worker_killed_in_the_middle(store_path: Path, finished: Path) -> None
 def test_a_closed_form_has_no_proximity() -> None:
     with pytest.raises(sb.StudyError, match=r"the reference is not one but a Sphere; take a fine mesh"):
         make_plan(sb.Study.from_table(small_table(proximity={})))
-
-
-def test_records_survive_as_text() -> None:
-    record = Record(
-        "key", "complete", facts=Facts(0, 0, 1.5, 0.5, 0.5), proximity=ProximityRecord("other", "", 0.5, 0.25, 0.1)
-    )
-    assert Record.from_json(record.to_json(3), 3) == record
-    assert Record.from_json(replace(record, proximity=None).to_json(3), 3) == replace(record, proximity=None)

@@ -101,15 +101,6 @@ def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex1
     assert found == pytest.approx(norms_of(fields[:, None] - fields, reducer), rel=1e-10)
 
 
-def test_fields_of_which_few_fit_are_measured_pair_by_pair(reducer: Reducer, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows, others = [0, 2, REFERENCE], [0, 2, REFERENCE, 7, 9]
-    by_products = reducer.tile(rows, others)
-    reducer = replace(reducer, tile_bytes=3 * 16 * reducer.blocks[0].size)
-    monkeypatch.setattr(Reducer, "_block_sums", None)
-    for found, expected in zip(reducer.tile(rows, others), by_products, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize(("rows", "others"), [([0, 1], [3, 4, 9]), ([2], [9]), ([5], [6, 7, 8])])
 @pytest.mark.parametrize("fitting", [5, 3])
 def test_tiles_whose_others_are_all_other_rows(

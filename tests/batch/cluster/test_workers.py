@@ -58,21 +58,19 @@ def test_workers_declare_their_memory(client: Client) -> None:
 
 
 @pytest.mark.all
-def test_workers_that_join_later_are_equipped_too() -> None:
-    with local_client(1) as client:
-        prepare_workers(client)
+def test_local_workers_have_the_memory_that_is_given_and_late_ones_are_equipped_too() -> None:
+    with local_client(1, "3GB") as client, Client(client.scheduler.address, set_as_default=False) as second:
+        first = prepare_workers(client)
+        (member,) = first.members
+        assert member.note
+        assert member.allowed_bytes == pytest.approx(0.85 * 3e9 - 300e6)
+        # This client registers nothing and waits for nothing of its own accord.
+        assert prepare_workers(second) == first
         client.cluster.scale(2)
         client.wait_for_workers(2, timeout=PATIENCE_SECONDS)
         assert len(prepare_workers(client).members) == 2
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         assert all(worker["resources"][MEMORY] > 0 for worker in workers)
-
-
-@pytest.mark.all
-def test_the_memory_of_local_workers_can_be_given() -> None:
-    with local_client(1, "3GB") as client:
-        (member,) = prepare_workers(client).members
-    assert member.allowed_bytes == pytest.approx(0.85 * 3e9 - 300e6)
 
 
 @pytest.mark.parametrize("memory", ["much", "-1", "0", "0.5", "1e3", "10MB", "inf", "nan", "50%", ""])
@@ -95,12 +93,3 @@ def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tm
         prepare_workers(client)
         task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
         assert task.result(timeout=PATIENCE_SECONDS) == "alive"
-
-
-@pytest.mark.all
-def test_workers_are_described_as_they_are_after_their_setup() -> None:
-    """A second client registers nothing and waits for nothing of its own accord."""
-    with local_client(1) as client, Client(client.scheduler.address, set_as_default=False) as second:
-        first = prepare_workers(client)
-        assert prepare_workers(second) == first
-        assert all(member.allowed_bytes > 0 and member.note for member in first.members)

@@ -71,19 +71,6 @@ def test_one_scale_of_colours_for_all() -> None:
 
 @drawing
 @pytest.mark.process
-def test_what_is_in_front_hides_what_is_behind() -> None:
-    eye = np.array([1.25, -1.4, 0.8])
-    front, back = 0.5 * icosphere(2).vertices + eye, icosphere(2).vertices - eye
-    triangles = np.vstack([icosphere(2).triangles + len(front), icosphere(2).triangles]).astype(np.int32)
-    values = np.repeat([1.0, -1.0], len(front))[None]
-    (pictures,) = render([MeshView("a", np.vstack([front, back]), triangles, values, (-2.0,), 640)], 1, side=200)
-    found = redness(pictures[0])
-    assert found[100, 100] > 0.2
-    assert found[100, 30] < -0.2
-
-
-@drawing
-@pytest.mark.process
 def test_meshes_seen_from_their_edge_and_no_witness() -> None:
     up, towards = np.array([0.0, 0.0, 1.0]), np.array([1.25, -1.4, 0.0])
     corners = np.array([0 * up, up, towards])

@@ -107,13 +107,6 @@ def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
     assert cut["distance"].values[0, 2] == 1.0
 
 
-def test_unknown_orders_and_unfinished_stores() -> None:
-    with pytest.raises(InputError, match="the DataTree does not say where it was opened"):
-        distances_at(made(3), -3.0)
-    with pytest.raises(InputError, match="no tables yet"):
-        format_matrix(xr.DataTree())
-
-
 @pytest.mark.parametrize("style", ["text", "markdown", "latex"])
 def test_every_mesh_has_its_name(style: Format) -> None:
     text = format_matrix(made(15, failed=3), style)
