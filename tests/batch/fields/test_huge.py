@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sobolev_batch import Lattice, Mesh, Similarity, Study, icosphere, open_store, run, write_mesh
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.spectral.quadrature.rules import gauss_rule
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 pytestmark = pytest.mark.all
 
@@ -69,18 +69,14 @@ def test_twenty_million_triangles_on_a_worker_of_six_gigabytes(tmp_path: Path, s
     assert count > 20_000_000
     # Finer, it takes four times the points and as many times as long.
     lattice, eps = Lattice(4.0, 48), 1e-6
-    study = Study.from_table(
-        {
-            "study": {"name": "huge"},
-            "lattice": {"xi_max": lattice.xi_max, "M": lattice.M},
-            "norm": {"orders": [-2.0]},
-            "transform": {"eps": eps},
-            "scaling": {"mode": "fixed", "scale": SCALE},
-            "reference": {"source": "sphere"},
-            "family": [{"name": "cortex", "source": "files", "paths": ["huge.ply"]}],
-        },
-        folder=tmp_path,
+    table = small_table(
+        lattice={"xi_max": lattice.xi_max, "M": lattice.M},
+        norm={"orders": [-2.0]},
+        transform={"eps": eps},
+        scaling={"mode": "fixed", "scale": SCALE},
+        family=[{"name": "cortex", "source": "files", "paths": ["huge.ply"]}],
     )
+    study = Study.from_table(table, folder=tmp_path)
     with local_client(1, "6GB") as client:
         before = processes(client)
         summary = run(study, store_path, client)
@@ -99,15 +95,12 @@ def test_twenty_million_triangles_on_a_worker_of_six_gigabytes(tmp_path: Path, s
 @pytest.mark.timeout(900)
 def test_a_lattice_of_512_intervals_on_a_worker_of_three_gigabytes(store_path: Path) -> None:
     lattice = Lattice(20.0, 512)
-    study = Study.from_table(
-        {
-            "study": {"name": "wide"},
-            "lattice": {"xi_max": lattice.xi_max, "M": lattice.M},
-            "norm": {"orders": [-2.0], "pairs": "reference"},
-            "reference": {"source": "sphere"},
-            "family": [{"name": "ico", "source": "icosphere", "levels": [4]}],
-        }
+    table = small_table(
+        lattice={"xi_max": lattice.xi_max, "M": lattice.M},
+        norm={"orders": [-2.0], "pairs": "reference"},
+        family=[{"name": "ico", "source": "icosphere", "levels": [4]}],
     )
+    study = Study.from_table(table)
     with local_client(1, "3GB") as client:
         before = processes(client)
         summary = run(study, store_path, client)

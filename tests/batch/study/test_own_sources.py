@@ -19,7 +19,7 @@ from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.mesh_files import off
 from tests.support.repository import blocks
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 PAGE = "docs/surfaces.md"
 
@@ -86,13 +86,7 @@ def test_the_example_of_an_archive_runs_and_resumes(tmp_path: Path, threads: Cli
             for name, scale in scales.items():
                 archive.writestr(f"boxes/{name}.off", off(scale * BOX_VERTICES, BOX_TRIANGLES))
 
-    table = {
-        "study": {"name": "archive"},
-        "lattice": {"xi_max": 2.0, "M": 16},
-        "norm": {"orders": [-3.0]},
-        "reference": {"source": "sphere"},
-        "family": [{"name": "scan", "source": "zip", "archive": "scans.zip"}],
-    }
+    table = small_table(family=[{"name": "scan", "source": "zip", "archive": "scans.zip"}])
     write_archive(small=0.2, large=0.3)
     study = Study.from_table(table, folder=tmp_path)
     store = tmp_path / "results.zarr"

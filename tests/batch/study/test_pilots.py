@@ -13,6 +13,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.study.lattice_choice import choose_pilots
 from tests.support.commands import call
 from tests.support.members import members
+from tests.support.studies import small_table
 
 
 @pytest.fixture
@@ -27,13 +28,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def study(folder: Path, **accuracy: Any) -> sb.Study:
-    table = {
-        "study": {"name": "mixed"},
-        "accuracy": {"rtol": 0.1, **accuracy},
-        "norm": {"orders": [-4.0]},
-        "reference": {"source": "sphere"},
-        "family": [{"name": "f", "source": "files", "paths": ["*.off"]}],
-    }
+    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+    table = small_table(accuracy={"rtol": 0.1, **accuracy}, lattice=None, norm={"orders": [-4.0]}, family=family)
     return sb.Study.from_table(table, folder=folder)
 
 

@@ -15,7 +15,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
 from tests.support.smooth_shapes import roof, roof_derivatives
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 RING = {"R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}
 EGG = {"axes": [2.0, 1.4, 0.8]}
@@ -23,14 +23,10 @@ EGG = {"axes": [2.0, 1.4, 0.8]}
 
 def torus_table(**changes: Any) -> dict[str, Any]:
     """Grids of a torus against the torus, in a few seconds."""
-    table: dict[str, Any] = {
-        "study": {"name": "torus"},
-        "lattice": {"xi_max": 3.0, "M": 20},
-        "norm": {"orders": [-3.0, -5.0]},
-        "reference": {"source": "torus", **RING},
-        "family": [{"name": "grid", "source": "torus", **RING, "levels": [0, 1, 2, 3]}],
-    }
-    return {**table, **changes}
+    ring = {"source": "torus", **RING}
+    family = [{"name": "grid", **ring, "levels": [0, 1, 2, 3]}]
+    own = {"lattice": {"xi_max": 3.0, "M": 20}, "norm": {"orders": [-3.0, -5.0]}, "reference": ring, "family": family}
+    return small_table(**{**own, **changes})
 
 
 def egg_table(**changes: Any) -> dict[str, Any]:
@@ -75,10 +71,9 @@ def test_refinements_converge_with_second_order(
 
 @pytest.mark.slow
 def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
-    table = torus_table(accuracy={"rtol": 1e-2}, norm={"orders": [-4.0]})
-    del table["lattice"]
     family = [{"name": "grid", "source": "torus", **RING, "levels": [1, 2]}]
-    summary = sb.run(sb.Study.from_table({**table, "family": family}), store_path, threads)
+    table = torus_table(accuracy={"rtol": 1e-2}, lattice=None, norm={"orders": [-4.0]}, family=family)
+    summary = sb.run(sb.Study.from_table(table), store_path, threads)
     assert not summary.failed
     found = sb.open_store(store_path)["convergence"].to_dataset().isel(order=0)
     assert found["within"].values[:2].all()

@@ -17,7 +17,7 @@ from sobolev_batch.results.tables.evolution import format_evolution
 from tests.support.browser import browser
 from tests.support.members import loaded, members
 from tests.support.mesh_files import off
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 SHAPE: dict[str, Any] = {"source": "ellipsoid", "axes": [1.0, 0.8, 0.6]}
 LATTICE = sb.Lattice(3.0, 40)
@@ -31,22 +31,16 @@ def carried(level: int, times: list[float]) -> dict[str, Any]:
 def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two meshes that a flow carries, against the true surface: a fine one that it carries along."""
     folder = tmp_path_factory.mktemp("moving")
-    study = sb.Study.from_table(
-        {
-            "study": {"name": "moving"},
-            "lattice": {"xi_max": LATTICE.xi_max, "M": LATTICE.M},
-            "scaling": {"mode": "none"},
-            "norm": {"orders": [-2.0, -4.0], "pairs": "reference"},
-            "reference": {"source": "ellipsoid", "axes": [1.0, 0.8, 0.6]},
-            "family": [
-                {"name": "coarse", **carried(1, [0.0, 0.4, 0.8])},
-                {"name": "late", **carried(2, [0.4, 0.8, 1.2])},
-                {"name": "true", **carried(4, [0.0, 0.4, 0.8])},
-                {"name": "still", **SHAPE, "levels": [1]},
-            ],
-        }
-    )
-    sb.run(study, folder / "moving.zarr", client)
+    family = [
+        {"name": "coarse", **carried(1, [0.0, 0.4, 0.8])},
+        {"name": "late", **carried(2, [0.4, 0.8, 1.2])},
+        {"name": "true", **carried(4, [0.0, 0.4, 0.8])},
+        {"name": "still", **SHAPE, "levels": [1]},
+    ]
+    norm = {"orders": [-2.0, -4.0], "pairs": "reference"}
+    lattice = {"xi_max": LATTICE.xi_max, "M": LATTICE.M}
+    study = small_table(lattice=lattice, scaling={"mode": "none"}, norm=norm, reference=SHAPE, family=family)
+    sb.run(sb.Study.from_table(study), folder / "moving.zarr", client)
     return folder / "moving.zarr"
 
 
@@ -138,17 +132,12 @@ def test_a_first_distance_below_its_error_has_no_growth(store: Path) -> None:
 
 def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Path) -> None:
     ball = {"source": "icosphere", "levels": [0]}
-    study: dict[str, Any] = {
-        "study": {"name": "rounded"},
-        "lattice": {"xi_max": 2.0, "M": 16},
-        "norm": {"orders": [-4.0]},
-        "reference": {"source": "sphere"},
-        "family": [
-            {"name": "carried", "source": "flow", "mesh": ball, "times": [0.1 + 0.2, 1000000.1, 1000000.2]},
-            {"name": "true", "source": "flow", "mesh": {**ball, "levels": [2]}, "times": [0.3]},
-            {"name": "elsewhere", "source": "flow", "mesh": ball, "times": [7.0]},
-        ],
-    }
+    family = [
+        {"name": "carried", "source": "flow", "mesh": ball, "times": [0.1 + 0.2, 1000000.1, 1000000.2]},
+        {"name": "true", "source": "flow", "mesh": {**ball, "levels": [2]}, "times": [0.3]},
+        {"name": "elsewhere", "source": "flow", "mesh": ball, "times": [7.0]},
+    ]
+    study = small_table(lattice={"xi_max": 2.0, "M": 16}, norm={"orders": [-4.0]}, family=family)
     store = tmp_path / "rounded.zarr"
     sb.run(sb.Study.from_table(study), store, client)
     with pytest.raises(sb.InputError, match="the families 'elsewhere' and 'true' have no time in common"):
@@ -182,16 +171,9 @@ def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) ->
         (tmp_path / f"frame_{number}.off").write_bytes(off(ball.vertices * (1 + number / 50), ball.triangles.tolist()))
 
     def study(**times: Any) -> sb.Study:
-        return sb.Study.from_table(
-            {
-                "study": {"name": "frames"},
-                "lattice": {"xi_max": 2.0, "M": 24},
-                "norm": {"orders": [-4.0]},
-                "reference": {"source": "sphere"},
-                "family": [{"name": "frames", "source": "files", "paths": ["*.off"], **times}],
-            },
-            folder=tmp_path,
-        )
+        family = [{"name": "frames", "source": "files", "paths": ["*.off"], **times}]
+        table = small_table(lattice={"xi_max": 2.0, "M": 24}, norm={"orders": [-4.0]}, family=family)
+        return sb.Study.from_table(table, folder=tmp_path)
 
     store = tmp_path / "frames.zarr"
     sb.run(study(), store, client)
