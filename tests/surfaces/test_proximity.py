@@ -86,13 +86,14 @@ def test_a_mesh_is_at_no_distance_from_itself() -> None:
     assert found.chamfer < 1e-15
 
 
-@pytest.mark.parametrize("points", [0, 1, -5, MOST_POINTS + 1, 2.5, True])
-def test_points_out_of_range(points: int) -> None:
-    with pytest.raises(sb.InputError, match="points must be an integer"):
-        proximity(square(1.0), square(2.0), points=points)
-
-
-@pytest.mark.parametrize("seed", [-1, 0.5, "1", True, None])
-def test_seeds_are_whole_numbers(seed: Any) -> None:
-    with pytest.raises(sb.InputError, match="seed must be a whole number from 0 on"):
-        proximity(square(1.0), square(2.0), seed=seed)
+@pytest.mark.parametrize(
+    ("key", "values", "message"),
+    [
+        ("points", [0, 1, -5, MOST_POINTS + 1, 2.5, True], "points must be an integer"),
+        ("seed", [-1, 0.5, "1", True, None], "seed must be a whole number from 0 on"),
+    ],
+)
+def test_wrong_points_and_seeds_are_refused(key: str, values: list[Any], message: str) -> None:
+    for value in values:
+        with pytest.raises(sb.InputError, match=message):
+            proximity(square(1.0), square(2.0), **{key: value})

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import Ellipsoid, Sphere, StudyError, Torus, icosphere
+from sobolev_batch import Ellipsoid, Mesh, Sphere, StudyError, Torus, icosphere
 from sobolev_batch.surfaces.sources import registry as sources
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member, Source, parse_source, source_type_of
 from tests.support.members import BALL, KINDS, listed, loaded, members
@@ -65,11 +65,6 @@ def test_all_sources_are_registered() -> None:
 def test_names_of_sources_must_be_exact(name: object) -> None:
     with pytest.raises(StudyError, match=re.escape(f"no source is named {name!r}")):
         parse_source({"source": name, "levels": [1]})
-
-
-def test_a_table_must_name_its_source() -> None:
-    with pytest.raises(StudyError, match="source is missing; add it, such as source = "):
-        parse_source({"levels": [1]})
 
 
 @pytest.mark.usefixtures("plugin")
@@ -179,7 +174,9 @@ def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], plac
 
 
 @pytest.mark.parametrize("name", ["decimate", "remesh", "spherical-levels"])
-def test_nested_sources_must_exist(name: str) -> None:
+def test_sources_and_nested_ones_must_be_named_and_exist(name: str) -> None:
+    with pytest.raises(StudyError, match="source is missing; add it, such as source = "):
+        parse_source({"levels": [1]})
     with pytest.raises(StudyError, match="no source is named 'nothing'"):
         parse_source({"source": name, "mesh": {"source": "nothing"}, "triangles": [80]})
     with pytest.raises(StudyError, match="source is missing; add it, such as source = "):
@@ -237,21 +234,18 @@ def test_icospheres_go_from_coarse_to_fine_and_once_each() -> None:
     assert found[1].fingerprint() == {"icosphere": 2}
 
 
-def test_levels_of_an_ellipsoid() -> None:
-    found = members({**EGG, "source": "ellipsoid", "levels": [3, 1, 1]})
-    assert listed(found) == [("1", 1), ("3", 3)]
-    assert loaded(found[1]).digest == Ellipsoid((3.0, 2.0, 1.0), (0.0, 0.5, 0.0)).mesh(3).digest
-    assert found[1].expected_size().triangles == len(loaded(found[1]).triangles)
-
-
-def test_levels_of_a_torus() -> None:
-    found = members({**RING, "source": "torus", "levels": [2, 0], "around": 10, "across": 4})
-    assert listed(found) == [("0", 0), ("2", 2)]
-    assert loaded(found[0]).digest == Torus(2.0, 0.5, (0.0, 0.5, 0.0)).mesh(10, 4).digest
-    assert loaded(found[1]).digest == Torus(2.0, 0.5, (0.0, 0.5, 0.0)).mesh(40, 16).digest
-    assert found[1].expected_size().triangles == len(loaded(found[1]).triangles)
-    usual = members({**RING, "source": "torus", "levels": [0]})
-    assert len(loaded(usual[0]).triangles) == 2 * 12 * 6
+def test_levels_of_ellipsoids_and_tori() -> None:
+    egg, ring = Ellipsoid((3.0, 2.0, 1.0), (0.0, 0.5, 0.0)), Torus(2.0, 0.5, (0.0, 0.5, 0.0))
+    cases: list[tuple[dict[str, Any], list[tuple[int, Mesh]]]] = [
+        ({**EGG, "levels": [3, 1, 1]}, [(1, egg.mesh(1)), (3, egg.mesh(3))]),
+        ({**RING, "levels": [2, 0], "around": 10, "across": 4}, [(0, ring.mesh(10, 4)), (2, ring.mesh(40, 16))]),
+        ({**RING, "levels": [0]}, [(0, ring.mesh(12, 6))]),
+    ]
+    for table, expected in cases:
+        found = members(table)
+        assert listed(found) == [(str(level), level) for level, _ in expected]
+        assert [loaded(member).digest for member in found] == [mesh.digest for _, mesh in expected]
+        assert [member.expected_size().triangles for member in found] == [len(mesh.triangles) for _, mesh in expected]
 
 
 @pytest.mark.parametrize("table", [EGG, {**EGG, "levels": [1]}, RING, {**RING, "levels": [1]}], ids=str)
@@ -267,10 +261,14 @@ def test_every_parameter_is_part_of_the_fingerprint(table: dict[str, Any]) -> No
     assert identity(dict(table)) == found[0]
 
 
-def test_parameters_that_make_no_surface_say_why() -> None:
-    with pytest.raises(ValidationError, match=r"0 < r < R, found R = 1\.0 and r = 1\.5"):
-        members({"source": "torus", "R": 1.0, "r": 1.5})
-    with pytest.raises(ValidationError, match="between 1e-150 and"):
-        members({"source": "ellipsoid", "axes": [1.0, 1.0, 1e-200]})
-    with pytest.raises(ValidationError, match="level 12 of 12 x 6 cells has 2415919104 triangles, at most 1000000000"):
-        members({"source": "torus", "R": 1.0, "r": 0.5, "levels": [12]})
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"source": "torus", "R": 1.0, "r": 1.5}, r"0 < r < R, found R = 1\.0 and r = 1\.5"),
+        ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e-200]}, "between 1e-150 and"),
+        ({**RING, "levels": [12]}, "level 12 of 12 x 6 cells has 2415919104 triangles, at most 1000000000"),
+    ],
+)
+def test_parameters_that_make_no_surface_say_why(table: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        members(table)
