@@ -56,7 +56,7 @@ def test_a_member_is_the_fit_in_the_unit_ball_of_its_target() -> None:
 
 
 @pytest.mark.process
-def test_every_process_makes_the_same_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_process_makes_the_same_mesh() -> None:
     member = members({**FIT, "target": SPHERE})[0]
     program = "import pickle, sys; print(pickle.load(sys.stdin.buffer).load().digest)"
     found = subprocess.run(
@@ -88,11 +88,9 @@ def test_the_reference_is_handed_down_to_nested_sources() -> None:
 
 
 def test_a_target_of_its_own_stays() -> None:
-    own = {"source": "sphere", "radius": 29.0, "center": [100.0, 0.0, 0.0]}
-    with_own, without = parse_source({**FIT, "target": own}), parse_source(FIT)
-    reference = parse_source(SPHERE)
+    reference, with_own = parse_source(SPHERE), parse_source({**FIT, "target": {**SPHERE, "radius": 29.0}})
     assert with_own.with_reference(reference) == with_own
-    assert without.with_reference(reference) == parse_source({**FIT, "target": SPHERE})
+    assert parse_source(FIT).with_reference(reference) == parse_source({**FIT, "target": SPHERE})
     assert parse_source(STARTS).with_reference(reference) == parse_source(STARTS)
 
 

@@ -55,20 +55,14 @@ def test_gltf_nodes_place_their_meshes(read: Read, name: str) -> None:
     assert soup(embedded) == soup(mesh)
 
 
-def test_gltf_meshes_may_have_several_primitives(read: Read) -> None:
+def test_gltf_meshes_may_have_several_primitives_and_no_indices(read: Read) -> None:
     halves = [(BOX_VERTICES, BOX_TRIANGLES[:6], None), (BOX_VERTICES, BOX_TRIANGLES[6:], 4)]
-    mesh = read(".glb", Gltf([halves], [{"mesh": 0}]).glb())
-    assert soup(mesh) == soup(box())
-    assert mesh.counts == CLOSED
+    corners = [(BOX_VERTICES[np.array(BOX_TRIANGLES)].reshape(-1, 3), None, None)]
+    for parts in (halves, corners):
+        mesh = read(".glb", Gltf([parts], [{"mesh": 0}]).glb())
+        assert (soup(mesh), mesh.counts) == (soup(box()), CLOSED)
     twice = read(".glb", Gltf([halves], [{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}]).glb())
     assert twice.area == 5 * BOX_AREA
-
-
-def test_gltf_primitives_may_go_without_indices(read: Read) -> None:
-    corners = BOX_VERTICES[np.array(BOX_TRIANGLES)].reshape(-1, 3)
-    mesh = read(".glb", Gltf([[(corners, None, None)]], [{"mesh": 0}]).glb())
-    assert soup(mesh) == soup(box())
-    assert mesh.counts == CLOSED
 
 
 @pytest.mark.parametrize(("level", "index"), [(2, "uint8"), (6, "uint16"), (2, "uint32")])
