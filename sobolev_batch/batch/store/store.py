@@ -52,7 +52,6 @@ LABELS = "fourier/mesh"
 QUALITY = "fourier/quality"
 OCTAVES_GROUP = "octaves"
 OCTAVES = "octaves/octaves"
-OCTAVE_LABELS = "octaves/mesh"
 RECORDS = "records"
 RECORD = "records/record"
 # Attributes of the root: the digest of tables and metadata; true while the store is being created; the objects of a

@@ -131,12 +131,13 @@ def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dic
                 labels.setdefault(family, {})[time] = label
     if not labels:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
-    if truth is None:
-        labels.pop(reference_of(tree), None)
-        return labels, {}
-    if truth not in labels:
+    if truth is not None and truth not in labels:
         raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
-    true_labels = labels.pop(truth)
+    true_labels = labels.pop(reference_of(tree) if truth is None else truth, {})
+    if not labels:
+        raise InputError("no mesh has a time, except those that the others are compared with")
+    if truth is None:
+        return labels, {}
     for name, by_time in labels.items():
         if not any(_at(true_labels, time) for time in by_time):
             raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")

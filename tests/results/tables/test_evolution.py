@@ -180,6 +180,8 @@ def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) ->
     with pytest.raises(sb.InputError, match="no mesh of the store has a time"):
         sb.evolution(store)
     assert sb.run(study(times="names"), store, client).computed == ()
+    with pytest.raises(sb.InputError, match="no mesh has a time, except those that the others are compared with"):
+        sb.evolution(store, truth="frames")
     assert sb.evolution(store)["time"].values.tolist() == [1.0, 2.0, 10.0]
     assert sb.run(study(times=[0.1, 0.2, 0.5]), store, client).computed == ()
     found = sb.evolution(store, -4.0)
