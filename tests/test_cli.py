@@ -20,7 +20,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch import icosphere
 from tests.support.commands import COMMAND, STUDY, call, command
-from tests.support.drawing import obstacle
+from tests.support.repository import obstacle
 
 pytestmark = pytest.mark.process
 
@@ -265,6 +265,8 @@ REFUSED = [
     ("run no.toml", "no.toml: cannot be read"),
     ("run broken.toml", "[lattice]: m is unknown; did you mean M?"),
     ("run study.toml --store taken", "not empty and holds no store"),
+    ("run study.toml --store typo/results.zarr", "/typo to hold the store; make it first"),
+    ("run study.toml --store 1.off", "it is a file"),
     ("run study.toml --store /proc/x.zarr", "/proc/x.zarr: the store cannot be written"),
     (f"run other.toml --store {STORE}", "it holds a store of another study"),
     ("run study.toml --store huge.zarr --memory 1000TB", "memory of a worker of 1.0PB is more than there is"),
@@ -312,6 +314,7 @@ def test_wrong_input_gives_one_line_or_the_usage_and_status_2(folder: Path, line
         assert re.match(r"^error: .*\n$", done.stderr)
     assert (folder / "taken" / "precious").read_text() == "text"
     assert not (folder / "none").exists()
+    assert not (folder / "typo").exists()
 
 
 def test_a_process_ends_in_the_same_way(folder: Path) -> None:

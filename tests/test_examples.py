@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-from tests.support.gallery import run_icospheres
-from tests.support.repository import PACKAGE
+from tests.support.repository import PACKAGE, run_icospheres
 
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 FILES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>>" in file.read_text(encoding="utf-8")]

@@ -10,8 +10,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.results.tables.league import leagues_of
-from tests.support.leagues import method_rows
-from tests.support.studies import small_table
+from tests.support.studies import method_rows, small_table
 
 HOSTILE = "<script>alert('&')</script>"
 # Names of families hold no slash.

@@ -18,8 +18,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.cli import cli
 from tests.support.commands import call
-from tests.support.gallery import run_blocks, run_icospheres
-from tests.support.repository import ROOT, blocks
+from tests.support.repository import ROOT, blocks, run_blocks, run_icospheres
 
 MOST_BYTES_OF_A_PICTURE = 100_000
 

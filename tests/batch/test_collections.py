@@ -18,8 +18,7 @@ from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.support.commands import call
-from tests.support.leagues import GONE, balls, methods_of
-from tests.support.studies import small_table
+from tests.support.studies import GONE, balls, methods_of, small_table
 
 
 def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:

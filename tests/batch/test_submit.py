@@ -15,10 +15,9 @@ from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.commands import call, command
-from tests.support.leagues import GONE, balls
 from tests.support.processes import tcp_cluster, wait_until
 from tests.support.recipes import write_study
-from tests.support.studies import small_table
+from tests.support.studies import GONE, balls, small_table
 
 # Dies without any farewell as soon as the study is handed over.
 CLIENT = """

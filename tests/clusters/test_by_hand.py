@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import dask
 import pytest
@@ -20,14 +20,12 @@ from distributed import Client
 
 from sobolev_batch import ClusterError, open_store
 from sobolev_batch.batch.cluster.clients import check_connection, remote_client
+from tests.support.commands import COMMAND, finished
 from tests.support.processes import PATIENCE_SECONDS, listening, stop
-from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, write_study
+from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, run_recipe, write_study
+from tests.support.stores import contents
 
 pytestmark = pytest.mark.all
-
-
-def make_certificates(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +35,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def certificates(home: Path) -> Path:
-    made = make_certificates(home / "dask-tls")
+    made = finished(CERTIFICATES, home / "dask-tls")
     assert made.returncode == 0, made.stderr
     assert f"export DASK_CONFIG={home}/dask-tls/tls.yaml" in made.stdout
     return home / "dask-tls"
@@ -46,7 +44,7 @@ def certificates(home: Path) -> Path:
 @pytest.fixture(scope="module")
 def others(home: Path) -> Path:
     """Return certificates of somebody else."""
-    assert make_certificates(home / "others", "2").returncode == 0
+    assert finished(CERTIFICATES, home / "others", "2").returncode == 0
     return home / "others"
 
 
@@ -56,9 +54,9 @@ def configured(folder: Path | None) -> Any:
     return dask.config.set(dask.config.merge(dask.config.config, settings))
 
 
-class Cluster:
-    def __init__(self, address: str, processes: list[subprocess.Popen[str]]) -> None:
-        self.address, self.processes = address, processes
+class Cluster(NamedTuple):
+    address: str
+    processes: list[subprocess.Popen[str]]
 
 
 @pytest.fixture(scope="module")
@@ -98,13 +96,12 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     assert [file.name for file in files] == ["ca.pem", "certificate.pem", "key.pem", "tls.yaml"]
     assert stat.S_IMODE(certificates.stat().st_mode) == 0o700
     assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
-    verify = ["openssl", "verify", "-x509_strict", "-CAfile", *map(str, files[:2])]
-    assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
-    before = {file: file.read_bytes() for file in files}
-    again = make_certificates(certificates)
+    assert finished("openssl", "verify", "-x509_strict", "-CAfile", *files[:2]).returncode == 0
+    before = contents(certificates)
+    again = finished(CERTIFICATES, certificates)
     assert again.returncode == 2
     assert f"{certificates} already exists" in again.stderr
-    assert before == {file: file.read_bytes() for file in files}
+    assert contents(certificates) == before
     assert not list(home.glob(".make-certificates*"))
 
 
@@ -118,7 +115,7 @@ def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Pat
     ],
 )
 def test_certificates_are_not_made(arguments: list[str], message: str, tmp_path: Path) -> None:
-    completed = subprocess.run([CERTIFICATES, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path)
+    completed = finished(CERTIFICATES, *arguments, cwd=tmp_path)
     assert completed.returncode == 2
     assert message in completed.stderr
     assert not list(tmp_path.iterdir())
@@ -128,14 +125,8 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
     write_study(tmp_path)
     (run,) = documented("sobolev-batch run")
     words = [cluster.address if word == "tls://HOST:8786" else word for word in run[1:]]
-    completed = subprocess.run(
-        [sys.executable, "-m", "sobolev_batch", *words],
-        env=environment(home, DASK_CONFIG=str(certificates / "tls.yaml")),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    variables = {"HOME": str(home), "DASK_CONFIG": str(certificates / "tls.yaml")}
+    completed = run_recipe(tmp_path, *COMMAND, *words, **variables)
     assert completed.returncode == 0, completed.stderr
     assert re.search(TABLE, completed.stdout)
     meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
@@ -209,10 +200,7 @@ def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says:
         thread = threading.Thread(target=answer)
         thread.start()
         address = f"{scheme}://127.0.0.1:{server.getsockname()[1]}"
-        with (
-            configured(certificates if scheme == "tls" else None),
-            pytest.raises(ClusterError, match=message),
-        ):
+        with configured(certificates if scheme == "tls" else None), pytest.raises(ClusterError, match=message):
             check_connection(address, 0.5)
         thread.join()
         for connection in connections:

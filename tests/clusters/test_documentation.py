@@ -18,11 +18,8 @@ from sobolev_batch.cli import cli
 from tests.support.recipes import FOLDER, documented
 from tests.support.repository import ROOT
 
-COMMANDS: dict[tuple[str, ...], click.Command] = {
-    ("dask", "scheduler"): dask_scheduler.main,
-    ("dask", "worker"): dask_worker.main,
-    **{("sobolev-batch", name): command for name, command in cli.commands.items()},
-}
+COMMANDS: dict[tuple[str, ...], click.Command] = {("sobolev-batch", name): made for name, made in cli.commands.items()}
+COMMANDS |= {("dask", "scheduler"): dask_scheduler.main, ("dask", "worker"): dask_worker.main}
 # One binary and one decimal unit, as Kubernetes writes them.
 UNITS = {"Gi": "GiB", "Mi": "MiB"}
 
@@ -75,11 +72,8 @@ def test_pods(name: str) -> None:
     check_options(container["args"])
     assert pod["automountServiceAccountToken"] is False
     assert pod["securityContext"]["runAsNonRoot"] is True
-    assert container["securityContext"] == {
-        "allowPrivilegeEscalation": False,
-        "readOnlyRootFilesystem": True,
-        "capabilities": {"drop": ["ALL"]},
-    }
+    security = {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}}
+    assert container["securityContext"] == security
     volumes = {volume["name"] for volume in pod["volumes"]}
     assert {mount["name"] for mount in container["volumeMounts"]} == volumes
     resources = container["resources"]
@@ -100,16 +94,12 @@ def test_the_parts_of_the_manifest_name_each_other() -> None:
     selector = {"dask.org/cluster-name": name, "dask.org/component": "scheduler"}
     assert cluster["spec"]["scheduler"]["service"]["selector"] == selector
     assert to_scheduler["spec"]["podSelector"]["matchLabels"] == selector
-    assert to_scheduler["spec"]["ingress"] == [
-        {
-            "from": [{"podSelector": {}}],  # of this namespace
-            "ports": [{"protocol": "TCP", "port": port} for port in (8786, 8787)],
-        }
-    ]
+    ports = [{"protocol": "TCP", "port": port} for port in (8786, 8787)]
+    # From this namespace, and from this cluster.
+    assert to_scheduler["spec"]["ingress"] == [{"from": [{"podSelector": {}}], "ports": ports}]
     assert to_workers["spec"]["podSelector"]["matchLabels"] == {**selector, "dask.org/component": "worker"}
-    assert to_workers["spec"]["ingress"] == [
-        {"from": [{"podSelector": {"matchLabels": {"dask.org/cluster-name": name}}}]}
-    ]
+    own = {"podSelector": {"matchLabels": {"dask.org/cluster-name": name}}}
+    assert to_workers["spec"]["ingress"] == [{"from": [own]}]
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert f"tcp://{name}-scheduler:8786" in container["args"]
     assert "--trust-network" in container["args"]
@@ -129,9 +119,8 @@ def test_the_image() -> None:
     lines = (FOLDER / "Dockerfile").read_text().splitlines()
     (build,) = documented("docker build")
     assert build[build.index("--tag") + 1] == pods()["worker"]["containers"][0]["image"]
-    sources = [
-        word for line in lines if line.startswith("COPY ") and "--from" not in line for word in line.split()[1:-1]
-    ]
+    copied = [line.split()[1:-1] for line in lines if line.startswith("COPY ") and "--from" not in line]
+    sources = [word for words in copied for word in words]
     assert {"pyproject.toml", "sobolev_batch"} <= set(sources)
     assert all((ROOT / source).exists() for source in sources)
     user = str(pods()["worker"]["securityContext"]["runAsUser"])

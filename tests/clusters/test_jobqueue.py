@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.support.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
+from tests.support.recipes import FOLDER, TABLE, add_command, documented, run_recipe, write_study
 
 SETTINGS = FOLDER / "jobqueue.yaml"
 
@@ -30,27 +30,16 @@ def jobqueue(
     """Run the documented command with further options."""
     command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
     script, study = FOLDER / Path(command[0]).name, command[1]
-    return subprocess.run(
-        [sys.executable, script, study, *options],
-        env=environment(home, DASK_CONFIG=str(settings), **variables),
-        cwd=home,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return run_recipe(home, sys.executable, script, study, *options, DASK_CONFIG=str(settings), **variables)
 
 
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("system", "directives"),
     [
-        (
-            "slurm",
-            ["-p compute", "-A project42", "--cpus-per-task=8", "--mem=32G", "-t 04:00:00"],
-        ),
+        ("slurm", ["-p compute", "-A project42", "--cpus-per-task=8", "--mem=32G", "-t 04:00:00"]),
         pytest.param(
-            "pbs",
-            ["-q compute", "-A project42", "-l select=1:ncpus=8:mem=32GB", "-l walltime=04:00:00"],
+            *("pbs", ["-q compute", "-A project42", "-l select=1:ncpus=8:mem=32GB", "-l walltime=04:00:00"]),
             marks=pytest.mark.all,
         ),
     ],
@@ -126,15 +115,7 @@ if __name__ == "__main__":
 
 @pytest.mark.all
 def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
-    paths = environment(slurm)["PYTHONPATH"]
-    completed = subprocess.run(
-        [sys.executable, "-c", REPLACED],
-        env=environment(slurm, DASK_CONFIG=str(slurm / "jobqueue.yaml"), PYTHONPATH=f"{paths}:{FOLDER}"),
-        cwd=slurm,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    completed = run_recipe(slurm, sys.executable, "-c", REPLACED, DASK_CONFIG=str(slurm / "jobqueue.yaml"))
     assert completed.returncode == 0, completed.stderr
     assert len(list(slurm.glob("job-*"))) == 2
     assert not list(slurm.glob(".sobolev-batch*"))

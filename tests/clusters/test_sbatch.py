@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.support.recipes import FOLDER, TABLE, add_command, documented, environment, write_study
+from tests.support.recipes import FOLDER, TABLE, add_command, documented, run_recipe, write_study
 
 # Options first, then the command, once per task.
 SRUN = """
@@ -26,23 +25,11 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     add_command(tmp_path, "srun", SRUN)
     write_study(tmp_path)
     script, study = documented("sbatch workflows")[0][1:]
-    completed = subprocess.run(
-        ["bash", FOLDER / Path(script).name, study, "--store", "results.zarr"],
-        env=environment(
-            tmp_path,
-            INTERFACE=next(
-                name for name, addresses in psutil.net_if_addrs().items() if addresses[0].address == "127.0.0.1"
-            ),
-            RECIPES=str(FOLDER),
-            SLURM_SUBMIT_DIR=str(tmp_path),
-            SLURM_NTASKS="1",
-            SLURM_MEM_PER_CPU="2048",
-        ),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    loopback = next(name for name, found in psutil.net_if_addrs().items() if found[0].address == "127.0.0.1")
+    variables = {"INTERFACE": loopback, "RECIPES": str(FOLDER), "SLURM_SUBMIT_DIR": str(tmp_path)}
+    variables |= {"SLURM_NTASKS": "1", "SLURM_MEM_PER_CPU": "2048"}
+    recipe = FOLDER / Path(script).name
+    completed = run_recipe(tmp_path, "bash", recipe, study, "--store", "results.zarr", **variables)
     assert completed.returncode == 0, completed.stderr
     assert re.search(TABLE, completed.stdout)
     log = (tmp_path / "workers.log").read_text()

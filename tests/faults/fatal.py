@@ -9,19 +9,15 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import dask
-import pytest
 
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 
-_VARIABLE = "FATAL_MOMENT"
+VARIABLE = "FATAL_MOMENT"
 
 
 @dataclass(frozen=True)
@@ -32,9 +28,9 @@ class Moment:
         what: "field" before a field is written, "rename" between its file and its name, "record" before the
             record is written, "recorded" after it.
         row: whose.
-        log: a file with one line for each worker that ended.
-        times: how many end, of all workers together.
-        number: of the signal that they get: by default that of an OOM killer; one that is stopped may be continued.
+        log: a file with a line for each worker that got the signal.
+        times: how many get it, of all workers together.
+        number: of the signal: by default that of an OOM killer.
     """
 
     what: str
@@ -48,11 +44,6 @@ class Moment:
         """The processes that got the signal."""
         path = Path(self.log)
         return list(map(int, path.read_text().split())) if path.exists() else []
-
-    @property
-    def deaths(self) -> int:
-        """How many workers have ended."""
-        return len(self.pids)
 
     def strike(self) -> None:
         """End or stop this process, unless enough have."""
@@ -78,17 +69,9 @@ class Moment:
         return wrapped
 
 
-@contextmanager
-def fatal(monkeypatch: pytest.MonkeyPatch, moment: Moment) -> Iterator[Moment]:
-    """Workers that are started inside end at a moment."""
-    monkeypatch.setenv(_VARIABLE, json.dumps(asdict(moment)))
-    with dask.config.set({"distributed.worker.preload": [__file__]}):
-        yield moment
-
-
 def dask_setup(worker: object) -> None:
     """What Dask calls in a worker that has this for a preload."""
-    moment = Moment(**json.loads(os.environ[_VARIABLE]))
+    moment = Moment(**json.loads(os.environ[VARIABLE]))
     write_record = Store.write_record
     if moment.what == "field":
         Store.write_field = moment.before(Store.write_field, lambda store, row, *_: row == moment.row)  # type: ignore[method-assign]

@@ -18,7 +18,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from tests.faults.conftest import FIELD
 from tests.support.commands import call, write_toml
-from tests.support.stores import assert_same_results, put_back
+from tests.support.stores import put_back
 from tests.support.studies import small_table, variable
 
 
@@ -59,9 +59,7 @@ def load(store: Path) -> None:
         node.to_dataset().load()
 
 
-def test_verify_names_the_mesh_and_run_repairs_it(
-    store: Path, study: Study, finished_store: Path, threads: Client
-) -> None:
+def test_verify_names_the_mesh_and_run_repairs_it(store: Path, mended: Callable[..., None]) -> None:
     for damage in DAMAGES:
         with put_back(store):
             damage(store / FIELD.format(row=2))
@@ -71,9 +69,7 @@ def test_verify_names_the_mesh_and_run_repairs_it(
     for row, damage in zip((4, 3, 2, 1), (truncate, flip, delete, swap), strict=True):
         damage(store / FIELD.format(row=row))
     assert sorted(verify(store).fields) == ["ico/1", "ico/2", "ico/3", "reference"]
-    assert sorted(run(study, store, threads).computed) == ["ico/1", "ico/2", "ico/3", "reference"]
-    assert verify(store).is_sound
-    assert_same_results(store, finished_store)
+    mended("ico/1", "ico/2", "ico/3", "reference")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +117,7 @@ SMALL: list[tuple[Damage, str]] = [
 
 
 def test_tables_and_coordinates_are_named_never_read_damaged_and_made_again(
-    store: Path, study: Study, finished_store: Path, threads: Client
+    store: Path, mended: Callable[..., None]
 ) -> None:
     for damage, key in SMALL:
         with put_back(store):
@@ -134,14 +130,12 @@ def test_tables_and_coordinates_are_named_never_read_damaged_and_made_again(
     for damage, key in SMALL:
         damage(store / key)
     assert set(verify(store).tables) == {key.partition("/c/")[0] for _, key in SMALL}
-    assert run(study, store, threads).computed == ()
-    assert verify(store).is_sound
-    assert_same_results(store, finished_store)
+    mended()
     field = variable(open_store(store), "fourier", "fourier").sel(mesh="ico/2")
     assert np.isfinite(norm(field, -3.0)["error"].item())
 
 
-def test_a_damaged_record_counts_as_none(store: Path, study: Study, threads: Client) -> None:
+def test_a_damaged_record_counts_as_none(store: Path, mended: Callable[..., None]) -> None:
     for row, damage in enumerate((truncate, empty, flip, delete)):
         damage(store / f"records/record/c/{row}")
     labels = ("ico/0", "ico/1", "ico/2", "ico/3")
@@ -149,9 +143,7 @@ def test_a_damaged_record_counts_as_none(store: Path, study: Study, threads: Cli
     assert "ico/2: its completion record is gone" in str(status(store))
     found = verify(store)
     assert (tuple(found.fields), found.complete) == (labels, 1)
-    assert run(study, store, threads).computed == labels
-    assert status(store).lost_records == ()
-    assert verify(store).is_sound
+    mended(*labels)
 
 
 def with_checksum(data: bytes) -> bytes:
@@ -169,7 +161,7 @@ def with_checksum(data: bytes) -> bytes:
     ids=["a huge count", "a huge length", "no UTF-8", "nothing"],
 )
 def test_texts_that_cannot_be_are_refused_before_they_take_memory(
-    data: bytes, store: Path, study: Study, threads: Client
+    data: bytes, store: Path, mended: Callable[..., None]
 ) -> None:
     (store / "records/record/c/2").write_bytes(with_checksum(data))
     (store / "meshes/name/c/0").write_bytes(with_checksum(data))
@@ -179,8 +171,7 @@ def test_texts_that_cannot_be_are_refused_before_they_take_memory(
     assert status(store).lost_records == ("ico/2",)
     assert list(verify(store).fields) == ["ico/2"]
     (store / "records/record/c/2").write_bytes(with_checksum(data))
-    assert run(study, store, threads).computed == ("ico/2",)
-    assert verify(store).is_sound
+    mended("ico/2")
 
 
 def test_files_larger_than_any_memory_are_named_and_made_again(store: Path, study: Study, threads: Client) -> None:

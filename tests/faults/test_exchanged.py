@@ -15,7 +15,7 @@ from sobolev_batch import DamageError, Study, open_store, run, status, table, ve
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.store_accessor import StoreAccessor
 from tests.faults.conftest import FIELD
-from tests.support.stores import assert_same_results, contents
+from tests.support.stores import contents
 from tests.support.studies import small_table, variable
 
 RECORD = "records/record/c/{row}"
@@ -53,13 +53,6 @@ def restore(store: Path, earlier: Path, *names: str) -> None:
             shutil.copyfile(source, target)
 
 
-def assert_mended(store: Path, study: Study, right: Path, client: Client, *computed: str) -> None:
-    assert sorted(run(study, store, client).computed) == sorted(computed)
-    assert verify(store).is_sound
-    assert status(store).lost_records == ()
-    assert_same_results(store, right)
-
-
 def relabel(store: Path) -> None:
     """Write labels in another order. The keys in the records say which field is whose."""
     there = Store.open(store)
@@ -84,19 +77,20 @@ def trade(store: Path) -> None:
     ],
 )
 def test_what_is_in_another_place_or_of_an_earlier_state_is_named_and_mended(
-    change: Callable[[Path, Path], None], labels: tuple[str, ...],
-    store: Path, study: Study, earlier: Path, finished_store: Path, threads: Client,
-) -> None:  # fmt: skip
+    change: Callable[[Path, Path], None],
+    labels: tuple[str, ...],
+    store: Path,
+    earlier: Path,
+    mended: Callable[..., None],
+) -> None:
     change(store, earlier)
     found = verify(store)
     assert tuple(found.fields) == labels
     assert labels or found.tables
-    assert_mended(store, study, finished_store, threads, *labels)
+    mended(*labels)
 
 
-def test_an_earlier_field_with_its_record(
-    store: Path, study: Study, earlier: Path, finished_store: Path, threads: Client
-) -> None:
+def test_an_earlier_field_with_its_record(store: Path, earlier: Path, mended: Callable[..., None]) -> None:
     restore(store, earlier, FIELD.format(row=1), RECORD.format(row=1))
     assert list(verify(store).fields) == ["ico/1"]
     restore(store, earlier, FIELD.format(row=1), RECORD.format(row=1))
@@ -108,22 +102,22 @@ def test_an_earlier_field_with_its_record(
     with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
         fields.distance("ico/1", "reference", -3.0)
     assert fields.norm("ico/2", -3.0)["norm"] > 0
-    assert_mended(store, study, finished_store, threads, "ico/1")
+    mended("ico/1")
 
 
 def test_earlier_tables_and_root_with_newer_fields(
-    store: Path, study: Study, earlier: Path, finished_store: Path, threads: Client
+    store: Path, earlier: Path, finished_store: Path, mended: Callable[..., None]
 ) -> None:
     restore(store, earlier, "zarr.json", "meshes", "norms", "distances", "convergence", "fourier/quality")
     found = verify(store)
     assert len(found.fields) == 5
     assert "fourier/quality" in found.tables
     restore(store, finished_store, "records/record")
-    assert_mended(store, study, finished_store, threads)
+    mended()
 
 
 @pytest.mark.parametrize("name", ["meshes/area", "fourier/fourier", "records"])
-def test_metadata_of_one_node(name: str, store: Path, study: Study, finished_store: Path, threads: Client) -> None:
+def test_metadata_of_one_node(name: str, store: Path, mended: Callable[..., None]) -> None:
     path = store / name / "zarr.json"
     content = path.read_bytes()
     other = json.dumps({**json.loads(content), "node_type": "x"}).encode()
@@ -132,7 +126,7 @@ def test_metadata_of_one_node(name: str, store: Path, study: Study, finished_sto
         if damaged is not None:
             path.write_bytes(damaged)
         assert set(verify(store).tables) == {"records" if name == "records" else "zarr.json"}, damaged
-    assert_mended(store, study, finished_store, threads)
+    mended()
 
 
 def alter(store: Path, *place: str, value: object) -> None:
@@ -155,12 +149,12 @@ def alter(store: Path, *place: str, value: object) -> None:
     ],
 )
 def test_metadata_at_the_root_that_were_altered(
-    place: tuple[str, ...], value: object, store: Path, study: Study, finished_store: Path, threads: Client
+    place: tuple[str, ...], value: object, store: Path, finished_store: Path, mended: Callable[..., None]
 ) -> None:
     alter(store, *place, value=value)
     assert not verify(store).is_sound
     restore(store, finished_store, "records/record")
-    assert_mended(store, study, finished_store, threads)
+    mended()
 
 
 @pytest.mark.parametrize(
@@ -179,7 +173,7 @@ def test_metadata_that_make_no_sense_are_damage(name: str, value: object, store:
         open_store(store)["meshes"].to_dataset().load()
 
 
-def test_a_root_that_cannot_be_read(store: Path, study: Study, finished_store: Path, threads: Client) -> None:
+def test_a_root_that_cannot_be_read(store: Path, study: Study, threads: Client, mended: Callable[..., None]) -> None:
     text = (store / "zarr.json").read_bytes()
     (store / "zarr.json").write_bytes(text[: len(text) // 2])
     for use in (open_store, status, verify):
@@ -190,7 +184,7 @@ def test_a_root_that_cannot_be_read(store: Path, study: Study, finished_store: P
     with pytest.raises(DamageError, match="no field of this study is found in the store"):
         run(other, store, threads)
     assert contents(store) == before
-    assert_mended(store, study, finished_store, threads)
+    mended()
 
 
 def test_the_record_of_a_run_that_was_altered(store: Path, study: Study, threads: Client) -> None:

@@ -13,35 +13,28 @@ import psutil
 import pytest
 
 from sobolev_batch.batch.storage.lock import LOCK_KEY
-from tests.support.commands import call, read_until, started, write_toml
+from tests.support.commands import call, finished, read_until, started, write_toml
 from tests.support.processes import PATIENCE_SECONDS, wait_until
 
-SIGNALS = pytest.mark.parametrize(
-    ("number", "status", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
-)
+WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 @pytest.mark.parametrize(
-    ("line", "number", "status", "words"),
+    ("line", "number"),
     [
-        pytest.param(line, number, 128 + number, f"{word}; the same command continues", marks=marks)
-        for line, number, word, marks in [
-            ("[2/5]", signal.SIGINT, "interrupted", pytest.mark.process),
-            ("dashboard:", signal.SIGINT, "interrupted", pytest.mark.all),
-            ("[5/5]", signal.SIGINT, "interrupted", pytest.mark.all),
-            ("[2/5]", signal.SIGTERM, "terminated", pytest.mark.all),
-        ]
+        ("[2/5]", signal.SIGINT),
+        pytest.param("dashboard:", signal.SIGINT, marks=pytest.mark.all),
+        pytest.param("[5/5]", signal.SIGINT, marks=pytest.mark.all),
+        pytest.param("[2/5]", signal.SIGTERM, marks=pytest.mark.all),
     ],
 )
-def test_a_run_ends_and_goes_on(
-    line: str, number: int, status: int, words: str, store_path: Path, tmp_path: Path
-) -> None:
+def test_a_run_ends_and_goes_on(line: str, number: int, store_path: Path, tmp_path: Path) -> None:
     study = write_toml(tmp_path)
     with started("run", study, "--store", store_path, "--workers", "2") as process:
         before = read_until(process, line)
         _, rest = interrupted(process, number)
-    assert process.returncode == status, rest
-    assert rest.splitlines()[-1].startswith(words)
+    assert process.returncode == 128 + number, rest
+    assert rest.splitlines()[-1].startswith(f"{WORDS[number]}; the same command continues")
     assert "Traceback" not in before + rest
     assert not (store_path / LOCK_KEY).exists()
     again = call("run", study, "--store", store_path, "--workers", "1")
@@ -69,7 +62,7 @@ if __name__ == "__main__":
 @pytest.mark.all
 def test_the_last_word_is_that_of_the_command() -> None:
     # Of a local cluster, semaphores may be left.
-    done = subprocess.run([sys.executable, "-c", SEMAPHORE_LEFT], capture_output=True, text=True, check=False)
+    done = finished(sys.executable, "-c", SEMAPHORE_LEFT)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
@@ -109,20 +102,16 @@ line.main()
 
 @pytest.mark.all
 @pytest.mark.parametrize(("script", "line"), [(IMPORTING, "here"), (COMPUTING, "computes")])
-@SIGNALS
-def test_a_command_ends_while_it_starts_and_while_a_library_computes(
-    script: str, line: str, number: int, status: int, word: str
-) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    assert read_until(process, line)
-    if script == COMPUTING:
-        wait_until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_SLEEPING)
-    else:
-        word = "interrupted before anything began"
-    _, rest = interrupted(process, number)
-    assert (process.returncode, rest) == (status, f"{word}\n")
+@pytest.mark.parametrize("number", WORDS)
+def test_a_command_ends_while_it_starts_and_while_a_library_computes(script: str, line: str, number: int) -> None:
+    word = "interrupted before anything began"
+    with started(script=script) as process:
+        assert read_until(process, line)
+        if script == COMPUTING:
+            wait_until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_SLEEPING)
+            word = WORDS[number]
+        _, rest = interrupted(process, number)
+    assert (process.returncode, rest) == (128 + number, f"{word}\n")
 
 
 # Work that keeps what it has is asked again for each part that takes long, and is not killed.
@@ -151,14 +140,11 @@ line.main()
 
 
 @pytest.mark.all
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", WORDS)
 def test_work_that_keeps_what_it_has_is_asked_again_and_not_killed(number: int) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", KEEPING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert read_until(process, "works")
-    process.send_signal(number)
-    output, rest = process.communicate(timeout=PATIENCE_SECONDS)
+    with started(script=KEEPING) as process:
+        assert read_until(process, "works")
+        output, rest = interrupted(process, number)
     assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
 
 

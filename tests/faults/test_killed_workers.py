@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,29 +11,23 @@ from distributed import Client
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.store.store import Store
-from tests.faults.fatal import Moment, fatal
-from tests.support.commands import write_toml
+from tests.faults.conftest import LABELS
+from tests.faults.fatal import Moment
+from tests.support.commands import command, write_toml
 from tests.support.stores import assert_same_results
 from tests.support.studies import variable
-
-LABELS = ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
 
 
 @pytest.mark.parametrize(
     "what", ["record", *(pytest.param(what, marks=pytest.mark.all) for what in ("field", "rename", "recorded"))]
 )
 def test_the_result_is_that_of_a_clean_run(
-    what: str,
-    study: Study,
-    store_path: Path,
-    finished_store: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    threads: Client,
+    what: str, study: Study, store_path: Path, finished_store: Path, strike: Callable[..., Moment], threads: Client
 ) -> None:
-    with fatal(monkeypatch, Moment(what, 2, str(tmp_path / "deaths"))) as moment, local_client(2) as client:
+    moment = strike(what, 2)
+    with local_client(2) as client:
         summary = run(study, store_path, client)
-    assert moment.deaths == 1
+    assert len(moment.pids) == 1
     assert (summary.computed, summary.failed) == (LABELS, {})
     assert_same_results(store_path, finished_store)
     strays = list(store_path.rglob("*.partial"))
@@ -46,23 +39,13 @@ def test_the_result_is_that_of_a_clean_run(
 
 @pytest.mark.all
 def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
-    study: Study,
-    store_path: Path,
-    finished_store: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    threads: Client,
+    study: Study, store_path: Path, finished_store: Path, tmp_path: Path, strike: Callable[..., Moment], threads: Client
 ) -> None:
-    with fatal(monkeypatch, Moment("field", 2, str(tmp_path / "deaths"), times=99)) as moment:
-        done = subprocess.run(
-            [sys.executable, "-c", COMMAND, str(write_toml(tmp_path)), str(store_path)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+    moment = strike("field", 2, times=99)
+    done = command("run", write_toml(tmp_path), "--store", store_path, "--workers", "2")
     assert done.returncode == 3, done.stderr
     # Twice beside others, twice alone.
-    assert moment.deaths == 4
+    assert len(moment.pids) == 4
     assert "ico/2 is failed: its tasks ended the worker that they ran on again and again" in done.stdout
     assert "Traceback" not in done.stderr
     records = Store.open(store_path).records()
@@ -71,16 +54,3 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
     # Without what kills its workers, it is computed and nothing else is.
     assert run(study, store_path, threads).computed == ("ico/2",)
     assert_same_results(store_path, finished_store)
-
-
-# Dask's configuration is this process's own; what the command inherits is the environment.
-COMMAND = """
-import sys
-import dask
-from tests.faults import fatal
-dask.config.set({"distributed.worker.preload": [fatal.__file__]})
-sys.argv = ["sobolev-batch", "run", sys.argv[1], "--store", sys.argv[2], "--workers", "2"]
-if __name__ == "__main__":
-    from sobolev_batch.__main__ import main
-    main()
-"""

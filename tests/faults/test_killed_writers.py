@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from sobolev_batch import Study
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
+from tests.support.commands import finished
 from tests.support.processes import PATIENCE_SECONDS
 from tests.support.studies import small_table
 
@@ -23,13 +23,7 @@ KILLS = 20
 
 def outcome(script: str, store: Path) -> Any:
     """What a script prints that kills children of its own: they start within milliseconds, without imports."""
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(store)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_SECONDS,
-        check=False,
-    )
+    done = finished(sys.executable, "-c", script, store, timeout=PATIENCE_SECONDS)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

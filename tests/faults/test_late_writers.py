@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from sobolev_batch import LockError, Mesh, Study, run, verify, write_mesh
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
-from tests.faults.fatal import Moment, fatal
+from tests.faults.fatal import Moment
 from tests.support.commands import TOML
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
@@ -44,25 +45,21 @@ def write_part(folder: Path, shift: float) -> None:
 @pytest.mark.all
 @pytest.mark.parametrize("what", ["field", "rename", "record"])
 def test_a_worker_that_goes_on_after_another_run_writes_nothing(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: str, tmp_path: Path, strike: Callable[..., Moment]
 ) -> None:
     """Its worker is stopped, its driver killed, the mesh changed, another run done, and the worker continued."""
     study, store, undisturbed = tmp_path / "study.toml", tmp_path / "store.zarr", tmp_path / "undisturbed.zarr"
     family = '[[family]]\nname = "file"\nsource = "files"\npaths = ["part.ply"]\n'
     study.write_text(TOML.partition("[[family]]")[0] + family)
     write_part(tmp_path, 0.0)
-    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", str(Path(__file__).with_name("fatal.py")))
-    with (
-        fatal(monkeypatch, Moment(what, 0, str(tmp_path / "stops"), number=signal.SIGSTOP)) as moment,
-        tcp_cluster([]) as (address, (_, worker)),
-    ):
+    moment = strike(what, 0, number=signal.SIGSTOP)
+    with tcp_cluster([]) as (address, (_, worker)):
         driver = subprocess.Popen([sys.executable, "-c", DRIVER, address, str(study), str(store)])
-        wait_until(lambda: moment.pids and _is_stopped(worker.pid))
+        wait_until(lambda: moment.pids and psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED)
         assert driver.poll() is None
         driver.kill()
         driver.wait()
         write_part(tmp_path, SHIFT)
-        monkeypatch.delenv("DASK_DISTRIBUTED__WORKER__PRELOAD")
         assert run(Study.from_toml(study), store, workers=1).failed == {}
         before = contents(store)
         os.kill(worker.pid, signal.SIGCONT)
@@ -86,7 +83,3 @@ def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store
         with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
             Store(location.fenced(Lock.of_this_process().fence)).write_record(0, record)
     assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
-
-
-def _is_stopped(pid: int) -> bool:
-    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)

@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 from selenium import webdriver
+from selenium.webdriver.support.wait import WebDriverWait
 
 _FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 )
-# Its own pages and extensions; what a page asks for has another scheme.
-_INTERNAL = ("chrome", "devtools")
 
 
 class Browser:
@@ -26,19 +25,15 @@ class Browser:
     def __init__(self, driver: Any) -> None:
         self.driver = driver
 
-    def open(self, path: Path, *, width: int = 1100, height: int = 800, dark: bool = False) -> None:
+    def open(self, path: Path, *, width: int = 1100, height: int = 800) -> None:
         """Load a page and wait for its pictures."""
         self.command(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
         )
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.command("Emulation.setEmulatedMedia", features=[scheme])
         self.driver.get(path.as_uri())
 
     def wait(self, expression: str) -> None:
         """Until an expression is true: pages answer events in their own time."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         WebDriverWait(self.driver, 20, 0.05).until(lambda _: self.tell(expression))
 
     def command(self, name: str, **arguments: Any) -> Any:
@@ -51,12 +46,8 @@ class Browser:
 
     def texts(self, selector: str) -> list[str]:
         """The text of each element that is shown."""
-        return list(
-            self.tell(
-                f"[...document.querySelectorAll({json.dumps(selector)})].filter(e => e.offsetParent)"
-                ".map(e => e.innerText.trim())"
-            )
-        )
+        shown = f"[...document.querySelectorAll({json.dumps(selector)})].filter(e => e.offsetParent)"
+        return list(self.tell(f"{shown}.map(e => e.innerText.trim())"))
 
     def open_report(self, path: Path, *, width: int = 1100) -> None:
         """Load the page of a report and wait for its charts."""
@@ -75,8 +66,6 @@ class Browser:
 
     def download_tables(self, folder: Path) -> set[str]:
         """Click the CSV button of every table, and return the names of the files that come into a folder."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         self.command("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
         count = self.tell("document.querySelectorAll('button.csv').length")
         self.driver.execute_script("document.querySelectorAll('button.csv').forEach(button => button.click())")
@@ -91,7 +80,8 @@ class Browser:
         """The addresses that pages asked for since the last call, but for data within the page itself."""
         events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
         urls = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
-        return [url for url in urls if not url.startswith(("data:", "blob:", *_INTERNAL))]
+        # Those of the browser's own pages and extensions have schemes of their own.
+        return [url for url in urls if not url.startswith(("data:", "blob:", "chrome", "devtools"))]
 
 
 @contextmanager

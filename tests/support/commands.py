@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -68,28 +69,22 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
     return subprocess.CompletedProcess(sys.argv, end.value.code, output.getvalue(), errors.getvalue())
 
 
+def finished(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run any program to its end."""
+    return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
+
+
 def command(*arguments: object, folder: Path = Path(), **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a command to its end as a process, as users do: for exit statuses, logs and settings of a process."""
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        check=False,
-        env={**os.environ, **environment},
-    )
+    return finished(*COMMAND, *arguments, cwd=folder, env={**os.environ, **environment})
 
 
 @contextmanager
-def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run a command in a session of its own, as in a terminal of its own."""
-    process = subprocess.Popen(
-        [*COMMAND, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+def started(*arguments: object, script: str | None = None) -> Iterator[subprocess.Popen[str]]:
+    """Run a command, or a script, in a session of its own, as in a terminal of its own."""
+    words = [*COMMAND, *map(str, arguments)] if script is None else [sys.executable, "-c", script]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
     try:
         yield process
     finally:

@@ -43,15 +43,6 @@ _INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
 _GIFTI = gifti(BOX_VERTICES, _INT_TRIANGLES)
 
 
-def _file(ending: str, content: bytes | Callable[[], bytes]) -> Attack:
-    def write(folder: Path) -> Path:
-        path = folder / f"scan{ending}"
-        path.write_bytes(content() if callable(content) else content)
-        return path
-
-    return write
-
-
 def _special(ending: str, make: Callable[[Path], object]) -> Attack:
     def write(folder: Path) -> Path:
         path = folder / f"scan{ending}"
@@ -59,6 +50,14 @@ def _special(ending: str, make: Callable[[Path], object]) -> Attack:
         return path
 
     return write
+
+
+def _file(ending: str, content: bytes | Callable[[], bytes]) -> Attack:
+    return _special(ending, lambda path: path.write_bytes(content() if callable(content) else content))
+
+
+def _link(ending: str, target: str) -> Attack:
+    return _special(ending, lambda path: path.symlink_to(target))
 
 
 def _ply_header(*lines: str, encoding: str = LITTLE) -> bytes:
@@ -73,6 +72,10 @@ def _lying_list(kind: str, length: bytes, items: str = "double") -> bytes:
     """A binary PLY file whose one face says that it has so many corners."""
     header = _ply_header(*_vertices(3), "element face 1", f"property list {kind} {items} vertex_indices")
     return header + bytes(36) + length + bytes(64)
+
+
+def _real_faces(face: list[float]) -> bytes:
+    return ply(BOX_VERTICES, [face], LITTLE, index="float")  # type: ignore[list-item]
 
 
 def _wide_rows(encoding: str, kind: str) -> bytes:
@@ -190,18 +193,16 @@ def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
     return content.replace(old, new, 1)
 
 
+_OBJ, _OFF, _PLY = obj(BOX_VERTICES, BOX_TRIANGLES), off(BOX_VERTICES, BOX_TRIANGLES), ply(BOX_VERTICES, BOX_TRIANGLES)
 _DIGITS = b"9" * 5000
 _FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial")
 
 ATTACKS: dict[str, Attack] = {
     # What is no file.
     **{f"FIFO {ending}": _special(ending, os.mkfifo) for ending in (*_FORMATS, ".ply.gz")},
-    **{
-        f"endless device {ending}": _special(ending, lambda path: path.symlink_to("/dev/zero"))
-        for ending in (*_FORMATS, ".ply.gz")
-    },
-    "terminal": _special(".ply", lambda path: path.symlink_to("/dev/tty")),
-    "link to itself": _special(".ply", lambda path: path.symlink_to(path)),
+    **{f"endless device {ending}": _link(ending, "/dev/zero") for ending in (*_FORMATS, ".ply.gz")},
+    "terminal": _link(".ply", "/dev/tty"),
+    "link to itself": _link(".ply", "scan.ply"),
     "NUL in the name": lambda folder: folder / "a\0b.ply",
     "name too long": lambda folder: folder / f"{'x' * 300}.ply",
     # Packed.
@@ -215,19 +216,17 @@ ATTACKS: dict[str, Attack] = {
     **{f"newlines {ending}": _file(ending, b"\n" * 2 * _MEGABYTE) for ending in _FORMATS},
     "obj, face of many corners": _file(".obj", b"v 0 0 0\nv 1 0 0\nf" + b" 1" * _MEGABYTE + b" 0\n"),
     "obj, continued lines": _file(".obj", b"v 0 0 0\nf 1 \\\n" + b"1 \\\n" * 500_000),
-    "obj, long index": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 " + _DIGITS + b"\n"),
-    "obj, long index of few digits": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 " + b"9" * 4000 + b"\n"),
-    "obj, huge index": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"f 1 2 9223372036854775808\n"),
+    "obj, long index": _file(".obj", _OBJ + b"f 1 2 " + _DIGITS + b"\n"),
+    "obj, long index of few digits": _file(".obj", _OBJ + b"f 1 2 " + b"9" * 4000 + b"\n"),
+    "obj, huge index": _file(".obj", _OBJ + b"f 1 2 9223372036854775808\n"),
     "obj, huge coordinate": _file(".obj", obj(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
-    "obj, overflowing coordinate": _file(".obj", obj(BOX_VERTICES, BOX_TRIANGLES) + b"v 1e999 0 0\n"),
+    "obj, overflowing coordinate": _file(".obj", _OBJ + b"v 1e999 0 0\n"),
     "obj, long coordinate": _file(".obj", b"v " + _DIGITS + b" 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj, one wide character": _file(".obj", "\U0001f600\n".encode() + b"#" * 2 * _MEGABYTE),
     "off, long counts": _file(".off", b"OFF\n" + _DIGITS + b" 1 0\n0 0 0\n3 0 0 0\n"),
     "off, other digits": _file(".off", "OFF\n² 1 0\n0 0 0\n".encode()),
-    "off, long length": _file(".off", off(BOX_VERTICES, BOX_TRIANGLES).replace(b"3 4 6 7", b"9" * 4000 + b" 4 6 7")),
-    "off, huge index": _file(
-        ".off", _changed(off(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 99999999999999999999")
-    ),
+    "off, long length": _file(".off", _OFF.replace(b"3 4 6 7", b"9" * 4000 + b" 4 6 7")),
+    "off, huge index": _file(".off", _changed(_OFF, b"3 4 6 7", b"3 4 6 99999999999999999999")),
     "stl ascii, long name": _file(".stl", stl_text(BOX_VERTICES * 1e300, BOX_TRIANGLES, "x" * _MEGABYTE)),
     "stl ascii, unknown long word": _file(".stl", b"solid\n" + b"y" * _MEGABYTE),
     "stl, huge coordinates": _file(".stl", stl_binary(BOX_VERTICES * 1e37, BOX_TRIANGLES, count=13)),
@@ -258,17 +257,9 @@ ATTACKS: dict[str, Attack] = {
     "ply, long name": _file(".ply", _ply_header(*_vertices(3), "element face 1", f"element {'e' * 60_000} 1")),
     "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0"), 1 << 40),
     "ply ascii, float overflow": _file(".ply", ply(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
-    "ply ascii, index that overflows": _file(
-        ".ply", _changed(ply(BOX_VERTICES, BOX_TRIANGLES), b"3 4 6 7", b"3 4 6 99999999999")
-    ),
-    "ply, indices with fractions": _file(
-        ".ply",
-        ply(BOX_VERTICES, [[0, 1, 2.5]], LITTLE, index="float"),  # type: ignore[list-item]
-    ),
-    "ply, indices that are NaN": _file(
-        ".ply",
-        ply(BOX_VERTICES, [[0, 1, float("nan")]], LITTLE, index="float"),  # type: ignore[list-item]
-    ),
+    "ply ascii, index that overflows": _file(".ply", _changed(_PLY, b"3 4 6 7", b"3 4 6 99999999999")),
+    "ply, indices with fractions": _file(".ply", _real_faces([0, 1, 2.5])),
+    "ply, indices that are NaN": _file(".ply", _real_faces([0, 1, float("nan")])),
     # glTF.
     "gltf, deep lists": _file(".gltf", b"[" * 200_000),
     "gltf, deep objects": _file(".gltf", b'{"a":' * 200_000),
@@ -302,8 +293,7 @@ ATTACKS: dict[str, Attack] = {
     # GIFTI.
     "gifti, a billion laughs": _file(".gii", _entities(10, "&a{};")),
     "gifti, quadratic entities": _file(
-        ".gii",
-        b'<!DOCTYPE GIFTI [<!ENTITY a "' + b"a" * 50_000 + b'">]><GIFTI>' + b"&a;" * 50_000 + b"</GIFTI>",
+        ".gii", b'<!DOCTYPE GIFTI [<!ENTITY a "' + b"a" * 50_000 + b'">]><GIFTI>' + b"&a;" * 50_000 + b"</GIFTI>"
     ),
     "gifti, entity of a file": _file(
         ".gii", b'<!DOCTYPE GIFTI [<!ENTITY a SYSTEM "file:///etc/hostname">]>' + _gifti_data(b"&a;")[21:]

@@ -156,17 +156,12 @@ class Gltf:
         """Append values to the buffer, and return the index of their accessor."""
         array = np.ascontiguousarray(values, dtype=dtype)
         self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.blob), "byteLength": array.nbytes})
-        self.tree["accessors"].append(
-            {
-                "bufferView": len(self.tree["bufferViews"]) - 1,
-                "componentType": _COMPONENTS[dtype],
-                "count": len(array),
-                "type": kind,
-            }
-        )
+        place = len(self.tree["accessors"])
+        accessor = {"bufferView": place, "componentType": _COMPONENTS[dtype], "count": len(array), "type": kind}
+        self.tree["accessors"].append(accessor)
         self.blob += array.tobytes()
         self.blob += bytes(-len(self.blob) % 4)
-        return len(self.tree["accessors"]) - 1
+        return place
 
     def _primitive(
         self, vertices: ArrayLike, indices: ArrayLike | None, mode: int | None, real: str, index: str
@@ -184,13 +179,8 @@ class Gltf:
         document = json.dumps(self.tree).encode()
         document += b" " * (-len(document) % 4)
         length = 12 + 8 + len(document) + 8 + len(self.blob)
-        return (
-            struct.pack("<4sII", b"glTF", 2, length)
-            + struct.pack("<I4s", len(document), b"JSON")
-            + document
-            + struct.pack("<I4s", len(self.blob), b"BIN\0")
-            + self.blob
-        )
+        head = struct.pack("<4sIII4s", b"glTF", 2, length, len(document), b"JSON")
+        return head + document + struct.pack("<I4s", len(self.blob), b"BIN\0") + self.blob
 
     def gltf(self, uri: str | None = None) -> bytes:
         """Return the JSON form; the buffer is embedded, or in the file that ``uri`` names."""
@@ -208,35 +198,23 @@ def gifti(
     points: int = 1,
 ) -> bytes:
     """Return a GIFTI file with several point sets."""
+    settings = {"encoding": encoding, "ordering": ordering}
     arrays = []
     if vertices is not None:
-        arrays += [
-            GiftiDataArray(
-                np.asarray(vertices, dtype=np.float32),
-                intent="NIFTI_INTENT_POINTSET",
-                encoding=encoding,
-                ordering=ordering,
-            )
-        ] * points
+        places = np.asarray(vertices, dtype=np.float32)
+        arrays += [GiftiDataArray(places, intent="NIFTI_INTENT_POINTSET", **settings)] * points
     if faces is not None:
-        arrays.append(
-            GiftiDataArray(np.asarray(faces), intent="NIFTI_INTENT_TRIANGLE", encoding=encoding, ordering=ordering)
-        )
+        arrays.append(GiftiDataArray(np.asarray(faces), intent="NIFTI_INTENT_TRIANGLE", **settings))
     return bytes(nibabel.GiftiImage(darrays=arrays).to_bytes())
 
 
 def freesurfer(
-    vertices: ArrayLike,
-    triangles: ArrayLike,
-    volume: bytes = b"",
-    *,
-    counts: tuple[int, int] | None = None,
+    vertices: ArrayLike, triangles: ArrayLike, volume: bytes = b"", *, counts: tuple[int, int] | None = None
 ) -> bytes:
     """Return a surface of FreeSurfer's."""
     rows, corners = np.asarray(vertices), np.asarray(triangles)
-    header = b"\xff\xff\xfecreated by somebody on a Monday\n\n" + struct.pack(
-        ">2i", *(counts or (len(rows), len(corners)))
-    )
+    header = b"\xff\xff\xfecreated by somebody on a Monday\n\n"
+    header += struct.pack(">2i", *(counts or (len(rows), len(corners))))
     return header + rows.astype(">f4").tobytes() + corners.astype(">i4").tobytes() + volume
 
 

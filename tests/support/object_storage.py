@@ -10,9 +10,9 @@ import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import fsspec
 import pytest
@@ -44,14 +44,14 @@ class Rule:
         rate: Probability of a failure.
         kinds: Kinds of failures, the rarest first. Only answers to GET can be truncated, and only keys that are to be
             removed can be kept, in an otherwise good answer.
-        methods: Methods that may fail; all if empty.
+        method: Method that may fail; all if empty.
         most: Number of failures after which nothing fails any more.
         part: Text in the path and query of requests that may fail.
     """
 
     rate: float
     kinds: tuple[Kind, ...] = KINDS
-    methods: frozenset[str] = frozenset()
+    method: str = ""
     most: int | None = None
     part: str = ""
 
@@ -60,18 +60,7 @@ HEALTHY = Rule(0.0)
 GONE = Rule(1.0, ("error",))
 
 
-@dataclass(frozen=True)
-class Turn:
-    """Change of the rule, at the given number of requests with a method and a text in their path."""
-
-    method: str
-    part: str
-    number: int
-    rule: Rule
-
-
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """A request, and its failure, if any."""
 
     method: str
@@ -97,19 +86,14 @@ class Server:
         self._moto = DomainDispatcherApplication(create_backend_app)
         self._random = random.Random(seed)
         self._rule = HEALTHY
-        self._turn: Turn | None = None
+        self._turn: list[tuple[str, str, Rule]] = []
         self._failed: Counter[Kind] = Counter()
         self._requests: list[Request] = []
         self._lock, self._conditional = threading.Lock(), threading.Lock()
-        self._http = make_server("127.0.0.1", 0, self._answer, threaded=True, request_handler=_handler())
-        self.url = f"http://127.0.0.1:{self._http.server_port}"
-        threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        self.http = make_server("127.0.0.1", 0, self._answer, threaded=True, request_handler=_handler())
+        self.url = f"http://127.0.0.1:{self.http.server_port}"
+        threading.Thread(target=self.http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
         self.client().create_bucket(Bucket=BUCKET)
-
-    def stop(self) -> None:
-        """Answer no more."""
-        self._http.shutdown()
-        self._http.server_close()
 
     @property
     def rule(self) -> Rule:
@@ -121,10 +105,10 @@ class Server:
         with self._lock:
             self._rule, self._failed = rule, Counter()
 
-    def await_turn(self, turn: Turn) -> None:
-        """Replace the rule at a request to come."""
+    def await_turn(self, method: str, part: str, number: int, rule: Rule) -> None:
+        """Replace the rule at the given number of requests to come with a method and a text in their path."""
         with self._lock:
-            self._turn = turn
+            self._turn = [(method, part, rule)] * number
 
     def requests(self) -> tuple[Request, ...]:
         """Return all requests so far, in order."""
@@ -197,11 +181,10 @@ class Server:
     def _draw(self, method: str, path: str) -> Kind | None:
         """Return the kind of failure of a new request, if it is to fail."""
         with self._lock:
-            turn = self._turn
-            if turn and turn.method == method and turn.part in path:
-                self._turn = replace(turn, number=turn.number - 1) if turn.number > 1 else None
-                if self._turn is None:
-                    self._rule, self._failed = turn.rule, Counter()
+            if self._turn and self._turn[0][0] == method and self._turn[0][1] in path:
+                *_, rule = self._turn.pop()
+                if not self._turn:
+                    self._rule, self._failed = rule, Counter()
             kind = self._drawn(method, path)
             self._requests.append(Request(method, path, kind))
             return kind
@@ -210,7 +193,7 @@ class Server:
         rule = self._rule
         possible = {"truncated": method == "GET", "kept": method == "POST" and path.endswith("?delete")}
         kinds = [kind for kind in rule.kinds if possible.get(kind, True)]
-        concerned = (not rule.methods or method in rule.methods) and rule.part in path
+        concerned = rule.method in ("", method) and rule.part in path
         if not kinds or not concerned or self._failed.total() == rule.most or self._random.random() >= rule.rate:
             return None
         kind = min(kinds, key=self._failed.__getitem__)
@@ -266,4 +249,5 @@ def serving(seed: int = 0) -> Iterator[Server]:
     try:
         yield server
     finally:
-        server.stop()
+        server.http.shutdown()
+        server.http.server_close()

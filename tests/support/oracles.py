@@ -18,14 +18,8 @@ def torus_value(R: float, r: float, across: float, along: float) -> float:
 
     def ring(v: float) -> float:
         radius = R + r * math.cos(v)
-        return (
-            r
-            * radius
-            * 2
-            * math.pi
-            * float(j0(2 * math.pi * across * radius))
-            * math.cos(2 * math.pi * along * r * math.sin(v))
-        )
+        length = 2 * math.pi * radius * float(j0(2 * math.pi * across * radius))
+        return r * length * math.cos(2 * math.pi * along * r * math.sin(v))
 
     return 2 * integral(ring, 0.0, math.pi)
 
@@ -36,13 +30,8 @@ def spheroid_value(a: float, c: float, across: float, along: float) -> float:
     def ring(theta: float) -> float:
         sine, cosine = math.sin(theta), math.cos(theta)
         width = a * sine * math.hypot(a * cosine, c * sine)
-        return (
-            width
-            * 2
-            * math.pi
-            * float(j0(2 * math.pi * across * a * sine))
-            * math.cos(2 * math.pi * along * c * cosine)
-        )
+        length = 2 * math.pi * width * float(j0(2 * math.pi * across * a * sine))
+        return length * math.cos(2 * math.pi * along * c * cosine)
 
     return 2 * integral(ring, 0.0, math.pi / 2)
 

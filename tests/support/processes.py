@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TypeVar
 
 import dask as dask_settings
@@ -36,13 +34,9 @@ def wait_until(condition: Callable[[], T]) -> T:
     return value
 
 
-def dask(*arguments: str, found_first: Path | None = None) -> subprocess.Popen[str]:
-    """Start a process of Dask, which imports modules of a folder before installed ones."""
-    environment = {**os.environ}
-    if found_first is not None:
-        environment["PYTHONPATH"] = os.pathsep.join([str(found_first), *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "dask", *arguments]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=found_first)
+def dask(*arguments: str) -> subprocess.Popen[str]:
+    """Start a process of Dask."""
+    return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
 
 
 def stop(process: subprocess.Popen[str]) -> None:

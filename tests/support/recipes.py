@@ -7,8 +7,9 @@ import re
 import shlex
 import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 
-from tests.support.commands import TOML
+from tests.support.commands import TOML, finished
 from tests.support.repository import ROOT
 
 FOLDER = ROOT / "workflows" / "clusters"
@@ -34,10 +35,16 @@ def documented(beginning: str = "") -> list[list[str]]:
 
 
 def environment(home: Path, **variables: str) -> dict[str, str]:
-    """Return an environment with this checkout, the commands beside this interpreter and a home of its own."""
+    """Return an environment with this checkout, its recipes, the commands beside this interpreter and a home."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("DASK_", "SLURM_"))}
     path = os.pathsep.join([str(home / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
-    return {**kept, "PYTHONPATH": str(ROOT), "HOME": str(home), "PATH": path, "TMPDIR": str(home), **variables}
+    own = {"PYTHONPATH": f"{ROOT}{os.pathsep}{FOLDER}", "HOME": str(home), "PATH": path, "TMPDIR": str(home)}
+    return {**kept, **own, **variables}
+
+
+def run_recipe(folder: Path, *words: object, **variables: str) -> CompletedProcess[str]:
+    """Run a program to its end in a folder, which is its home too unless a variable names another one."""
+    return finished(*words, cwd=folder, env=environment(folder, **variables))
 
 
 def add_command(home: Path, name: str, script: str) -> None:

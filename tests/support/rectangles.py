@@ -166,9 +166,8 @@ def _heat_traces(
             pairs = x * y * z
             traces.append([signs @ pairs @ signs, pairs.sum()])
         else:
-            traces.append(
-                [np.vdot(grid, np.einsum("ai,bj,ck,ijk->abc", *factors, grid, optimize=True)) for grid in grids]
-            )
+            sums = (np.einsum("ai,bj,ck,ijk->abc", *factors, grid, optimize=True) for grid in grids)
+            traces.append([np.vdot(grid, inner) for grid, inner in zip(grids, sums, strict=True)])
     signed, positive = (np.pi / times) ** 1.5 * np.array(traces).T
     return signed, positive
 
@@ -183,10 +182,5 @@ def _axis_factors(a: Reals, b: Reals, rate: float) -> Reals:
         between = between + (1 if end != start else -1) * antiderivative
     from_flat = np.sqrt(np.pi) / (2 * rate) * (erf(rate * (b - a[:, None])) - erf(rate * (a - a[:, None])))
     both_flat = np.exp(-((rate * np.subtract.outer(a, a)) ** 2))
-    return np.asarray(
-        np.select(
-            [flat[:, None] & flat, flat[:, None] & ~flat, ~flat[:, None] & flat],
-            [both_flat, from_flat, from_flat.T],
-            between,
-        )
-    )
+    cases = [flat[:, None] & flat, flat[:, None] & ~flat, ~flat[:, None] & flat]
+    return np.asarray(np.select(cases, [both_flat, from_flat, from_flat.T], between))

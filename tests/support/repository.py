@@ -1,15 +1,20 @@
-"""The checkout that the tests run in: its pages, and what its modules import."""
+"""The checkout and the machine that the tests run on: pages, what modules import, what cannot be drawn."""
 
 from __future__ import annotations
 
 import ast
 import re
+import sys
+from ctypes.util import find_library
 from pathlib import Path
+from typing import Any
 
-import sobolev_batch
+from distributed import Client
+
+import sobolev_batch as sb
 
 ROOT = Path(__file__).parents[2]
-PACKAGE = Path(sobolev_batch.__file__).parent
+PACKAGE = Path(sb.__file__).parent
 
 
 def blocks(path: str, language: str) -> list[str]:
@@ -26,3 +31,31 @@ def imported(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             names.add(node.module or "")
     return names
+
+
+def run_icospheres(folder: Path, client: Client) -> sb.Study:
+    """Run workflows/icosphere.toml below a folder, with fewer levels on a smaller lattice."""
+    text = (ROOT / "workflows" / "icosphere.toml").read_text(encoding="utf-8")
+    small = text.replace("M = 128", "M = 48").replace("3, 4, 5, 6, 7]", "3]")
+    assert small.count("M = 48") == 1
+    for name in ("workflows", "storage"):
+        (folder / name).mkdir()
+    (folder / "workflows" / "icosphere.toml").write_text(small)
+    study = sb.Study.from_toml(folder / "workflows" / "icosphere.toml")
+    sb.run(study, folder / "storage" / "icosphere.zarr", client)
+    return study
+
+
+def run_blocks(path: str) -> dict[str, Any]:
+    """Run the Python blocks of a page one after the other; what they leave behind."""
+    found: dict[str, Any] = {}
+    for block in blocks(path, "python"):
+        exec(compile(block, path, "exec"), found)
+    return found
+
+
+def obstacle() -> str | None:
+    """Return what keeps VTK from drawing here, looked up without it; None where nothing does."""
+    if sys.platform == "linux" and find_library("EGL_mesa") is None and find_library("OSMesa") is None:
+        return "no OpenGL without a display: apt-get install libegl1 libgl1-mesa-dri libx11-6"
+    return None

@@ -1,27 +1,23 @@
-"""Small surfaces whose areas are known, and random ones."""
+"""Small surfaces whose areas are known, random ones, and parametrisations, which survive pickling."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from sobolev_batch import Mesh
+from sobolev_batch import Interval, Mesh, ParametrisedSurface, Torus
 
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # A box with sides of 1, 2 and 4, so that axes cannot be confused. Its coordinates are exact in single precision.
 BOX_VERTICES: Reals = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)], dtype=np.float64)
-BOX_QUADS: list[list[int]] = [
-    [0, 1, 3, 2],
-    [4, 6, 7, 5],
-    [0, 4, 5, 1],
-    [2, 3, 7, 6],
-    [0, 2, 6, 4],
-    [1, 5, 7, 3],
-]
+BOX_QUADS: list[list[int]] = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 BOX_TRIANGLES: list[list[int]] = [[q[0], q[i], q[i + 1]] for q in BOX_QUADS for i in (1, 2)]
 # Three sides of the box as quadrilaterals, three as pairs of triangles.
 BOX_MIXED: list[list[int]] = [*BOX_QUADS[:3], *BOX_TRIANGLES[6:]]
@@ -33,12 +29,8 @@ AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
 
 def mesh_counts(zero_area: int, duplicate: int, boundary: int, nonmanifold: int) -> dict[str, int]:
     """Return counts as `Mesh.counts` gives them."""
-    return {
-        "zero_area_triangles": zero_area,
-        "duplicate_triangles": duplicate,
-        "boundary_edges": boundary,
-        "nonmanifold_edges": nonmanifold,
-    }
+    names = ("zero_area_triangles", "duplicate_triangles", "boundary_edges", "nonmanifold_edges")
+    return dict(zip(names, (zero_area, duplicate, boundary, nonmanifold), strict=True))
 
 
 CLOSED = mesh_counts(0, 0, 0, 0)
@@ -81,3 +73,54 @@ CENTRED_BOX = Mesh(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
      [1, 5, 7], [1, 7, 3]],
 )  # fmt: skip
+
+HALF_TURN, TURN = Interval(0.0, math.pi), Interval(0.0, 2 * math.pi, periodic=True)
+# Neither an axis nor a diagonal stays where it is.
+ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+
+
+def ball(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
+    """The unit sphere in its two angles."""
+    return np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)
+
+
+def ball_derivatives(u: Reals, v: Reals) -> tuple[tuple[Reals, Reals, Reals], tuple[Reals, Reals, float]]:
+    """The derivatives of the unit sphere."""
+    along_u = np.cos(u) * np.cos(v), np.cos(u) * np.sin(v), -np.sin(u)
+    return along_u, (-np.sin(u) * np.sin(v), np.sin(u) * np.cos(v), 0.0)
+
+
+def plate(u: Reals, v: Reals) -> tuple[Reals, Reals, float]:
+    """A flat rectangle."""
+    return u, v, 0.0
+
+
+def roof(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
+    """Two flat halves that meet in a ridge."""
+    return u, v, -np.abs(u)
+
+
+def roof_derivatives(u: Reals, v: Reals) -> tuple[tuple[float, float, Reals], tuple[float, float, float]]:
+    """The derivatives of the roof; its area element is constant."""
+    return (1.0, 0.0, -np.sign(u)), (0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The points of a torus, turned about its centre."""
+
+    torus: Torus
+
+    def __call__(self, u: Reals, v: Reals) -> Reals:
+        """The positions (3, ...)."""
+        return np.asarray(np.tensordot(ROTATION, self.torus.positions(u, v), axes=1))
+
+
+def angular_ball(derivatives: bool) -> ParametrisedSurface:
+    """Return the unit sphere in its two angles."""
+    return ParametrisedSurface(ball, HALF_TURN, TURN, ball_derivatives if derivatives else None)
+
+
+def turned_torus(torus: Torus) -> ParametrisedSurface:
+    """Return a torus turned about its centre, without derivatives."""
+    return ParametrisedSurface(Turned(torus), TURN, TURN)

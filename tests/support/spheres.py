@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sobolev_batch import Mesh, Study, icosphere, run
+from sobolev_batch import Mesh, Study, icosphere, run, write_mesh
 
 RADIUS, CENTER = 40.0, np.array([10.0, -3.0, 5.0])
 # To the right of who looks at a picture of the witness.
@@ -22,20 +22,12 @@ def sphere(scale: float, shift: float = 0.0) -> Mesh:
     return Mesh(RADIUS * scale * ball.vertices + CENTER + RADIUS * shift * RIGHT, ball.triangles)
 
 
-def write(mesh: Mesh, path: Path) -> None:
-    lines = [
-        *(f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()),
-        *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.triangles),
-    ]
-    path.write_text("\n".join(lines))
-
-
 def make_study(folder: Path, place: str) -> None:
     """A sphere as the reference; a small one within it, one beside it, a larger one, and a file without a mesh."""
-    write(sphere(1.0), folder / "large.obj")
-    write(sphere(0.5), folder / f"{STRANGE}.obj")
-    write(sphere(1.0, shift=0.3), folder / "beside.obj")
-    write(sphere(1.1), folder / f"{LONG}.obj")
+    write_mesh(sphere(1.0), folder / "large.obj")
+    write_mesh(sphere(0.5), folder / f"{STRANGE}.obj")
+    write_mesh(sphere(1.0, shift=0.3), folder / "beside.obj")
+    write_mesh(sphere(1.1), folder / f"{LONG}.obj")
     (folder / "bad.obj").write_text("v 0 0 nan\n")
     names = (f"{STRANGE}.obj", "beside.obj", f"{LONG}.obj", "bad.obj")
     table = {

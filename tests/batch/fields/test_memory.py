@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 from sobolev_batch import ClusterError, Lattice
@@ -12,6 +15,7 @@ from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import fastest_spec, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
+from tests.support.commands import call, write_toml
 
 ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
 LARGE = Lattice(5.0, 512).split(1 << 24)
@@ -72,3 +76,19 @@ def test_what_fits_into_no_worker_is_refused_with_both_numbers(size: ExpectedSiz
 def test_a_block_that_fits_into_no_worker_is_refused() -> None:
     with pytest.raises(ClusterError, match=r"690\.5MB in one task, and no worker has more than 400\.0MB"):
         size_tasks(LARGE, TRANSFORM, ExpectedSize(), workers_with(0.4), rows=1)
+
+
+@pytest.mark.process
+def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_path: Path) -> None:
+    study = write_toml(tmp_path)
+    study.write_text(study.read_text().replace("M = 16", "M = 1024"))
+    arguments = "--store", tmp_path / "large.zarr", "--workers", "1", "--memory", "700MB"
+    done = call("run", study, *arguments)
+    assert done.returncode == 1
+    expected = r"it takes about 777\.6MB in one task, and no worker has more than 295\.0MB"
+    assert re.search(expected, " ".join(done.stderr.split())), done.stderr
+    assert "[1/5]" not in done.stderr
+    # Where they are, too large a lattice is a matter of how many blocks.
+    planned = call("plan", study, "--store", tmp_path / "large.zarr")
+    assert planned.returncode == 0, planned.stderr
+    assert "chunks of the lattice: " in planned.stdout

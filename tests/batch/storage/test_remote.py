@@ -33,7 +33,6 @@ from tests.support.object_storage import (
     Kind,
     Rule,
     Server,
-    Turn,
     serving,
     taken_for_s3,
 )
@@ -159,7 +158,7 @@ def test_a_study_on_storage_that_fails_now_and_then(served: Server, location: Lo
 @pytest.mark.parametrize(
     ("rule", "verb"),
     # Records of failed meshes could still be written in the second case.
-    [(GONE, "(read|written)"), (Rule(1.0, ("error",), frozenset({"PUT"}), part="/fourier/fourier/c/"), "written")],
+    [(GONE, "(read|written)"), (Rule(1.0, ("error",), "PUT", part="/fourier/fourier/c/"), "written")],
     ids=["gone", "no room for fields"],
 )
 def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
@@ -170,7 +169,7 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
 
     (tmp_path / "study.toml").write_text(STUDY)
     # The field of the second mesh, after the record of the first.
-    served.await_turn(Turn("PUT", "/fourier/fourier/c/", 2, rule))
+    served.await_turn("PUT", "/fourier/fourier/c/", 2, rule)
     done = go()
     served.rule = HEALTHY
     assert (done.returncode, done.stdout) == (2, ""), done.stderr

@@ -14,7 +14,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
-from tests.support.smooth_shapes import roof, roof_derivatives
+from tests.support.shapes import roof, roof_derivatives
 from tests.support.studies import small_table, variable
 
 RING = {"R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}

@@ -19,7 +19,7 @@ from sobolev_batch.cli import cli
 from sobolev_batch.results.figures import views as rendering
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.views import FRONT, MeshView, make_views, render, write_witness_plots
-from tests.support.drawing import obstacle
+from tests.support.repository import obstacle
 from tests.support.spheres import LABELS, RIGHT
 
 Spheres = tuple[str, Path]

@@ -16,8 +16,7 @@ from sobolev_batch.results.report import collection as collection_module
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.tables.league import leagues_of
 from tests.support.browser import Browser, browser
-from tests.support.leagues import GONE, balls, method_rows, methods_of
-from tests.support.studies import small_table
+from tests.support.studies import GONE, balls, method_rows, methods_of, small_table
 
 SCRIPT = "<script>window.ran=1</script>"
 

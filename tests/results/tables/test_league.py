@@ -14,7 +14,7 @@ from scipy import stats
 import sobolev_batch as sb
 from sobolev_batch.results.tables.league import League, format_league, leagues_of
 from sobolev_batch.results.tables.statistics import Interval, adjusted, sign_flip_test, within_objects
-from tests.support.leagues import method_rows
+from tests.support.studies import method_rows
 
 SIZES = (100, 400, 1600)
 

@@ -32,7 +32,7 @@ from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.support.fake_device import Device
 from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus_value
-from tests.support.smooth_shapes import (
+from tests.support.shapes import (
     HALF_TURN,
     TURN,
     angular_ball,

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from sobolev_batch.surfaces.formats.readers import mesh_format
-from tests.support.gallery import run_blocks
 from tests.support.mesh_files import BOXES
-from tests.support.repository import ROOT
+from tests.support.repository import ROOT, run_blocks
 from tests.support.shapes import AWKWARD_VERTICES, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, box
 
 try:

@@ -12,7 +12,7 @@ import pytest
 from scipy.special import eval_legendre
 
 from sobolev_batch import InputError, Interval, ParametrisedSurface, Similarity, Torus
-from tests.support.smooth_shapes import (
+from tests.support.shapes import (
     HALF_TURN,
     ROTATION,
     TURN,
