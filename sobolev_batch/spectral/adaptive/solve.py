@@ -277,9 +277,11 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
     allowed = np.maximum(parts * problem.accuracy.scale(found.values), problem.rounding)
 
     def with_part(squares: Reals) -> Solution:
-        beyond = np.maximum(np.sqrt(found.values**2 + squares) - found.values, found.truncation)
-        truncation = np.where(found.values > problem.rounding, beyond, found.truncation)
+        truncation = np.maximum(np.sqrt(found.values**2 + squares) - found.values, found.truncation)
         return replace(solution, estimate=replace(found, truncation=truncation))
+
+    def permitted(fraction: float) -> Reals:
+        return np.asarray((found.values + fraction * allowed) ** 2 - found.values**2)
 
     def needed(squares: Reals, enough: Reals, powers: Reals) -> float:
         """Return the frequency beyond which squares that fall by some powers are small enough."""
@@ -288,22 +290,22 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
         return max(float(factors.max()), _LEAST_GROWTH) * lattice.xi_max
 
     largest, period = problem.accuracy.largest_intervals, 1 / lattice.spacing
-    certain, powers = modulus_bound(problem.area, orders, lattice.xi_max), -2 * orders - 1
-    negligible = (found.values + _NEGLIGIBLE * allowed) ** 2 - found.values**2
-    if np.all(certain <= negligible):
+    powers, has_digit = -2 * orders - 1, found.values > problem.rounding
+    certain = np.where(has_digit, modulus_bound(problem.area, orders, lattice.xi_max), 0.0)
+    if np.all(certain <= permitted(_NEGLIGIBLE)):
         return with_part(certain), None
     if np.all(np.isfinite(certain)):
-        farther = needed(certain, negligible, powers - 2)
+        farther = needed(certain, permitted(_NEGLIGIBLE), powers - 2)
         if 2 * farther * period <= min(_quick_intervals(problem), largest):
             return with_part(certain), lattice_of(farther, period, largest)
     hidden, error = _beyond_lattice(problem, solution)
     bound = np.minimum(np.maximum(hidden, 0.0) + error, certain)
     if before_octaves:
         law = (found.values + found.truncation) ** 2 - found.values**2
-        if np.any(hidden - error > law):
+        if np.any(has_digit & (hidden - error > law)):
             return with_part(bound), None
         largest = min(_WIDE_M, largest)
-    farther = needed(bound, found.values * allowed, powers)
+    farther = needed(bound, permitted(0.5), powers)
     return with_part(bound), lattice_of(farther, period, largest) if 2 * farther * period <= largest else None
 
 

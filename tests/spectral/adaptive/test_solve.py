@@ -21,6 +21,9 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
+from sobolev_batch.spectral.adaptive.problem import Problem, support_of
+from sobolev_batch.spectral.adaptive.solve import run_pilot
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from tests.support.shapes import CENTRED_BOX as BOX
 
 
@@ -272,3 +275,10 @@ def test_a_turned_ring_differs_although_no_small_lattice_shows_it() -> None:
     spread = 3 * squares.std() / math.sqrt(len(radii)) / (2 * truth)
     assert spread < 0.1 * truth
     assert abs(found["distance"].item() - truth) < found["error"].item() + spread
+
+
+def test_a_pilot_without_a_digit_needs_no_larger_lattice() -> None:
+    ball = icosphere(2)
+    again = Mesh(ball.vertices.copy(), ball.triangles)
+    problem = Problem((again, ball), (-4.0, -10.0), Accuracy(1e-2), support_of((again, ball)), "a copy")
+    assert not run_pilot(problem).values.any()
