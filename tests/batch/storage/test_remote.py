@@ -130,9 +130,10 @@ def test_an_outage_ends_in_one_line(storage: Server, location: Location, kind: K
 
 def test_storage_that_never_answers_is_given_up(location: Location, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locations, "_ANSWER_SECONDS", 0.1)
+    credentials = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
     with (
         socket.create_server(("127.0.0.1", 0)) as deaf,
-        taken_for_s3({"AWS_ENDPOINT_URL": f"http://127.0.0.1:{deaf.getsockname()[1]}"}),
+        taken_for_s3({"AWS_ENDPOINT_URL": f"http://127.0.0.1:{deaf.getsockname()[1]}", **credentials}),
     ):
         with pytest.raises(StoreError, match="nothing answers there"):
             location.read("a")
