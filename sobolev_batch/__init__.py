@@ -34,7 +34,7 @@ The public names by subject:
 - Errors: all derive from `SobolevBatchError`.
 """
 
-from importlib import import_module
+from importlib import import_module  # noqa: TID251 -- of modules of this package
 from typing import Any
 
 import lazy_loader

@@ -426,7 +426,7 @@ class Gpu(Backend):
 
 def _module(name: str, title: str) -> ModuleType:
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(name)  # noqa: TID251 -- of libraries that this module names
     except ImportError as error:
         is_missing = isinstance(error, ModuleNotFoundError)
         found = "not installed" if is_missing else f"installed but cannot be imported ({one_line(error)})"

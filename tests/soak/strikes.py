@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -26,6 +25,7 @@ from sobolev_batch.batch.storage.location import Location
 from tests.soak.studies import differences, write_study
 from tests.support.commands import COMMAND
 from tests.support.object_storage import BUCKET, HEALTHY, Rule, Server, serving, taken_for_s3
+from tests.support.processes import free_port
 
 SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP}
 ROLES = ("worker", "nanny", "scheduler", "driver")
@@ -126,9 +126,7 @@ class _Run:
         self.store, self.is_done, self.commands = store, False, 0
         self._study, self._folder, self._starts = study, folder, 0
         self._stopped_since: float | None = None
-        with socket.socket() as listening:
-            listening.bind(("127.0.0.1", 0))
-            self._port = str(listening.getsockname()[1])
+        self._port = str(free_port())
         self._scheduler = self._start_scheduler()
         self._nannies = [self._start_nanny() for _ in range(_WORKERS)]
         self._driver = self._start_driver()

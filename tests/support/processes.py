@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 import dask as dask_settings
@@ -40,13 +41,22 @@ def dask(*arguments: str) -> subprocess.Popen[str]:
 
 
 def stop(process: subprocess.Popen[str]) -> None:
-    """End a process, by force if need be: a worker may wait for a peer that is gone."""
-    process.terminate()
+    """End a process, by force if need be: one that was stopped hears nothing, and a worker may wait for a lost peer."""
+    with suppress(psutil.NoSuchProcess):
+        is_stopped = psutil.Process(process.pid).status() == psutil.STATUS_STOPPED
+        (process.kill if is_stopped else process.terminate)()
     try:
         process.communicate(timeout=PATIENCE_SECONDS)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
+
+
+def free_port() -> int:
+    """Return a port of loopback that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def listening(*pids: int) -> set[tuple[str, int]]:

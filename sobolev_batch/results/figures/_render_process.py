@@ -27,7 +27,7 @@ _ARRAYS = ("vertices", "triangles", "values", "limits", "eye")
 
 def main(scene_path: str, pictures_path: str) -> None:
     """Draw all meshes of a scene."""
-    scene = np.load(scene_path, allow_pickle=False)
+    scene = np.load(scene_path, allow_pickle=False)  # noqa: TID251
     side = int(scene["side"])
     pictures = {
         f"picture_{i}": _pictures(*(scene[f"{name}_{i}"] for name in _ARRAYS), side=side)

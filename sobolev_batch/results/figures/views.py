@@ -291,7 +291,7 @@ def render(
         files = Path(folder, "scene.npz"), Path(folder, "pictures.npz")
         np.savez(files[0], **scene)
         _draw([str(program), *map(str, files)], Path(folder), timeout_seconds)
-        with np.load(files[1], allow_pickle=False) as pictures:
+        with np.load(files[1], allow_pickle=False) as pictures:  # noqa: TID251
             return [pictures[f"picture_{i}"] for i in range(len(views))]
 
 

@@ -145,7 +145,7 @@ def measured_errors() -> dict[str, Reals]:
     They depend on the rules alone, and measuring takes a second of each process, so the package carries them.
     `python -m sobolev_batch.spectral.quadrature.rules` writes them anew.
     """
-    with np.load(_MEASURED, allow_pickle=False) as stored:
+    with np.load(_MEASURED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
 
 
