@@ -1,11 +1,10 @@
-"""The report of a store: one HTML page that needs no other files, with data of charts and pictures for paper."""
+"""The report of a store: one HTML page that needs no other files, with the data of its charts."""
 
 from __future__ import annotations
 
 import base64
 import gzip
 import hashlib
-import io
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,16 +18,14 @@ from uuid import uuid4
 import numpy as np
 import pandas as pd
 import xarray as xr
-from matplotlib.figure import Figure
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.figures.drawing import LEAGUE, MOST_MESHES, PLOTS, clustered_order, embedded
+from sobolev_batch.results.figures.drawing import MOST_MESHES, clustered_order, embedded
 from sobolev_batch.results.figures.selection import Selection, Spectra
-from sobolev_batch.results.figures.style import save
-from sobolev_batch.results.figures.views import MOST_ORDERS, Axis, MeshView, make_views, render, witness_figure
+from sobolev_batch.results.figures.views import Axis, MeshView, make_views
 from sobolev_batch.results.open import (
     AnyStore,
     as_tree,
@@ -57,18 +54,10 @@ _FOLDER = "page"
 _LIBRARIES = ("jinja2", "plotly", "tomli_w")
 
 
-# Orders that printed pictures show; more would make the page heavy.
-MOST_PICTURED_ORDERS = 6
 # Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
 MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
-# Quality of shaded pictures; others are stored without loss.
-_QUALITY = 90
 
 Json = dict[str, Any]
-# A picture for paper, and for browsers without scripts: its source as a data: URL, or None where it could not be made,
-# and its alternative text, or the reason why there is no picture.
-Picture = Mapping[str, str | None]
-Pictures = dict[str, list[Picture]]
 # A page as HTML, and what it leaves out, for people.
 Page = tuple[str, tuple[str, ...]]
 
@@ -169,11 +158,9 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
     charts = chart_data(tree, spectra, views)
-    pictures = study_pictures(selection, views)
-    text = _filled("study", content, charts, spectra=spectra, views=views, missing=missing, pictures=pictures)
+    text = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
     require_unchanged(tree)
-    cut = chart_omissions(tree, charts, spectra, views, missing)
-    return text, (*content["omissions"], *cut, *unpictured(tree, pictures))
+    return text, (*content["omissions"], *chart_omissions(tree, charts, spectra, views, missing))
 
 
 def _collection_page(collection: CollectionStore) -> Page:
@@ -181,7 +168,7 @@ def _collection_page(collection: CollectionStore) -> Page:
 
     content = league_content(collection, Status.of_collection(collection))
     charts = league_data(content["leagues"], content["name"], content["orders"])
-    return _filled("league", content, charts, pictures=league_pictures(content["leagues"])), content["omissions"]
+    return _filled("league", content, charts), content["omissions"]
 
 
 def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) -> str:
@@ -422,61 +409,3 @@ def _packed(values: Any, dtype: str) -> Mapping[str, str]:
     """Return an array as plotly.js reads it."""
     data = np.ascontiguousarray(values, dtype=dtype)
     return {"dtype": dtype[1:], "bdata": base64.b64encode(data.tobytes()).decode("ascii")}
-
-
-def study_pictures(selection: Selection, views: Sequence[MeshView]) -> Pictures:
-    """Return the pictures of an open store, by the chart that they stand for."""
-    pictures: Pictures = {
-        name: [
-            {
-                "source": _data_url(plot.figure(selection, [item])),
-                "text": plot.text + ("" if item is None else f", order {item:g}"),
-            }
-            for item in plot.items(selection)[:MOST_PICTURED_ORDERS]
-        ]
-        for name, plot in PLOTS.items()
-    }
-    return {**pictures, "witness": _witness_pictures(views)}
-
-
-def unpictured(tree: xr.DataTree, pictures: Pictures) -> Iterator[str]:
-    """Yield what the pictures of an open store leave out, for people."""
-    orders = finished_group(tree, "convergence", load=False).sizes["order"]
-    if orders > MOST_PICTURED_ORDERS:
-        yield f"pictures for paper: only those of {MOST_PICTURED_ORDERS} of {orders} orders are included"
-    yield from (
-        f"pictures of meshes for paper: {picture['text']}"
-        for picture in pictures["witness"]
-        if picture["source"] is None
-    )
-
-
-def league_pictures(leagues: Sequence[League]) -> Pictures:
-    """Return a picture of the league of each order."""
-    return {
-        "league": [
-            {"source": _data_url(LEAGUE.figure(leagues, [one])), "text": f"{LEAGUE.text}, order {one.order:g}"}
-            for one in leagues[:MOST_PICTURED_ORDERS]
-        ]
-    }
-
-
-def _witness_pictures(views: Sequence[MeshView]) -> list[Picture]:
-    try:
-        rendered = render(views, MOST_ORDERS)
-    except InputError as error:
-        return [{"source": None, "text": str(error)}]
-    return [
-        {
-            "source": _data_url(witness_figure(view, drawn), is_shaded=True),
-            "text": f"{view.label}, coloured by its witness function",
-        }
-        for view, drawn in zip(views, rendered, strict=True)
-    ]
-
-
-def _data_url(figure: Figure, *, is_shaded: bool = False) -> str:
-    """Return a figure as WebP: without loss, or with a little loss where it is shaded."""
-    file = io.BytesIO()
-    save(figure, file, "webp", pil_kwargs={"lossless": not is_shaded, "quality": _QUALITY, "method": 4})
-    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -138,7 +138,7 @@ def test_columns_sort_by_clicks_and_keys(reader: Browser) -> None:
     assert reader.tell("document.activeElement.closest('th').ariaSort") == "descending"
 
 
-def test_the_order_switches_tables_and_pictures(reader: Browser, store: str) -> None:
+def test_the_order_switches_tables_and_charts(reader: Browser, store: str) -> None:
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
@@ -187,33 +187,49 @@ def test_paper_and_browsers_without_scripts_show_every_order(reader: Browser, pa
     def check() -> None:
         assert reader.texts("#table-convergence .of-order th") == ["order −10", "order −3"]
         assert len(reader.texts("#table-convergence tbody th.label")) == 10
-        assert reader.tell("[...document.images].filter(e => e.offsetWidth > 100).length") >= 8
-        reader.wait("[...document.images].every(e => e.complete && e.naturalWidth > 0)")
-        assert reader.tell("document.getElementById('chart-convergence').offsetParent === null")
 
+    look = "[getComputedStyle(document.body).color, document.getElementById('chart-convergence').layout.font.color]"
+    reader.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    reader.wait(f'JSON.stringify({look}) === \'["rgb(230, 232, 234)","#e6e8ea"]\'')
     reader.command("Emulation.setEmulatedMedia", media="print")
+    reader.driver.execute_script("dispatchEvent(new Event('beforeprint'))")
+    assert reader.tell(look) == ["rgb(29, 35, 41)", "#1d2329"]
+    assert reader.tell("document.querySelector('#chart-convergence svg').getBoundingClientRect().width") == 640
     check()
-    reader.command("Emulation.setEmulatedMedia", media="")
+    reader.command("Emulation.setEmulatedMedia", media="", features=[])
     reader.command("Emulation.setScriptExecutionDisabled", value=True)
     try:
         reader.driver.get(page.as_uri())
     finally:
         reader.command("Emulation.setScriptExecutionDisabled", value=False)
     check()
+    assert len(reader.texts(".no-chart")) == len(_CHARTS)
+    assert reader.texts(".chart") == []
 
 
-def test_page_can_be_found_through_without_eyes(reader: Browser) -> None:
+def test_page_can_be_found_through_without_eyes_and_mouse(reader: Browser, page: Path) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
     def values(selector: str, name: str) -> list[str | None]:
         return list(reader.tell(f"[...document.querySelectorAll('{selector}')].map(e => e.getAttribute('{name}'))"))
 
+    reader.open_report(page)
     parts = ("main", "nav", "header", "footer", "fieldset", "legend", "caption", "figcaption")
     assert all(values(part, "class") for part in parts)
     assert len(values("h1", "class")) == 1
     ids = values("[id]", "id")
     assert len(ids) == len(set(ids))
     assert {f"#{one}" for one in ids} >= set(values("a", "href"))
-    assert all(values("img", "alt"))
     assert all(values("[role=img]", "aria-label"))
+    controls = "a[href], button, input:checked, [type=checkbox], select, [tabindex='0']"
+    shown = f"[...document.querySelectorAll(`{controls}`)].filter(e => e.checkVisibility())"
+    names = reader.tell(f"{shown}.map((e, i) => e.dataset.control = `${{i}}`)")
+    walked = []
+    for _ in names:
+        ActionChains(reader.driver).send_keys(Keys.TAB).perform()
+        walked.append(reader.tell("document.activeElement.dataset.control"))
+    assert walked == names
 
 
 @pytest.mark.slow
@@ -242,8 +258,6 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
 
 @pytest.mark.slow
 def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nothing: dict[str, list[Any]] = {name: [] for name in _CHARTS}
-    monkeypatch.setattr(build, "study_pictures", lambda *_: nothing)
     for module, name, most in (
         (content, "MOST_CONVERGENCE_ROWS", 6),
         (content, "MOST_MESH_ROWS", 2),
@@ -270,23 +284,11 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         assert omission in omissions
 
 
-@pytest.mark.all
-def test_a_page_without_rendered_pictures_says_why(
-    store: str, folder: Path, page: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    note = "No picture: meshes cannot be drawn here: no &lt;OpenGL&gt;</p>"
-    assert note not in page.read_text(encoding="utf-8")
-
-    def nothing(*_: object) -> None:
-        raise InputError("meshes cannot be drawn here: no <OpenGL>")
-
-    monkeypatch.setattr(build, "render", nothing)
+@pytest.mark.slow
+def test_lacking_comparisons_have_a_section(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(Status.from_store(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
     monkeypatch.setattr(Status, "from_store", lambda _: status)
-    text, omissions = make_report(store, folder=folder)
-    assert text.count(note) == 1
-    assert "pictures of meshes for paper: meshes cannot be drawn here: no <OpenGL>" in omissions
-    # Comparisons that are lacking have a section.
+    text, _ = make_report(store, folder=folder)
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
     assert "no proximity: &lt;i&gt;changed&lt;/i&gt;" in text

@@ -1,7 +1,7 @@
 "use strict";
 // Charts of a report, drawn by plotly.js from the page's data in the colours of its style sheet.
 (async () => {
-  // The page holds plotly.js compressed: it would be most of it. Without it, pictures stand for the charts.
+  // The page holds plotly.js compressed: it would be most of it. Without it, a note stands for the charts.
   const unpacked = async (text) => {
     const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -40,6 +40,7 @@
   };
   const number = (value) => (value === null ? "?" : value.toPrecision(4));
   const narrow = () => innerWidth < 700;
+  const isPrinted = () => document.documentElement.classList.contains("printed");
 
   const layout = (changes) => {
     const axis = { gridcolor: color("line"), zerolinecolor: color("line"), linecolor: color("line"), automargin: true };
@@ -59,7 +60,8 @@
   const draw = (name, traces, changes, modeBarButtons = flat) => {
     const place = document.getElementById(`chart-${name}`);
     const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
-    Plotly.react(place, traces, layout({ height: Number(place.dataset.height), ...changes }), config);
+    const size = { height: Number(place.dataset.height), ...(isPrinted() ? { width: 640 } : {}) };
+    Plotly.react(place, traces, layout({ ...size, ...changes }), config);
   };
 
   // Ticks of a logarithmic axis: powers of ten, with 2 and 5 between them where these are few, and even steps within
@@ -295,6 +297,13 @@
     witness();
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  // Paper is white, and narrower than most screens.
+  for (const name of ["beforeprint", "afterprint"]) {
+    addEventListener(name, () => {
+      document.documentElement.classList.toggle("printed", name === "beforeprint");
+      redraw();
+    });
+  }
   matchMedia("(max-width: 699px)").addEventListener("change", redraw);
   const chosen = document.querySelector("input[name=order]:checked, #order");
   state.order = chosen ? Number(chosen.value) : 0;
