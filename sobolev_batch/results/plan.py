@@ -24,7 +24,7 @@ from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.costs import SurfaceSize
+from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
 from sobolev_batch.visible import table_html, visible

@@ -26,8 +26,6 @@ from sobolev_batch.spectral.metrics.datasets import (
     labelled,
     order_axis,
 )
-from sobolev_batch.spectral.octaves.partition import Octave
-from sobolev_batch.spectral.octaves.sums import squared_moduli
 from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.names import quoted
@@ -300,9 +298,8 @@ def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
     if tails is None:
         return []
     values = [tails.read(row) for row in rows]
-    sums = tails.weights.sums(squared_moduli(values[0] - values[1] if len(rows) > 1 else values[0]))
-    partition: list[Octave] = tails.weights.partition
+    sums = tails.sums(values[0] - values[1] if len(rows) > 1 else values[0])
     return [
-        (octave.highest, one.squares, one.energy, one.energy_deviation)
-        for octave, one in zip(partition, sums, strict=True)
+        (sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
+        for sampling, one in zip(tails.sampling.octaves, sums, strict=True)
     ]

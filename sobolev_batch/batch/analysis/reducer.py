@@ -28,9 +28,8 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.causes import area_and_shape
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.octaves.remainder import Remainder
-from sobolev_batch.spectral.octaves.sums import squared_moduli
-from sobolev_batch.spectral.octaves.tail import Tail
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling, TailWeights
+from sobolev_batch.spectral.octaves.sampling import TailSampling
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
@@ -75,9 +74,9 @@ class TailReducer:
     checksums: Mapping[int, int]
 
     @cached_property
-    def weights(self) -> TailWeights:
-        """Weights of all samples."""
-        return self.sampling.weights_for(self.orders)
+    def weights(self) -> tuple[OctaveWeights, ...]:
+        """Weights of the samples of each octave."""
+        return tuple(OctaveWeights(octave, self.orders) for octave in self.sampling.octaves)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "weights"}
@@ -93,14 +92,18 @@ class TailReducer:
         values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row]])[0]
         return values
 
+    def sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:
+        """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
+        parts = self.sampling.split(squared_moduli(values))
+        return [weights.sums(squares) for weights, squares in zip(self.weights, parts, strict=True)]
+
     def of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
         """Return the tail of a squared norm."""
-        sums = self.weights.sums(squared_moduli(values))
-        return Tail.from_sums(sums, *self.qualities[row].own.at(self.orders))
+        return Tail.from_sums(self.sums(values), *self.qualities[row].own.at(self.orders))
 
     def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
         """Return the tail of a squared distance."""
-        sums = self.weights.sums(squared_moduli(difference))
+        sums = self.sums(difference)
         return Tail.from_sums(sums, *self._remainder(row, other, sums[-1].energy).at(self.orders))
 
     def of_pairs(self, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
@@ -305,7 +308,8 @@ class Reducer:
             if reference is not None and self.reference is not None:
                 difference = values - reference
                 differences.append(tails.of_pair(row, self.reference, difference))
-                products.append(tails.weights.integrals((difference * reference.conj()).real.astype(np.float64)))
+                parts = tails.sampling.split((difference * reference.conj()).real.astype(np.float64))
+                products.append(sum(one.integrals(part) for one, part in zip(tails.weights, parts, strict=True)))
         norms = Tail.stacked(own)
         if reference is None or self.reference is None:
             return norms, norms, norms.beyond, norms

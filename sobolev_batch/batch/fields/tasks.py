@@ -26,7 +26,7 @@ from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import Quality, TailQuality, compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.remainder import remainder
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.probe import Probe, draws_for, join, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
@@ -217,11 +217,11 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     if tail is None:
         raise ValueError("the study has no octaves")
     settings = job.octave_settings(surface)
-    values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.sampled]
+    values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, reference = tail.highest_frequency, job.load_reference()
     quality = TailQuality(
-        tuple(float(radius) for octave in values for radius in octave.checks.radii),
-        tuple(float(square) for octave in values for square in octave.checks.squares),
+        tuple(float(radius) for octave in values for radius in octave.radii),
+        tuple(float(square) for octave in values for square in octave.squares),
         remainder([surface], [1], cutoff, points=_POINTS_OF_NORM),
         None if reference is None else remainder([surface, reference], [1, -1], cutoff),
     )

@@ -34,7 +34,7 @@ from sobolev_batch.batch.store.tables import array_keys, dataset_keys, hide_tabl
 from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.surface import Similarity
 

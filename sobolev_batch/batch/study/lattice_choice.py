@@ -30,8 +30,7 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.sampling import OctaveSampling
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling, TailSampling
 from sobolev_batch.spectral.probe import estimate
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
@@ -384,8 +383,8 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
             continue
         if solution.lattice is not None:
             lattices[label] = solution.lattice
-        # The values of pilots would fill the memory.
-        samplings.append([octave.sampling for octave in solution.octaves])
+        # Copies make their samples anew: those of pilots would fill the memory.
+        samplings.append([replace(octave) for octave in solution.octaves])
         if solution.shortfall is not None:
             shortfalls[label] = solution.shortfall
     if not lattices:

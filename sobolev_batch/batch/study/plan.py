@@ -19,7 +19,7 @@ from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES
-from sobolev_batch.spectral.octaves.tail_sampling import TailSampling
+from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.probe import Sample, draws_for
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.transform.settings import TransformSettings

@@ -25,9 +25,9 @@ from sobolev_batch.spectral.budget import (
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.remainder import remainder
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
-from sobolev_batch.spectral.octaves.tail import Tail
-from sobolev_batch.spectral.octaves.values import SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli, statistical_errors
+from sobolev_batch.spectral.octaves.values import octave_values, settings_for
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -51,7 +51,7 @@ class Frequencies:
     """
 
     lattice: Lattice
-    octaves: tuple[SampledOctave, ...]
+    octaves: tuple[OctaveSampling, ...]
     orders: tuple[float, ...]
     widths: Reals
     has_tail: bool = False
@@ -74,7 +74,7 @@ class Frequencies:
 
     @cached_property
     def _octave_weights(self) -> tuple[OctaveWeights, ...]:
-        return tuple(OctaveWeights(octave.quadrature, self.orders) for octave in self.octaves)
+        return tuple(OctaveWeights(octave, self.orders) for octave in self.octaves)
 
     def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
         """Return the values of a surface, with an error within a target.
@@ -154,7 +154,7 @@ class Frequencies:
         shells = shell_sums(own.lattice, None, self.lattice, self.lattice.half)
         squares = self.weights.per_shell @ (shells * (2 - 2 * np.sinc(2 * radii * length)))
         for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
-            factors = 2 - 2 * np.sinc(2 * weights.quadrature.radii * length)
+            factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
         if self.has_tail:
             squares = squares + 2 * self._tail(own, [surface], [1]).beyond
@@ -188,7 +188,7 @@ class Frequencies:
 
     def _tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
         """Return the tail from the octaves, and what is known to lie beyond them."""
-        cutoff = self.octaves[-1].sampling.octave.highest if self.octaves else self.lattice.xi_max
+        cutoff = self.octaves[-1].octave.highest if self.octaves else self.lattice.xi_max
         # Norms of single surfaces serve as scales.
         points = _POINTS_OF_SCALES if len(surfaces) == 1 else None
         beyond = remainder(surfaces, signs, cutoff, self.orders, points)

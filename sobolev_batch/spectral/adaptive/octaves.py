@@ -16,14 +16,17 @@ from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
-from sobolev_batch.spectral.octaves.costs import POINTS_PER_SQUARE, SurfaceSize
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.partition import Octave
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
-from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, window_integral
-from sobolev_batch.spectral.octaves.tail import Tail
-from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling
+from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli
+from sobolev_batch.spectral.octaves.values import (
+    POINTS_PER_SQUARE,
+    OctaveValues,
+    SurfaceSize,
+    octave_values,
+    settings_for,
+)
 from sobolev_batch.spectral.probe import estimate as estimate_from
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
@@ -118,7 +121,7 @@ class MeasuredOctave:
     @property
     def sampling(self) -> OctaveSampling:
         """Samples of the octave, common to all surfaces."""
-        return self.values[0].octave.sampling
+        return self.values[0].sampling
 
     def error_norms(self, orders: Sequence[float]) -> Reals:
         """Return the norms of the values' own errors (orders,), those of all surfaces added."""
@@ -331,11 +334,10 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
     values = problem.accuracy.scale(np.sqrt(state.squares))
     target = error_target(values, problem.orders, problem.accuracy, problem.area)
     settings = settings_for(target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES)))
-    octave = SampledOctave.from_sampling(sampling)
     of_surfaces = tuple(
         octave_values(
             surface,
-            octave,
+            sampling,
             problem.orders,
             settings,
             problem.execution,
@@ -344,7 +346,7 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
         for number, surface in enumerate(problem.surfaces)
     )
     squares = squared_moduli(_difference([values.values for values in of_surfaces]))
-    return MeasuredOctave(of_surfaces, OctaveWeights(octave.quadrature, problem.orders).sums(squares))
+    return MeasuredOctave(of_surfaces, OctaveWeights(sampling, problem.orders).sums(squares))
 
 
 def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
@@ -352,7 +354,7 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     orders, normals, rng = state.problem.orders, state.normals, state.rng
     energy = state.octaves[-1].sums.energy if state.octaves else state.core.energy
     energy = max(_GROWTH * energy, *state.remainders[-1].energies)
-    inside = np.array([window_integral(octave, order) for order in orders])
+    inside = np.array([octave.integral(order) for order in orders])
     outside = np.array([tail_integral(octave.highest, order) for order in orders])
     deviation = _FLAT_DEVIATION if normals else _CURVED_DEVIATION
     # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
@@ -366,12 +368,12 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
     alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
     if state.can_draw and alone * state.draw_seconds < seconds:
-        return OctaveSampling(octave, (), _drawn(state, octave, alone, _UNIFORM_ALONE, rng))
+        return OctaveSampling(octave, (), alone, _seed(rng), normals, _UNIFORM_ALONE)
     beside = 0
     if normals and state.can_draw:
         affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
         beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
-    return OctaveSampling(octave, (lattice,), _drawn(state, octave, beside, _UNIFORM_BESIDE_LATTICE, rng))
+    return OctaveSampling(octave, (lattice,), beside, _seed(rng), normals, _UNIFORM_BESIDE_LATTICE)
 
 
 def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
@@ -394,28 +396,22 @@ def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
 
 def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
     """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
-    sampling, sums, rng = (
-        octave.sampling,
-        octave.sums,
-        np.random.default_rng([state.seed, state.steps, octave.sampling.octave.index]),
-    )
+    sampling, sums = octave.sampling, octave.sums
+    rng = np.random.default_rng([state.seed, state.steps, sampling.octave.index])
     excess = float(sums.variances[order]) / permitted
     if excess <= 1:
         return None
-    lattices, drawn = sampling.lattices, sampling.drawn
-    count = int(min(len(drawn) * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
-    from_draws = sums.drawn_variances[order] > sums.lattice_variances[order]
+    count = int(min(sampling.draws * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
     first = _lattice(state, sampling.octave, _FIRST_M, rng)
-    if not lattices and count * state.draw_seconds > state.lattice_seconds(first):
-        beside = len(drawn) if state.normals else 0
-        lattices = (first,)
-        drawn = _drawn(state, sampling.octave, beside, _UNIFORM_BESIDE_LATTICE, rng)
-    elif from_draws:
-        drawn = _drawn(state, sampling.octave, count, drawn.uniform_fraction, rng)
-    else:
-        intervals = 2 * round(lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
-        lattices = (*lattices, _lattice(state, sampling.octave, intervals, rng))
-    return replace(sampling, lattices=lattices, drawn=drawn)
+    if not sampling.lattices and count * state.draw_seconds > state.lattice_seconds(first):
+        beside = sampling.draws if state.normals else 0
+        return replace(
+            sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE
+        )
+    if sums.drawn_variances[order] > sums.lattice_variances[order]:
+        return replace(sampling, draws=count, seed=_seed(rng))
+    intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
+    return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))
 
 
 def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:
@@ -423,10 +419,8 @@ def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Genera
     return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), rng)
 
 
-def _drawn(
-    state: State, octave: Octave, count: int, uniform_fraction: float, rng: np.random.Generator
-) -> DrawnFrequencies:
-    return DrawnFrequencies(octave, count, int(rng.integers(2**53)), state.normals, uniform_fraction)
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**53))
 
 
 def _resolvable_frequency(problem: Problem) -> float:

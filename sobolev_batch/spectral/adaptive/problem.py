@@ -16,7 +16,7 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.values import SampledOctave
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
@@ -230,9 +230,9 @@ class Solution:
         return cls(NormEstimate(*np.zeros((5, len(orders)))))
 
     @property
-    def octaves(self) -> tuple[SampledOctave, ...]:
+    def octaves(self) -> tuple[OctaveSampling, ...]:
         """Octaves that were measured beyond the lattice."""
-        return tuple(one.octave for one in self.values[0].octaves) if self.values else ()
+        return tuple(one.sampling for one in self.values[0].octaves) if self.values else ()
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -245,7 +245,7 @@ class Solution:
             "xi_max": self.lattice.xi_max,
             "M": self.lattice.M,
             "octaves": len(self.octaves),
-            "highest_frequency": max([self.lattice.xi_max, *(one.sampling.octave.highest for one in self.octaves)]),
+            "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
             "dtype": settings[0].dtype,
             "eps": [setting.eps for setting in settings],
             "tolerance": [setting.tolerance for setting in settings],

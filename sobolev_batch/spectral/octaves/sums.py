@@ -1,17 +1,18 @@
-"""Integrals over octaves, with standard errors that the samples themselves give."""
+"""Integrals over octaves, with standard errors that the samples themselves give; the tails that they make up."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sobolev_batch.spectral.octaves.partition import Octave
-from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
+from sobolev_batch.spectral.budget import NormEstimate, change_of_root
+from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 
 Reals = NDArray[np.float64]
 
@@ -52,23 +53,23 @@ class OctaveWeights:
     """Weights of the samples of an octave for some orders.
 
     Attributes:
-        quadrature: Samples of the octave.
+        sampling: Samples of the octave.
         orders: Orders s.
     """
 
-    quadrature: OctaveQuadrature
+    sampling: OctaveSampling
     orders: tuple[float, ...]
 
     @cached_property
     def by_order(self) -> Reals:
         """Weight times (1+|ξ|²)^s for each order, and the weight alone, float64 (orders + 1, n)."""
-        lengths = 1 + self.quadrature.radii**2
-        return np.stack([*(self.quadrature.weights * lengths**order for order in self.orders), self.quadrature.weights])
+        lengths, weights = 1 + self.sampling.radii**2, self.sampling.weights
+        return np.stack([*(weights * lengths**order for order in self.orders), weights])
 
     @cached_property
     def width(self) -> float:
         """Integral of the octave's window over |ξ|."""
-        return window_integral(self.quadrature.octave, 0.0)
+        return self.sampling.octave.integral(0.0)
 
     def integrals(self, products: Reals) -> Reals:
         """Return ∫ window (1+|ξ|²)^s products for each order (orders,), from values at all samples (n,)."""
@@ -82,7 +83,7 @@ class OctaveWeights:
                 otherwise may have been subtracted.
         """
         sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), [0, 0]
-        for part in self.quadrature.parts:
+        for part in self.sampling.parts:
             if part.samples.start == part.samples.stop:
                 continue
             kind = int(part.is_drawn)
@@ -124,12 +125,58 @@ def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
     return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
 
 
-def window_integral(octave: Octave, order: float) -> float:
-    """Return ∫ window(r) (1+r²)^s dr over an octave."""
-    from scipy.integrate import quad
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """Squared norms of fields beyond the innermost frequencies, each (orders, ...).
 
-    def integrand(radius: float) -> float:
-        return float(octave.window(np.array(radius)) * (1 + radius**2) ** order)
+    Attributes:
+        octaves: Part of the octaves.
+        statistical: How far off that may be, at 99 %.
+        beyond: Part beyond the last octave.
+        uncertainty: How far off that may be.
+    """
 
-    middle = octave.highest / 2
-    return float(quad(integrand, octave.lowest, middle)[0] + quad(integrand, middle, octave.highest)[0])
+    octaves: Reals
+    statistical: Reals
+    beyond: Reals
+    uncertainty: Reals
+
+    @classmethod
+    def from_sums(cls, sums: Sequence[OctaveSums], beyond: Reals, uncertainty: Reals) -> Self:
+        """Return the tail by the sums over octaves, and what lies beyond them (orders,)."""
+        none = np.zeros(len(beyond))
+        measured = np.sum([octave.squares for octave in sums], axis=0) if sums else none
+        return cls(measured, statistical_errors(sums) if sums else none, beyond, uncertainty)
+
+    @classmethod
+    def stacked(cls, tails: Sequence[Tail]) -> Self:
+        """Return the tails of several fields as one, (orders, fields)."""
+        parts = ([getattr(tail, field.name) for tail in tails] for field in fields(cls))
+        return cls(*(np.stack(arrays, axis=-1) for arrays in parts))
+
+    def scaled(self, factors: Reals) -> Tail:
+        """Return the tails of several fields, (orders, fields), each times a factor."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return Tail(*(part * factors for part in parts))
+
+    @property
+    def squares(self) -> Reals:
+        """The whole tail."""
+        return self.octaves + self.beyond
+
+    def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
+        """Return norms with their errors, each (orders, ...).
+
+        Args:
+            core: Squared norm of the innermost frequencies.
+            images: Bound on its change by the lattice's spacing.
+            discretisation: Norms of the errors of all values.
+        """
+        squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
+        return NormEstimate(
+            np.sqrt(squares),
+            change_of_root(squares, self.uncertainty),
+            change_of_root(squares, images),
+            discretisation,
+            change_of_root(squares, self.statistical),
+        )

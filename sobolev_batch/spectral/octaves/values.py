@@ -1,17 +1,17 @@
-"""Transforms of surfaces at the samples of an octave, and their errors."""
+"""Transforms of surfaces at the samples of an octave: their values, errors and processor time."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.octaves.costs import SurfaceSize
-from sobolev_batch.spectral.octaves.quadrature import OctaveQuadrature
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.probe import norms_of_checks
 from sobolev_batch.spectral.quadrature.kinds import kind_of
@@ -35,59 +35,35 @@ Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
 # number of pairs of a triangle (or point) and a frequency.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
-
-
-@dataclass(frozen=True)
-class SampledOctave:
-    """An octave, how it is sampled, and the samples with their weights."""
-
-    sampling: OctaveSampling
-    quadrature: OctaveQuadrature
-
-    @classmethod
-    def from_sampling(cls, sampling: OctaveSampling) -> SampledOctave:
-        """Return an octave with the quadrature of its sampling."""
-        return cls(sampling, OctaveQuadrature.from_sampling(sampling))
-
-
-@dataclass(frozen=True, eq=False)
-class Checks:
-    """Comparisons of values on lattices with exact ones, at a few samples.
-
-    Attributes:
-        radii: |ξ| of each comparison, float64 (P,).
-        scales: Factor of its squared error in the squared norm of the error, without the weight of an order,
-            float64 (P,).
-        differences: Computed values less exact ones, complex128 (P,).
-    """
-
-    radii: Reals
-    scales: Reals
-    differences: Complexes
-
-    @property
-    def squares(self) -> Reals:
-        """Contribution of each comparison to the squared norm of the error, without the weight of an order."""
-        return np.asarray(self.scales * np.abs(self.differences) ** 2)
+# Seconds for a quadrature point, for a sample of a lattice's block, and for a pair of a triangle and a frequency:
+# measured on one machine, and rough on others.
+_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8
+# Quadrature points for each square of half a wavelength, and for each triangle at least.
+POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
+# What a frequency costs beside its triangles, in triangles.
+_OVERHEAD_TRIANGLES = 50
 
 
 @dataclass(frozen=True, eq=False)
 class OctaveValues:
-    """The transform of a surface at the samples of an octave.
+    """The transform of a surface at the samples of an octave, compared with exact values at a few of them.
 
     Attributes:
-        octave: The octave and its samples.
+        sampling: The octave and its samples.
         values: Values at all samples, complex (n,).
-        checks: Comparisons with exact values.
+        radii: |ξ| of each comparison, float64 (P,).
+        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order,
+            float64 (P,).
     """
 
-    octave: SampledOctave
+    sampling: OctaveSampling
     values: NDArray[np.complexfloating]
-    checks: Checks
+    radii: Reals
+    squares: Reals
 
     def error_norms(self, orders: Sequence[float]) -> Reals:
         """Return the norm of the values' own error for each order (orders,), raised for the small sample."""
-        return norms_of_checks(self.checks.radii, self.checks.squares, orders)
+        return norms_of_checks(self.radii, self.squares, orders)
 
 
 def settings_for(target: ErrorTarget, dtype: ComplexDtype | None = None) -> Settings:
@@ -104,7 +80,7 @@ def settings_for(target: ErrorTarget, dtype: ComplexDtype | None = None) -> Sett
 
 def octave_values(
     surface: Surface,
-    octave: SampledOctave,
+    sampling: OctaveSampling,
     orders: Sequence[float],
     settings: Settings,
     execution: Execution = ON_CPU,
@@ -115,7 +91,7 @@ def octave_values(
 
     Args:
         surface: Surface in units of length.
-        octave: The octave and its samples.
+        sampling: The octave and its samples.
         orders: Orders that errors are measured for.
         settings: Settings of nonuniform FFTs. Values at drawn frequencies, and on lattices where large triangles would
             take many points, are exact.
@@ -126,31 +102,23 @@ def octave_values(
     Raises:
         InputError: The quadrature of a parametrised surface does not converge.
     """
-    sampling, quadrature = octave.sampling, octave.quadrature
     values: list[NDArray[np.complexfloating]] = []
-    finished = 0 if known is None else len(known.octave.sampling.lattices)
-    for number, part in enumerate(quadrature.parts):
+    finished = 0 if known is None else len(known.sampling.lattices)
+    for number, part in enumerate(sampling.parts):
         if known is not None and number < finished:
-            values.append(known.values[known.octave.quadrature.parts[number].samples])
-        elif not part.is_drawn:
-            lattice = sampling.lattices[number]
-            if SurfaceSize.from_surface(surface).prefers_exact(lattice):
-                values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
-                continue
+            values.append(known.values[known.sampling.parts[number].samples])
+            continue
+        if known is not None and part.is_drawn and sampling.has_draws_of(known.sampling):
+            values.append(known.values[known.sampling.parts[-1].samples])
+            continue
+        lattice = None if part.is_drawn else sampling.lattices[number]
+        if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
+            values.append(_at_frequencies(surface, sampling.frequencies[part.samples], execution))
+        else:
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
             values.append(block.ravel()[part.places])
-        elif known is not None and known.octave.sampling.drawn is sampling.drawn:
-            values.append(known.values[known.octave.quadrature.parts[-1].samples])
-        else:
-            values.append(_at_frequencies(surface, quadrature.frequencies[part.samples], execution))
     joined = np.concatenate(values)
-    return OctaveValues(octave, joined, _compared(surface, quadrature, joined, orders, check_count(surface)))
-
-
-def check_count(surface: Surface) -> int:
-    """Return the number of comparisons on each lattice: fewer where each costs more; none for closed forms."""
-    kind = kind_of(surface)
-    return 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
+    return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders))
 
 
 def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:
@@ -158,25 +126,81 @@ def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution =
 
 
 def _compared(
-    surface: Surface,
-    quadrature: OctaveQuadrature,
-    values: NDArray[np.complexfloating],
-    orders: Sequence[float],
-    count: int,
-) -> Checks:
-    """Compare values on lattices with exact ones at a few samples, drawn by their weights for all orders."""
+    surface: Surface, sampling: OctaveSampling, values: NDArray[np.complexfloating], orders: Sequence[float]
+) -> tuple[Reals, Reals]:
+    """Compare values on lattices with exact ones at a few samples, drawn by their weights for all orders.
+
+    There are fewer where each costs more, and none for closed forms.
+    """
+    kind = kind_of(surface)
+    count = 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
     chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for number, part in enumerate(quadrature.parts):
+    for number, part in enumerate(sampling.parts):
         if part.is_drawn or not count:
             continue
-        weights = quadrature.weights[part.samples]
+        weights = sampling.weights[part.samples]
         # Relative to the lowest frequency, so that high powers do not all underflow.
-        lengths = 1 + quadrature.radii[part.samples] ** 2
+        lengths = 1 + sampling.radii[part.samples] ** 2
         by_order = weights * [(lengths / lengths[weights > 0].min()) ** order for order in orders]
         chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
         drawn = np.random.default_rng(number).choice(len(chances), count, p=chances)
         chosen.append(part.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    differences = values[places] - _at_frequencies(surface, quadrature.frequencies[places])
-    return Checks(quadrature.radii[places], np.concatenate(scales), np.asarray(differences, np.complex128))
+    differences = values[places] - _at_frequencies(surface, sampling.frequencies[places])
+    return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
+
+
+@dataclass(frozen=True)
+class SurfaceSize:
+    """Size of a surface, on which the processor time of its transforms depends.
+
+    Attributes:
+        triangles: Number of triangles; zero for a surface that is no mesh.
+        area: Area, in squared units of length.
+        is_closed_form: True for a surface whose transform is a formula.
+    """
+
+    triangles: int
+    area: float
+    is_closed_form: bool = False
+
+    @classmethod
+    def from_surface(cls, surface: Surface) -> Self:
+        """Return the size of a surface."""
+        kind = kind_of(surface)
+        return cls(kind.triangles, surface.area, kind.is_closed_form)
+
+    @property
+    def draw_seconds(self) -> float:
+        """Time of the exact transform at one frequency."""
+        return _PAIR_SECONDS * (self.triangles + _OVERHEAD_TRIANGLES)
+
+    def lattice_seconds(self, lattice: OctaveLattice) -> float:
+        """Return the time of a transform on a lattice, in the cheaper of both ways."""
+        return min(self._nufft_seconds(lattice), self._exact_seconds(lattice))
+
+    def prefers_exact(self, lattice: OctaveLattice) -> bool:
+        """Tell whether the exact transform at all samples of a lattice is cheaper than a nonuniform FFT."""
+        return self._exact_seconds(lattice) < self._nufft_seconds(lattice)
+
+    def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Return the time of the transforms at the samples of an octave, without those of a known sampling.
+
+        The known one has some of the same lattices, from the first on, and maybe the same drawn frequencies.
+        """
+        lattices, draws = sampling.lattices, sampling.draws
+        if known is not None:
+            lattices = lattices[len(known.lattices) :]
+            draws = 0 if sampling.has_draws_of(known) else draws
+        return sum(map(self.lattice_seconds, lattices)) + draws * self.draw_seconds
+
+    def _nufft_seconds(self, lattice: OctaveLattice) -> float:
+        seconds = _SAMPLE_SECONDS * lattice.half.size
+        if self.is_closed_form:
+            return seconds
+        of_area = POINTS_PER_SQUARE * self.area * (2 * lattice.highest) ** 2
+        return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
+
+    def _exact_seconds(self, lattice: OctaveLattice) -> float:
+        return math.pi / 12 * lattice.M**3 * self.draw_seconds if self.triangles else math.inf

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Mesh, Sphere, Torus, icosphere
-from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.partition import Octave
-from sobolev_batch.spectral.octaves.sampling import DrawnFrequencies, OctaveSampling
+from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling, TailSampling
 from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
-from sobolev_batch.spectral.octaves.values import OctaveValues, SampledOctave, octave_values, settings_for
+from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values, settings_for
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.spectral.transform.settings import ErrorTarget
 from sobolev_batch.spectral.triangles import exact_transform
@@ -32,19 +30,17 @@ TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
 
 
 def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
-    rng = np.random.default_rng(seed)
-    lattices = [OctaveLattice.random(OCTAVE.lowest, OCTAVE.highest, intervals, rng)] if intervals else []
-    drawn = DrawnFrequencies(OCTAVE, draws, seed, FaceNormals.from_surfaces([surface]), 0.3)
-    return OctaveSampling(OCTAVE, tuple(lattices), drawn)
+    sizes, rng = [intervals] if intervals else [], np.random.default_rng(seed)
+    found = OctaveSampling.random(OCTAVE, sizes, draws, FaceNormals.from_surfaces([surface]), 0.3, rng)
+    return replace(found, seed=seed)
 
 
 def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
-    return octave_values(surface, SampledOctave.from_sampling(sampling), ORDERS, settings_for(TARGET), known=known)
+    return octave_values(surface, sampling, ORDERS, settings_for(TARGET), known=known)
 
 
 def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
-    found = values_of(surface, sampling)
-    return OctaveWeights(found.octave.quadrature, ORDERS).sums(squared_moduli(found.values))
+    return OctaveWeights(sampling, ORDERS).sums(squared_moduli(values_of(surface, sampling).values))
 
 
 def sphere_integral(order: float) -> float:
@@ -71,9 +67,8 @@ def test_the_ball_and_its_octaves_are_a_partition_of_one() -> None:
 def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surface) -> None:
     sampling = sampling_of(surface, 3)
     values = values_of(surface, sampling)
-    quadrature = values.octave.quadrature
-    chosen = np.random.default_rng(0).integers(quadrature.parts[0].samples.stop, size=20)
-    frequencies = quadrature.frequencies[chosen]
+    chosen = np.random.default_rng(0).integers(sampling.parts[0].samples.stop, size=20)
+    frequencies = sampling.frequencies[chosen]
     if isinstance(surface, Mesh):
         expected = exact_transform(surface, frequencies)
     else:
@@ -135,7 +130,7 @@ def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
     octave = Octave(40.0, 1)
     deviations = []
     for normals in (FaceNormals.from_surfaces([BOX]), FaceNormals.from_surfaces([Sphere()])):
-        sums = sums_of(BOX, OctaveSampling(octave, (), DrawnFrequencies(octave, 2000, 0, normals, 0.3)))
+        sums = sums_of(BOX, OctaveSampling(octave, (), 2000, 0, normals, 0.3))
         deviations.append(sums.energy_deviation / sums.energy)
     assert deviations[0] < 0.1
     assert deviations[1] > 3 * deviations[0]
@@ -144,25 +139,24 @@ def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
 def test_known_values_are_not_computed_again() -> None:
     sampling = sampling_of(BOX, 0)
     known = values_of(BOX, sampling)
-    lattice, drawn = known.octave.quadrature.parts
-    more = OctaveSampling(OCTAVE, (*sampling.lattices, *sampling_of(BOX, 1).lattices), sampling.drawn)
+    more = replace(sampling, lattices=(*sampling.lattices, *sampling_of(BOX, 1).lattices))
     # What is known is taken as it is, wrong or right.
     marked = replace(known, values=known.values + 1)
     found, fresh = values_of(BOX, more, marked), values_of(BOX, more)
-    first, second, last = found.octave.quadrature.parts
+    (lattice, drawn), (first, second, last) = sampling.parts, more.parts
     assert (found.values[first.samples] == marked.values[lattice.samples]).all()
     assert (found.values[last.samples] == marked.values[drawn.samples]).all()
     assert found.values[second.samples] == pytest.approx(fresh.values[second.samples], abs=1e-12)
-    assert len(found.checks.radii) == 2 * len(known.checks.radii)
+    assert len(found.radii) == 2 * len(known.radii)
+    other_draws = replace(sampling, seed=7)
+    again = values_of(BOX, other_draws, marked)
+    assert again.values[drawn.samples] == pytest.approx(values_of(BOX, other_draws).values[drawn.samples], abs=1e-12)
 
 
 def test_a_sampling_is_the_same_after_it_was_stored() -> None:
-    sampling = sampling_of(BOX, 5)
-    table = json.loads(json.dumps(sampling.to_table()))
-    again = SampledOctave.from_sampling(
-        OctaveSampling.from_table(OCTAVE, FaceNormals.from_surfaces([BOX]), table)
-    ).quadrature
-    first = SampledOctave.from_sampling(sampling).quadrature
+    first = TailSampling.usual(4.0, 2, [BOX])
+    again = TailSampling.from_table(json.loads(json.dumps(first.to_table())))
+    assert again.digest == first.digest
     assert (again.frequencies == first.frequencies).all()
     assert (again.weights == first.weights).all()
 
@@ -177,19 +171,55 @@ def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
 
 
 def test_one_sample_that_carries_the_sum_may_stand_for_others() -> None:
-    octave = SampledOctave.from_sampling(sampling_of(BOX, 0, 0, 400))
     squares = np.zeros(400)
     squares[7] = 1.0
-    weights = OctaveWeights(octave.quadrature, ORDERS)
+    weights = OctaveWeights(sampling_of(BOX, 0, 0, 400), ORDERS)
     sums = weights.sums(squares)
     assert (sums.variances >= 1.9 * weights.integrals(squares) ** 2).all()
 
 
 def test_wrong_values_have_large_errors() -> None:
     values = values_of(icosphere(2), sampling_of(icosphere(2), 0))
-    off = replace(values.checks, differences=values.checks.differences + 0.1)
+    off = values_of(icosphere(2), values.sampling, replace(values, values=values.values + 0.1))
     window = OCTAVE.highest - OCTAVE.lowest
-    for order, norm in zip(ORDERS, replace(values, checks=off).error_norms(ORDERS), strict=True):
+    for order, norm in zip(ORDERS, off.error_norms(ORDERS), strict=True):
         radii = np.linspace(OCTAVE.lowest, OCTAVE.highest, 1001)
         square = np.mean(OCTAVE.window(radii) * (1 + radii**2) ** order * 0.01 * 4 * np.pi * radii**2) * window
         assert 0.8 * np.sqrt(square) < norm < 4 * np.sqrt(square)
+
+
+# Samplings of all octaves of a study: joined from those of pilots, and refined.
+
+
+def sizes_of(sampling: TailSampling) -> list[int]:
+    return [lattice.M for one in sampling.octaves for lattice in one.lattices]
+
+
+def test_joined_samplings_serve_the_most_demanding_pilot_in_each_octave() -> None:
+    first, second = TailSampling.usual(4.0, 2, [BOX]), TailSampling.usual(4.0, 3, [BOX], seed=1)
+    large = [replace(one, lattices=tuple(replace(lattice, M=96) for lattice in one.lattices)) for one in first.octaves]
+    fewer, fewest = ([replace(one, draws=n) for one in it.octaves] for it, n in ((first, 900), (second, 700)))
+    normals = FaceNormals.from_surfaces([BOX])
+    joined = TailSampling.joined(4.0, [large, fewest, fewer], normals)
+    assert sizes_of(joined) == [96, 96, 64]
+    assert [one.draws for one in joined.octaves] == [20_000, 20_000, 700]
+    assert [one.draws for one in TailSampling.joined(4.0, [fewer, fewest], normals).octaves] == [900, 900, 700]
+
+
+def test_refined_samplings_have_more_samples_within_the_largest_lattice() -> None:
+    usual = TailSampling.usual(4.0, 2, [BOX])
+    refined = usual.refined(8.0, 1, 1000, seed=3)
+    assert sizes_of(refined) == [128, 128, 128]
+    assert [one.draws for one in refined.octaves] == [160_000] * 3
+    assert refined.octaves[-1].octave.highest == 2 * usual.highest_frequency
+    assert sizes_of(usual.refined(8.0, 0, 70, seed=3)) == [70, 70]
+    # A lattice that is larger already stays.
+    assert sizes_of(usual.refined(8.0, 0, 38, seed=3)) == [64, 64]
+
+
+def test_samples_follow_from_the_seed_and_differ_in_each_octave() -> None:
+    first, again, other = (TailSampling.usual(4.0, 2, [icosphere(2)], seed=seed) for seed in (0, 0, 1))
+    assert first.digest == again.digest != other.digest
+    assert np.array_equal(first.frequencies, again.frequencies)
+    offsets = [one.lattices[0].offset for one in first.octaves]
+    assert offsets[0] != offsets[1]
