@@ -218,18 +218,6 @@ def freesurfer(
     return header + rows.astype(">f4").tobytes() + corners.astype(">i4").tobytes() + volume
 
 
-def freesurfer_quads(
-    vertices: ArrayLike, quads: Faces, *, old: bool = False, counts: tuple[int, int] | None = None
-) -> bytes:
-    """Return an older surface of FreeSurfer's, of quadrilaterals; the oldest ones count in hundredths."""
-    rows = np.asarray(vertices)
-    coordinates = (100 * rows).astype(">i2") if old else rows.astype(">f4")
-    of_three = [*(counts or (len(rows), len(quads))), *(corner for quad in quads for corner in quad)]
-    numbers_of_three = [int(number).to_bytes(3, "big") for number in of_three]
-    magic = b"\xff\xff\xff" if old else b"\xff\xff\xfd"
-    return magic + b"".join(numbers_of_three[:2]) + coordinates.tobytes() + b"".join(numbers_of_three[2:])
-
-
 # What stands in a surface behind its triangles: the geometry of the volume that it was made of.
 VOLUME = (
     b"\0\0\0\2\0\0\0\0\0\0\0\x14valid = 1  # volume info valid\nfilename = ../mri/filled.mgz\nvolume = 256 256 256\n"

@@ -17,7 +17,7 @@ from sobolev_batch.batch.study.schema import RESERVED
 from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection, is_collection
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
-from sobolev_batch.surfaces.sources.files import MOST_MESHES, FileMember, FileSource, expand
+from sobolev_batch.surfaces.sources.files import MOST_MESHES, FileMember, FileSource, matching_files
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.visible import reasons, table_html, visible
 
@@ -432,16 +432,8 @@ def _entries(paths: Sequence[str], base: Path) -> list[str]:
     for (folder, ending), alike in kinds.items():
         stems = {"*", _with_any_size(mesh_stem(Path(alike[0])))} if len(alike) > 1 else set()
         globs = [str(folder / f"{stem}{ending}") for stem in sorted(stems) if "*" in stem]
-        entries += [glob for glob in globs if _matches(glob, base) == set(alike)][:1] or alike
+        entries += [glob for glob in globs if _relative(matching_files(base, glob), base) == set(alike)][:1] or alike
     return entries
-
-
-def _matches(glob: str, base: Path) -> set[str]:
-    try:
-        return _relative(expand(base, glob), base)
-    except StudyError:
-        # A link leads out of the folder.
-        return set()
 
 
 def _relative(paths: Iterable[Path], base: Path) -> set[str]:

@@ -33,7 +33,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Similarity
-from sobolev_batch.surfaces.sources.files import MeshTable, expand, matching_files, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 from sobolev_batch.surfaces.sources.registry import Source
 
@@ -367,9 +367,8 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     names: set[str] = set()
     for template in templates:
         match = re.compile(_pattern(template)).fullmatch
-        found = {
-            matched["object"] for path in expand(folder, _glob(template)) if (matched := match(_text(folder, path)))
-        }
+        texts = map(partial(_text, folder), matching_files(folder, _glob(template)))
+        found = {matched["object"] for matched in map(match, texts) if matched}
         if not found:
             raise StudyError(
                 f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"

@@ -10,38 +10,30 @@ import base64
 import json
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, read_regular, unpacked_limit
+from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, unpacked_limit
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Bytes of memory while a byte of a buffer is read.
-_MEMORY_FACTOR = 10.6
+# Modes of primitives: points and lines have none of the area; triangles, strips and fans of them follow.
+_TRIANGLES = 4
 # Required extensions that do not change the positions of vertices.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "KHR_xmp")
 
 
-def parse_gltf(data: bytes, path: Path) -> Raw:
-    """Return the vertices and triangles of the default scene, in its own frame; coinciding vertices are merged.
-
-    Args:
-        data: Contents of the file, .gltf or .glb.
-        path: Path of the file; its folder holds buffers in files of their own.
-    """
+def parse_gltf(data: bytes) -> Raw:
+    """Return the vertices and triangles of the default scene, in its own frame; coinciding vertices are merged."""
     tree, binary = _document(data)
     required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
     if required:
         raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
-    buffers = _loaded_buffers(tree, binary, path)
-    most = unpacked_limit(len(data) + sum(map(len, {id(buffer): buffer for buffer in buffers}.values())))
+    buffers = _loaded_buffers(tree, binary)
+    most = unpacked_limit(len(data))
     placed: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
     total = 0
     for matrix, mesh in _placed_meshes(tree):
@@ -58,18 +50,9 @@ def parse_gltf(data: bytes, path: Path) -> Raw:
     return merge_coincident(np.concatenate([vertices for vertices, _ in placed]), triangles)
 
 
-def buffer_paths(data: bytes, path: Path) -> list[Path]:
-    """Return the files beside a glTF file that hold its buffers."""
-    tree, _ = _document(data)
-    uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
-    return [_beside(path, uri) for uri in uris if uri is not None and not uri.startswith("data:")]
-
-
-def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, path: Path) -> list[bytes]:
+def _loaded_buffers(tree: dict[str, Any], binary: bytes | None) -> list[bytes]:
     """Return the bytes of each buffer of a document."""
     buffers: list[bytes] = []
-    # By path, since several buffers may be one file under different names.
-    files: dict[Path, bytes] = {}
     for index, buffer in enumerate(tree.get("buffers", [])):
         uri = buffer.get("uri")
         if uri is None:
@@ -79,14 +62,7 @@ def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, path: Path) -> l
         elif uri.startswith("data:"):
             buffers.append(base64.b64decode(uri.partition(",")[2], validate=True))
         else:
-            beside = _beside(path, uri)
-            if beside not in files:
-                held_bytes = sum(map(len, files.values()))
-                try:
-                    files[beside] = read_regular(beside, gzipped=False, factor=_MEMORY_FACTOR, held_bytes=held_bytes)
-                except MeshError as error:
-                    raise MeshError(f"its buffer {beside.name[:80]} {error}") from error
-            buffers.append(files[beside])
+            raise MeshError(f"its buffer {uri[:80]!r} is a file of its own; export the scene as one file, .glb")
         if len(buffers[-1]) < buffer["byteLength"]:
             raise MeshError(f"buffer {index} announces {buffer['byteLength']} bytes, found {len(buffers[-1])}")
     return buffers
@@ -113,15 +89,6 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -
         raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
     values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
     return values[:, 0] if kind == "SCALAR" else values
-
-
-def _beside(path: Path, uri: str) -> Path:
-    name, folder = unquote(uri), path.parent.resolve()
-    outside = "://" in name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts
-    # A link may lead out of the folder too.
-    if outside or not (folder / name).resolve().is_relative_to(folder):
-        raise MeshError(f"its buffer {uri[:80]!r} lies outside the file's folder; put it there")
-    return (folder / name).resolve()
 
 
 def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
@@ -190,27 +157,21 @@ def _primitives(
     """Yield positions and triangles of each primitive that has area, so no points or lines."""
     for primitive in mesh["primitives"]:
         mode = primitive.get("mode", _TRIANGLES)
-        if mode not in (_TRIANGLES, _STRIP, _FAN):
+        if mode < _TRIANGLES:
             continue
+        if mode > _TRIANGLES:
+            raise MeshError(f"a primitive has the mode {mode}, strips or fans; export plain triangles")
         vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
         if "indices" in primitive:
             corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
         else:
             corners = np.arange(len(vertices), dtype=np.int64)
-        triangles = _triangles(corners, mode)
+        if len(corners) % 3:
+            raise MeshError(f"{len(corners)} indices make no whole triangles")
+        triangles = corners.reshape(-1, 3)
         bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
         if bad.size:
             raise MeshError(
                 f"{bad.size} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
             )
         yield vertices, triangles
-
-
-def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    if mode == _TRIANGLES:
-        if len(corners) % 3:
-            raise MeshError(f"{len(corners)} indices make no whole triangles")
-        return corners.reshape(-1, 3)
-    if mode == _STRIP:
-        return np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-    return np.stack([np.broadcast_to(corners[:1], len(corners) - 2), corners[1:-1], corners[2:]], axis=1)

@@ -30,7 +30,7 @@ _GIFTI_TYPES = {
 _POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 # lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; but lh.aparc.annot has values at vertices.
 _NAME = re.compile(r"(?:^|[._-])[lr]h\.[^.].*(?<!\.annot)(?<!\.label)(?<!\.mgh)(?<!\.mgz)$|.\.surf$")
-_TRIANGLES, _QUADS, _OLD_QUADS = b"\xff\xff\xfe", b"\xff\xff\xfd", b"\xff\xff\xff"
+_MAGIC = b"\xff\xff\xfe"
 # The two lines after the number of the format: who made the file and when, and an empty one.
 _HEADER_LINES = re.compile(rb"[^\n]{0,1000}\n[^\n]{0,1000}\n")
 # Behind the triangles there may be the geometry of the volume, which begins with one of these.
@@ -117,21 +117,17 @@ def is_freesurfer_name(name: str) -> bool:
 
 
 def parse_freesurfer(data: bytes) -> Raw:
-    """Return the vertices and triangles of a FreeSurfer surface; quadrilaterals are cut as FreeSurfer cuts them."""
-    match data[:3]:
-        case magic if magic == _TRIANGLES:
-            return _triangle_surface(data)
-        case magic if magic in (_QUADS, _OLD_QUADS):
-            return _quad_surface(data, is_old=magic == _OLD_QUADS)
-        case magic:
-            raise MeshError(
-                f"it begins with the bytes {magic.hex(' ')} and is no surface of FreeSurfer's, which begin with "
-                f"{_TRIANGLES.hex(' ')}; give a surface such as lh.pial, or a name with the suffix of its own format"
-            )
-
-
-def _triangle_surface(data: bytes) -> Raw:
-    lines = _HEADER_LINES.match(data, len(_TRIANGLES))
+    """Return the vertices and triangles of a FreeSurfer surface."""
+    if len(data) >= 15 and len(data) == 15 + 4 * math.prod(np.frombuffer(data, ">i4", 3, 3)[[0, 2]].tolist()):
+        raise MeshError(
+            "it holds values at vertices, such as thickness or curvature; give the surface, such as lh.pial"
+        )
+    if not data.startswith(_MAGIC):
+        raise MeshError(
+            f"it begins with the bytes {data[:3].hex(' ')} and is no FreeSurfer surface of triangles, which begins "
+            f"with {_MAGIC.hex(' ')}; give a surface such as lh.pial, or a name with the suffix of its own format"
+        )
+    lines = _HEADER_LINES.match(data, len(_MAGIC))
     if lines is None or len(data) < lines.end() + 8:
         raise MeshError("the file breaks off before the counts of its vertices and triangles")
     vertices, triangles = np.frombuffer(data, ">i4", 2, lines.end()).tolist()
@@ -146,24 +142,3 @@ def _triangle_surface(data: bytes) -> Raw:
     coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)
     corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
     return coordinates.reshape(-1, 3), corners.reshape(-1, 3)
-
-
-def _quad_surface(data: bytes, *, is_old: bool) -> Raw:
-    if len(data) >= 15 and len(data) == 15 + 4 * math.prod(np.frombuffer(data, ">i4", 3, 3)[[0, 2]].tolist()):
-        raise MeshError(
-            "it holds values at vertices, such as thickness or curvature; give the surface, such as lh.pial"
-        )
-    vertices, quads = (int.from_bytes(data[place : place + 3], "big") for place in (3, 6))
-    start = 9 + (6 if is_old else 12) * vertices
-    if len(data) != start + 12 * quads:
-        raise MeshError(
-            f"the header announces {vertices} vertices and {quads} quadrilaterals, but the file has {len(data)} bytes"
-        )
-    # The oldest ones count in hundredths.
-    coordinates = np.frombuffer(data, ">i2" if is_old else ">f4", 3 * vertices, 9) / (100.0 if is_old else 1.0)
-    digits = np.frombuffer(data, np.uint8, 12 * quads, start).reshape(-1, 4, 3).astype(np.int64)
-    corners = digits @ [1 << 16, 1 << 8, 1]
-    cut = np.where(
-        (corners[:, 0] % 2 == 0)[:, None, None], corners[:, [[0, 1, 3], [2, 3, 1]]], corners[:, [[0, 1, 2], [0, 2, 3]]]
-    )
-    return coordinates.reshape(-1, 3), cut.reshape(-1, 3)

@@ -75,41 +75,26 @@ def require_memory_to_read(needed_bytes: float) -> None:
         )
 
 
-def read_regular(path: Path, *, gzipped: bool, factor: float, held_bytes: int = 0) -> bytes:
-    """Return the bytes of a regular file.
+def read_unpacked(path: Path, factor: float) -> bytes:
+    """Return the bytes of a regular file, unpacked if its name ends in .gz.
 
     Args:
         path: Path of the file.
-        gzipped: True where it is to be unpacked.
         factor: Bytes of memory that reading takes for each byte, unpacked.
-        held_bytes: Bytes that were read before for the same mesh.
     """
     try:
         with open_regular(path) as file:
             length = checked_length(file)
-            if gzipped:
+            if is_gzipped(path):
                 data = _read_unpacked_bounded(file, length, factor)
             else:
-                require_memory_to_read(factor * (held_bytes + length))
+                require_memory_to_read(factor * length)
                 data = file.read(length)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not data:
         raise MeshError("the file is empty")
     return data
-
-
-def read_unpacked(path: Path, factor: float) -> bytes:
-    """Return the bytes of a file, unpacked if its name ends in .gz.
-
-    Args:
-        path: Path of the file.
-        factor: Bytes of memory that reading takes for each byte, unpacked.
-    """
-    try:
-        return read_regular(path, gzipped=is_gzipped(path), factor=factor)
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
 
 
 def unpacked_limit(packed_bytes: int) -> int:
@@ -197,27 +182,16 @@ def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArr
     """
     if not len(sizes):
         raise MeshError("the file has no faces")
-    _check_sizes(sizes)
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
-    first, rank = _places(sizes)
+    # The place of the first corner of each triangle's polygon, and the rank of the triangle in it.
+    ends = np.cumsum(sizes - 2)
+    first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
+    rank = np.arange(ends[-1]) - np.repeat(ends - (sizes - 2), sizes - 2)
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
-
-
-def triangle_strips(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cut each strip of triangles into these, all turned the same way.
-
-    Args:
-        corners: Vertex indices of all strips, one after the other.
-        sizes: Number of corners of each strip.
-
-    Returns:
-        Vertex indices of triangles (m, 3), int64.
-    """
-    _check_sizes(sizes)
-    first, rank = _places(sizes)
-    start, odd = first + rank, rank % 2
-    return np.stack([corners[start + odd], corners[start + 1 - odd], corners[start + 2]], axis=1)
 
 
 def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
@@ -237,17 +211,3 @@ def merge_coincident(
         return vertices, triangles
     merged, indices = np.unique(vertices, axis=0, return_inverse=True)
     return merged, indices.reshape(-1)[triangles]
-
-
-def _check_sizes(sizes: NDArray[np.int64]) -> None:
-    short = np.flatnonzero(sizes < 3)
-    if short.size:
-        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
-
-
-def _places(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return, for each triangle of polygons or strips, the place of the first corner and its rank among them."""
-    starts = np.cumsum(sizes) - sizes
-    polygon = np.repeat(np.arange(len(sizes)), sizes - 2)
-    rank = np.arange(len(polygon)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
-    return starts[polygon], rank

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.surfaces.formats.gltf import buffer_paths, parse_gltf
+from sobolev_batch.surfaces.formats.gltf import parse_gltf
 from sobolev_batch.surfaces.formats.neuroimaging import is_freesurfer_name, parse_freesurfer, parse_gifti
 from sobolev_batch.surfaces.formats.parsing import (
     Raw,
@@ -89,7 +89,7 @@ _FORMATS = (
     Format((".obj",), lambda data, _: parse_obj(data), 35, 240, write_obj),
     Format((".stl",), lambda data, _: parse_stl(data), 50, 270, write_stl),
     Format((".off",), lambda data, _: parse_off(data), 35, 240, write_off),
-    Format((".gltf", ".glb"), parse_gltf, 18, 190),
+    Format((".gltf", ".glb"), lambda data, _: parse_gltf(data), 18, 190),
     Format((".gii",), lambda data, _: parse_gifti(data), 10, 90),
     Format((".vtk",), parse_vtk, 22, 290),
     Format((".vtp", ".vtu"), parse_vtk, 10, 215),
@@ -142,12 +142,15 @@ def read_mesh(path: str | Path) -> Mesh:
             f"{path}: no mesh format that is read has this name; known are {known} and FreeSurfer's names such as "
             "lh.pial, each also with .gz. docs/formats.md shows how to convert others"
         )
-    data = [_checked_bytes(path)]
+    form = _BY_SUFFIX[suffix]
     try:
+        # The header of a PLY file tells more than its length.
+        require_memory_to_read(expected_size(path)[1])
+        data = [read_unpacked(path, form.memory_bytes / form.file_bytes)]
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
-            vertices, triangles = _BY_SUFFIX[suffix].parse(data.pop(), path)
+            vertices, triangles = form.parse(data.pop(), path)
             for array in (vertices, triangles):
                 array.setflags(write=False)
             return Mesh(vertices, triangles)
@@ -160,22 +163,6 @@ def read_mesh(path: str | Path) -> Mesh:
         raise MeshError(
             f"{path}: not a readable {suffix.removeprefix('.')} file: {type(error).__name__}: {_shortened(error)}"
         ) from error
-
-
-def _checked_bytes(path: Path) -> bytes:
-    """Return the bytes of a file that there is the memory to read."""
-    try:
-        # The header of a PLY file tells more than its length.
-        require_memory_to_read(expected_size(path)[1])
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
-    return read_unpacked(path, memory_factor(path))
-
-
-def memory_factor(path: Path) -> float:
-    """Return the bytes of memory that reading takes for each byte of a mesh file, unpacked."""
-    form = _BY_SUFFIX[mesh_format(path).removesuffix(".gz")]
-    return form.memory_bytes / form.file_bytes
 
 
 def expected_size(path: Path) -> tuple[int, float]:
@@ -197,8 +184,6 @@ def expected_size(path: Path) -> tuple[int, float]:
             if unpacked_suffix == ".ply":
                 unpacked = gzip.GzipFile(fileobj=file) if suffix.endswith(".gz") else file
                 return _announced_size(unpacked.read(HEADER_BYTES), length)
-        if suffix == ".gltf":
-            length += sum(buffer.stat().st_size for buffer in set(companion_files(path)))
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
         return 0, 0.0
     triangles = int(length / form.file_bytes)
@@ -236,22 +221,6 @@ def mesh_stem(path: Path) -> str:
 
 def _unpacked_name(path: Path) -> str:
     return path.name[: -len(".gz")] if is_gzipped(path) else path.name
-
-
-def companion_files(path: Path) -> list[Path]:
-    """Return the further files that a mesh file consists of: the buffers of a glTF file.
-
-    Raises:
-        MeshError: The file cannot be read.
-    """
-    if mesh_format(path).removesuffix(".gz") not in (".gltf", ".glb"):
-        return []
-    try:
-        return buffer_paths(read_unpacked(path, memory_factor(path)), path)
-    except MeshError:
-        raise
-    except Exception as error:
-        raise MeshError(f"{path}: not a readable glTF file: {type(error).__name__}") from error
 
 
 def _shortened(error: Exception) -> str:

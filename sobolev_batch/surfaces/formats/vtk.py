@@ -16,15 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.surfaces.formats.parsing import Raw, triangle_fans, triangle_strips, xml_events
+from sobolev_batch.surfaces.formats.parsing import Raw, triangle_fans, xml_events
 
 Indices = NDArray[np.int64]
 
-_POLYGON, _STRIP, _PIXEL = 7, 6, 8
-# Types of cells with a number of corners of their own: triangles, pixels and quadrilaterals.
-_CORNERS = {5: 3, _PIXEL: 4, 9: 4}
-# Vertices and lines.
-_WITHOUT_AREA = (1, 2, 3, 4)
+# VTK's numbers for types of cells: vertices and lines, then those with area, triangles, polygons and quadrilaterals.
+_WITHOUT_AREA, _TRIANGLE, _POLYGON, _QUAD = (1, 2, 3, 4), 5, 7, 9
 _RAW_DATA = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"']raw[\"'][^>]{0,200}>\s{0,99}_")
 _END = b"</VTKFile>"
 # VTK has one place for the reports of all threads.
@@ -32,7 +29,7 @@ _shared = Lock()
 
 
 def parse_vtk(data: bytes, path: Path) -> Raw:
-    """Return the vertices and triangles of a VTK file: of polygons first, then of strips.
+    """Return the vertices and triangles of a VTK file.
 
     Args:
         data: Contents of the file, legacy or XML.
@@ -52,10 +49,12 @@ def parse_vtk(data: bytes, path: Path) -> Raw:
     if kind == "vtkUnstructuredGrid":
         cells = dataset.GetCells()
         # PyVista knows what each version of VTK calls them.
-        parts = [(np.asarray(pyvista.wrap(dataset).celltypes, dtype=np.int64), cells)]
+        kinds = np.asarray(pyvista.wrap(dataset).celltypes, dtype=np.int64)
     elif kind == "vtkPolyData":
-        all_cells = ((_POLYGON, dataset.GetPolys()), (_STRIP, dataset.GetStrips()))
-        parts = [(np.full(cells.GetNumberOfCells(), type_), cells) for type_, cells in all_cells]
+        if dataset.GetNumberOfStrips():
+            raise MeshError("the file has strips; cut them: in PyVista by mesh.triangulate()")
+        cells = dataset.GetPolys()
+        kinds = np.full(cells.GetNumberOfCells(), _POLYGON)
     else:
         raise MeshError(
             f"the file holds {kind}, no polygons; take its surface first: in PyVista by "
@@ -67,13 +66,8 @@ def parse_vtk(data: bytes, path: Path) -> Raw:
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
             "mesh.remove_ghost_cells()"
         )
-    triangles = [
-        _triangles(types, _values(cells.GetConnectivityArray()), _values(cells.GetOffsetsArray()))
-        for types, cells in parts
-    ]
-    if not sum(map(len, triangles)):
-        raise MeshError("the file has no faces")
-    return _values(dataset.GetPoints().GetData()), np.concatenate(triangles)
+    triangles = _triangles(kinds, _values(cells.GetConnectivityArray()), _values(cells.GetOffsetsArray()))
+    return _values(dataset.GetPoints().GetData()), triangles
 
 
 def _check_xml(data: bytes) -> None:
@@ -125,7 +119,7 @@ def _values(array: Any) -> NDArray[Any]:
 
 
 def _triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indices:
-    """Return the triangles (m, 3) of cells: of polygons first, then of strips.
+    """Return the triangles (m, 3) of cells.
 
     Args:
         kinds: VTK's number for the type of each cell.
@@ -135,25 +129,13 @@ def _triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indices:
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")
-    expected = np.select([kinds == kind for kind in _CORNERS], list(_CORNERS.values()), sizes)
-    flat = np.isin(kinds, (*_WITHOUT_AREA, *_CORNERS, _POLYGON, _STRIP))
-    wrong = np.flatnonzero(~flat | (sizes != expected))
+    has_area = ~np.isin(kinds, _WITHOUT_AREA)
+    expected = np.select([kinds == _TRIANGLE, kinds == _QUAD, kinds == _POLYGON], [3, 4, sizes], -1)
+    wrong = np.flatnonzero(has_area & (sizes != expected))
     if wrong.size:
         raise MeshError(
             f"cell {wrong[0] + 1} is of VTK's type {kinds[wrong[0]]} with {sizes[wrong[0]]} corners, no flat polygon; "
             "take the surface and cut it into triangles first: in PyVista by "
             "grid.extract_surface().triangulate(), then save it as .vtp"
         )
-    of_corner = np.repeat(kinds, sizes)
-    pixels = corners[of_corner == _PIXEL].reshape(-1, 4)
-    if len(pixels):
-        # The corners of pixels lie in rows.
-        corners = corners.copy()
-        corners[of_corner == _PIXEL] = pixels[:, [0, 1, 3, 2]].ravel()
-    polygon, strip = np.isin(kinds, (*_CORNERS, _POLYGON)), kinds == _STRIP
-    parts = [
-        cut(corners[np.repeat(chosen, sizes)], sizes[chosen])
-        for chosen, cut in ((polygon, triangle_fans), (strip, triangle_strips))
-        if chosen.any()
-    ]
-    return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.int64)
+    return triangle_fans(corners[np.repeat(has_area, sizes)], sizes[has_area])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.parsing import checked_length, open_regular
-from sobolev_batch.surfaces.formats.readers import companion_files, expected_size, mesh_format, mesh_stem, read_mesh
+from sobolev_batch.surfaces.formats.readers import expected_size, mesh_format, mesh_stem, read_mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import (
     caseless_key,
@@ -175,16 +174,15 @@ def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None
         if value == "names":
             return "names"
         raise ValueError('must be a list of numbers, or "names" for the numbers in the names of the files')
-    return checked_times(value, MOST_MESHES)
+    return checked_times(value)
 
 
 class FileSource(Source):
     """Mesh files.
 
     Attributes:
-        paths: Paths or globs (``**`` crosses folders), relative to the study file. A path may lie anywhere,
-            and its file must exist when its mesh is computed. A glob must match a file at once, and matches
-            none outside the folder that it names: see `expand`.
+        paths: Paths or globs (``**`` crosses folders), relative to the study file. The file of a path must exist when
+            its mesh is computed; a glob must match a file at once.
         meshes: Instead of paths, a list of meshes with what is known of them: a CSV file, or tables of the study.
         distribution: Installed Python distribution. Paths are then those of files that it recorded at its
             installation, without wildcards. It is not imported.
@@ -242,9 +240,8 @@ class FileMember(Member):
         return read_mesh(self.path)
 
     def fingerprint(self) -> Fingerprint:
-        """Return the format, and the digests of the file and of those that it refers to."""
-        beside = [file_digest(path) for path in companion_files(self.path)]
-        return {"file": file_digest(self.path), "beside": beside, "format": mesh_format(self.path)}
+        """Return the format, and the digest of the file."""
+        return {"file": file_digest(self.path), "format": mesh_format(self.path)}
 
     def expected_size(self) -> ExpectedSize:
         """Return the size that the header announces, or that the length of the file suggests."""
@@ -289,16 +286,34 @@ def _recorded_file(name: str, path: str) -> Path:
 
 
 def matching_files(folder: Path, path: str) -> list[Path]:
-    """Return the files that a path or glob names."""
+    """Return the files that a path, or a glob of ``**``, ``*``, ``?`` and ``[...]``, names.
+
+    Hidden files match only where a part of the glob begins with a dot; ``**`` follows no links to folders.
+
+    Raises:
+        StudyError: No file can have this name, or the glob matches none.
+    """
     if "\0" in path:
         raise StudyError(f"paths: no file can have the name {quoted(path)}, which holds the character NUL")
     # A file may have wildcard characters in its name; an existing one is meant.
     if not has_magic(path) or os.path.isfile(folder / path):
         return [folder / path]
+    parts = Path(path).parts
+    first = next(place for place, part in enumerate(parts) if has_magic(part))
+    base, wild = folder.joinpath(*parts[:first]), parts[first:]
     try:
-        return expand(folder, path)
-    except StudyError as error:
-        raise StudyError(f"paths: {error}") from error
+        # At the end, ** stands for folders alone.
+        found = [*base.glob("/".join([*wild, "*"] if wild[-1] == "**" else wild))]
+    except ValueError as error:
+        raise StudyError(f"paths: the glob {quoted(path, 300)} is none: {error}") from error
+    if not any(part.startswith(".") for part in wild):
+        found = [file for file in found if not any(part.startswith(".") for part in file.relative_to(base).parts)]
+    files = [file for file in dict.fromkeys(found) if file.is_file()]
+    if not files:
+        raise StudyError(
+            f"paths: the glob {quoted(path, 300)} matches no file below {base}; correct it, or put files there"
+        )
+    return files
 
 
 def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> dict[Path, float]:
@@ -361,45 +376,3 @@ def file_digest(path: Path) -> str:
         raise MeshError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
         raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-
-
-def expand(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match a pattern of ``**``, ``*``, ``?`` and ``[...]``.
-
-    The part of the pattern before its first wildcard names a folder. Files outside of that folder are
-    refused, since nobody would notice them: ``..`` after a wildcard, and links that lead out. Hidden files
-    match only where a part begins with a dot; ``**`` follows no links to folders.
-
-    Args:
-        folder: Folder where relative patterns start.
-        pattern: Pattern with at least one wildcard.
-
-    Raises:
-        StudyError: The pattern matches no file, or one outside its folder.
-    """
-    parts = Path(pattern).parts
-    first = next(i for i, part in enumerate(parts) if has_magic(part))
-    base, rest = folder.joinpath(*parts[:first]), parts[first:]
-    glob = f"the glob {quoted(pattern, 300)}"
-    if ".." in rest:
-        raise StudyError(f"{glob} goes back up behind a wildcard; name the folder to search")
-    # Two of ** in a row are one, or some patterns would take for ever.
-    rest = tuple(part for part, before in zip(rest, ("", *rest), strict=False) if not part == before == "**")
-    plain = "/".join(part if part == "**" else re.sub(r"\*+", "*", part) for part in rest)
-    inside = Path(os.path.realpath(base))
-    found = base.glob(f"{plain}/*" if rest[-1] == "**" else plain)
-    shows_hidden = any(part.startswith(".") for part in rest)
-    files = [
-        path
-        for path in dict.fromkeys(found)
-        if path.is_file() and (shows_hidden or not any(part.startswith(".") for part in path.relative_to(base).parts))
-    ]
-    if not files:
-        raise StudyError(f"{glob} matches no file below {inside}; correct it, or put files there")
-    for path in files:
-        target = Path(os.path.realpath(path))
-        if not target.is_relative_to(inside):
-            raise StudyError(
-                f"{glob} matches {str(path)!r}, a link out of {inside} to {target}; name such files by their paths"
-            )
-    return files

@@ -27,8 +27,8 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.names import quoted
 
-# Levels, or triangle counts of one mesh, that one source takes.
-MOST_ENTRIES = 1000
+# Levels, or triangle counts of one mesh, that one source takes; and times.
+_MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
 
 _GROUP = "sobolev_batch.sources"
 _HERE = "sobolev_batch.surfaces.sources"
@@ -285,19 +285,19 @@ def at_most(count: int) -> BeforeValidator:
 
 _Entry = TypeVar("_Entry")
 # One or several numbers that each make a surface.
-Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
+Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_most(_MOST_ENTRIES)]
 
 
-def checked_times(value: object, most: int = MOST_ENTRIES) -> tuple[float, ...]:
-    """Return a list of times as floats.
+def checked_times(value: object) -> tuple[float, ...]:
+    """Return a list of different times as floats.
 
     Raises:
-        ValueError: It is no list of finite numbers, all different, of at most this length.
+        ValueError: It is none.
     """
     if not isinstance(value, list | tuple) or not value:
         raise ValueError("must be a list of numbers, such as [0.0, 0.5, 1.0]")
-    if len(value) > most:
-        raise ValueError(f"at most {most} entries are allowed, found {len(value)}")
+    if len(value) > _MOST_TIMES:
+        raise ValueError(f"at most {_MOST_TIMES} entries are allowed, found {len(value)}")
     wrong = next((time for time in value if not is_finite_number(time)), None)
     if wrong is not None:
         raise ValueError(f"each time must be a finite number, found {quoted(wrong)} among them")

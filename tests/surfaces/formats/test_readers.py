@@ -25,7 +25,6 @@ from tests.support.mesh_files import (
     LITTLE,
     WRITERS,
     Read,
-    freesurfer_quads,
     obj,
     off,
     ply,
@@ -292,12 +291,6 @@ def test_other_vertices_that_coincide_stay_apart_and_odd_faces_are_kept(read: Re
     assert mesh.triangles.tolist() == faces
     assert (mesh.counts["zero_area_triangles"], mesh.counts["duplicate_triangles"]) == (1, 2)
     assert mesh.area == BOX_AREA + 2 * 4
-
-
-def test_quadrilaterals_of_freesurfer_are_cut(read: Read) -> None:
-    for old in (False, True):
-        mesh = read(".lh.orig", freesurfer_quads(BOX_VERTICES, BOX_QUADS, old=old))
-        assert (mesh.area, mesh.counts) == (BOX_AREA, CLOSED)
 
 
 @pytest.mark.parametrize(

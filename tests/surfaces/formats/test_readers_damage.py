@@ -20,7 +20,6 @@ from tests.support.mesh_files import (
     Gltf,
     box_scene,
     freesurfer,
-    freesurfer_quads,
     gifti,
     off,
     ply,
@@ -185,7 +184,7 @@ BAD: dict[str, dict[str, bytes]] = {
             )
             for vertices, triangles in ((8, 13), (8, 11), (2**31 - 1, 8), (-8, 28))
         },
-        "a quadrilateral too many": freesurfer_quads(BOX_VERTICES, BOX_QUADS, counts=(8, 7)),
+        "quadrilaterals": b"\xff\xff\xfd" + WHOLE["freesurfer"][3:],
         "thickness": b"\xff\xff\xff" + np.array([8, 12, 1], ">i4").tobytes() + bytes(32),
         "text": b"#!ascii version of lh.pial\n",
     },

@@ -56,19 +56,6 @@ def test_polygons_are_cut_into_fans(tmp_path: Path, faces: list[list[int]], suff
     assert (read.area, read.counts, read.triangles.shape) == (BOX_AREA, CLOSED, (12, 3))
 
 
-@pytest.mark.parametrize("suffix", [".vtk", ".vtp", ".vtu"])
-def test_strips_are_cut_and_keep_their_side(tmp_path: Path, suffix: str) -> None:
-    mesh = read_mesh(saved(polygons(BOX_QUADS[1:], strips=[4, 0, 1, 2, 3]), tmp_path / f"scan{suffix}"))
-    assert (mesh.area, mesh.counts) == (BOX_AREA, CLOSED)
-    # Twice the volume six times over: negative where triangles are turned inwards.
-    assert np.linalg.det(mesh.vertices[mesh.triangles]).sum() == pytest.approx(6 * 8)
-
-
-def test_pixels_have_their_corners_in_rows(tmp_path: Path) -> None:
-    mesh = read_mesh(saved(grid([[0, 1, 2, 3]], 8), tmp_path / "scan.vtu"))
-    assert (mesh.area, mesh.counts["boundary_edges"]) == (8.0, 4)
-
-
 @pytest.mark.parametrize(("suffix", "binary"), KINDS)
 @pytest.mark.parametrize("kept", [0.1, 0.6, 0.95])
 def test_a_file_that_breaks_off_is_refused_in_silence(
@@ -92,6 +79,8 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "lines alone": (lambda: pyvista.PolyData(BOX_VERTICES, lines=[2, 0, 7]), "no faces"),
     "tetrahedra": (lambda: grid([[0, 1, 2, 4]], 10), "type 10 with 4 corners.*extract_surface"),
     "triangles of four corners": (lambda: grid(BOX_QUADS, 5), "type 5 with 4 corners"),
+    "pixels": (lambda: grid([[0, 1, 2, 3]], 8), "type 8 with 4 corners.*extract_surface"),
+    "strips": (lambda: polygons(BOX_QUADS[1:], strips=[4, 0, 1, 2, 3]), "strips; cut them"),
     "an image": (lambda: pyvista.ImageData(dimensions=(3, 3, 3)), "vtkStructuredPoints.*extract_surface"),
 }
 

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -17,7 +16,7 @@ from sobolev_batch import MeshError, Study, StudyError
 from sobolev_batch.surfaces.sources.files import file_digest
 from sobolev_batch.surfaces.sources.names import caseless_key
 from tests.support.members import listed, loaded, members
-from tests.support.mesh_files import box_scene, off
+from tests.support.mesh_files import off
 from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
 from tests.support.studies import small_table
 
@@ -130,44 +129,16 @@ def test_twins_in_one_folder_are_refused(tmp_path: Path, one: str, other: str) -
     assert other in message
 
 
-def test_globs_do_not_leave_their_folder_through_links(tmp_path: Path) -> None:
-    put(tmp_path, "study/meshes/a.off", "elsewhere/secret.off")
-    folder = tmp_path / "study"
-    (folder / "meshes" / "link.off").symlink_to("../../elsewhere/secret.off")
-    for glob in ("meshes/*.off", "**/*.off", "meshes/l*"):
-        message = refused(folder, glob)
-        assert "a link out of" in message
-        assert "secret.off" in message
-        assert message.endswith("name such files by their paths")
-    # A path that is named is meant, wherever it leads.
-    assert names_of(folder, "meshes/link.off", "../elsewhere/secret.off") == ["secret", "link"]
-    (folder / "meshes" / "link.off").unlink()
-    # A link within the folder leads to nothing that was not there.
-    (folder / "meshes" / "inner.off").symlink_to("a.off")
-    assert names_of(folder, "meshes/*.off") == ["a", "inner"]
-
-
-def test_globs_do_not_leave_their_folder_through_linked_folders(tmp_path: Path) -> None:
-    put(tmp_path, "study/a.off", "elsewhere/secret.off")
-    folder = tmp_path / "study"
-    (folder / "up").symlink_to("../elsewhere")
-    assert names_of(folder, "**/*.off") == ["a"]
-    assert "a link out of" in refused(folder, "*/*.off")
-    assert "goes back up behind a wildcard" in refused(folder, "u*/../../elsewhere/*.off")
-    # What stands before the wildcard is named by the study, and therefore meant.
-    assert names_of(folder, "up/*.off") == names_of(folder, "../elsewhere/*.off") == ["secret"]
-    assert names_of(folder, f"{tmp_path}/elsewhere/*.off") == ["secret"]
-
-
-def test_loops_of_links_and_repeated_wildcards_end(tmp_path: Path) -> None:
-    put(tmp_path, *(f"{'d/' * depth}a{depth}.off" for depth in range(12)))
+def test_globs_follow_links_to_files_but_none_in_circles(tmp_path: Path) -> None:
+    put(tmp_path, "elsewhere/b.off", *(f"study/{'d/' * depth}a{depth}.off" for depth in range(4)))
+    (tmp_path / "study/b.off").symlink_to("../elsewhere/b.off")
     for name in ("one", "two"):
-        (tmp_path / "d" / name).symlink_to(".")
-    assert len(names_of(tmp_path, "**/*.off")) == 12
-    assert len(names_of(tmp_path, "/".join(["**"] * 12) + "/*.off")) == 12
+        (tmp_path / "study/d" / name).symlink_to(".")
+    assert sorted(names_of(tmp_path / "study", "**/*.off")) == ["a0", "a1", "a2", "a3", "b"]
+    assert names_of(tmp_path, "study/../elsewhere/*.off") == ["b"]
 
 
-@pytest.mark.parametrize("glob", ["*.ply", "none/*.off", "fold*", "*" * 300 + "z", "a[.off", "**/none/*", "a*\n"])
+@pytest.mark.parametrize("glob", ["*.ply", "none/*.off", "fold*", "a[.off", "**/none/*", "a*\n"])
 def test_globs_that_match_nothing_are_refused(tmp_path: Path, glob: str) -> None:
     put(tmp_path, "a.off", "folder/b.txt")
     message = refused(tmp_path, "a.off", glob)
@@ -208,17 +179,6 @@ def test_the_fingerprint_of_a_file_is_not_that_of_its_name_but_of_its_format(tmp
     found = [json.dumps(fingerprint(tmp_path, one)) for one in ("box.off", "box.ply", "box.off.gz", name)]
     assert found[3] == found[0]
     assert len(set(found)) == 3
-
-
-def test_the_fingerprint_covers_files_that_a_gltf_file_refers_to(tmp_path: Path) -> None:
-    scene = box_scene()
-    (tmp_path / "box.gltf").write_bytes(scene.gltf("data.bin"))
-    (tmp_path / "data.bin").write_bytes(scene.blob)
-    (member,) = members({"source": "files", "paths": ["box.gltf"]}, tmp_path)
-    before, area = dict(member.fingerprint()), loaded(member).area
-    (tmp_path / "data.bin").write_bytes(scene.blob.replace(np.float32(4).tobytes(), np.float32(8).tobytes()))
-    assert loaded(member).area > area
-    assert dict(member.fingerprint()) != before
 
 
 @pytest.fixture
