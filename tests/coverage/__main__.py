@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from itertools import product
+from typing import Any
 
 import click
-from tabulate import tabulate
+import pandas as pd
 
-from tests.coverage.cases import Case, all_cases
-from tests.coverage.judging import PARTS, Findings, Refusal, Tally, Verdict, judge
-from tests.coverage.kinds import KINDS, ORDERS
+from tests.coverage.cases import all_cases
+from tests.coverage.judging import PARTS, judge, judged
 
 LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0
 _SLOWEST = 10
@@ -24,65 +22,40 @@ def main(count: int, seed: int) -> None:
     """Compare reported errors with true ones over random cases; status 1 if they fall short."""
     pairs = list(all_cases(seed, count))
     with click.progressbar(pairs, label=f"{len(pairs)} pairs", file=sys.stderr) as shown:
-        found = [judge(cases) for cases in shown]
-    sys.exit(not show(found))
+        rows = [row for cases in shown for row in judge(cases)]
+    sys.exit(not show(judged(rows)))
 
 
-def show(found: Sequence[Findings]) -> bool:
+def show(table: pd.DataFrame) -> bool:
     """Print all that was found; tell whether the errors keep their promise."""
-    verdicts = [verdict for one in found for verdict in one.verdicts]
-    refusals = [refusal for one in found for refusal in one.refusals]
-    groups = [
-        (f"{kind} {order:g}", [v for v in verdicts if v.case.kind == kind and v.case.order == order])
-        for kind, order in product(KINDS, ORDERS)
-    ]
-    orders = [(f"all {order:g}", [v for v in verdicts if v.case.order == order]) for order in ORDERS]
-    kinds = [(f"{kind}, all", [v for v in verdicts if v.case.kind == kind]) for kind in KINDS]
-    rows = [_row(name, group) for name, group in (*groups, *kinds, *orders, ("all", verdicts)) if group]
-    headers = ["pair, order", "cases", "covered", "telling", "median ratio", "largest ratio", "least ratio"]
-    click.echo(tabulate(rows, headers=headers, floatfmt=".3g"))
-    for verdict in verdicts:
-        if not verdict.covered:
-            click.echo(f"not covered: {described(verdict)}")
-    for refusal in refusals:
-        if refusal.unexpected or not refusal.answered:
-            click.echo(f"refused: {_described_refusal(refusal)}")
-    taken = [(v.seconds, _described_case(v.case)) for v in verdicts]
-    taken += [(r.seconds, f"{_described_case(r.case)}, refused") for r in refusals]
-    for seconds, description in sorted(taken, reverse=True)[:_SLOWEST]:
-        click.echo(f"{seconds:.1f} s: {description}")
-    tally = Tally(tuple(verdicts))
-    share = tally.covered / len(verdicts)
-    unexpected = sum(refusal.unexpected for refusal in refusals)
+    measured, refused = table[table["measured"]], table[table["refused"].notna()]
+    columns = {"cases": ("covered", "size"), "covered": ("covered", "sum"), "telling": ("ratio", "count")}
+    columns |= {f"{name} ratio": ("ratio", name) for name in ("median", "max", "min")}
+    for by in (["kind", "order"], ["kind"], ["order"], lambda _: "all"):
+        summary = measured.groupby(by).agg(**columns)
+        click.echo(summary.to_string(float_format="{:.3g}".format))
+    for row in measured[~measured["covered"]].to_dict("records"):
+        click.echo(f"not covered: {described(row)}")
+    for row in refused[refused["unexpected"] | refused["broken"]].to_dict("records"):
+        kept = ", and refused that too" if row["broken"] else ""
+        click.echo(f"refused: {row['case']}: offered {row['refused']:.2g}{kept}")
+    for row in table.nlargest(_SLOWEST, "seconds").to_dict("records"):
+        click.echo(f"{row['seconds']:.1f} s: {row['case']}")
+    share, median = measured["covered"].mean(), measured["ratio"].median()
     click.echo(
-        f"covered {100 * share:.2f} % of {len(verdicts)}, median ratio {tally.median_ratio:.3g}, "
-        f"{len(refusals)} refused, {unexpected} of them unexpectedly"
+        f"covered {100 * share:.2f} % of {len(measured)}, median ratio {median:.3g}, "
+        f"{len(refused)} refused, {refused['unexpected'].sum()} of them unexpectedly"
     )
-    return share >= LEAST_COVERED and tally.median_ratio <= LARGEST_MEDIAN
+    return bool(share >= LEAST_COVERED and median <= LARGEST_MEDIAN)
 
 
-def described(verdict: Verdict) -> str:
-    """Return a line that identifies a verdict and its case."""
-    parts = ", ".join(f"{name} {part:.2g}" for name, part in zip(PARTS, verdict.parts, strict=True))
+def described(row: dict[str, Any]) -> str:
+    """Return a line that identifies a case and what came of it."""
+    parts = ", ".join(f"{name} {row[name]:.2g}" for name in PARTS)
     return (
-        f"{_described_case(verdict.case)}: {verdict.value:.8g} ± {verdict.reported:.2g} ({parts}), "
-        f"truly {verdict.truth.value:.8g} ± {verdict.truth.uncertainty:.1g}"
+        f"{row['case']}: {row['value']:.8g} ± {row['reported']:.2g} ({parts}), "
+        f"truly {row['truth']:.8g} ± {row['uncertainty']:.1g}"
     )
-
-
-def _described_refusal(refusal: Refusal) -> str:
-    kept = "" if refusal.answered else ", and refused that too"
-    return f"{_described_case(refusal.case)}: offered {refusal.reachable:.2g}{kept}"
-
-
-def _described_case(case: Case) -> str:
-    return f"{case.kind}, pair {case.index}, order {case.order:g}, {case.setting}"
-
-
-def _row(name: str, verdicts: list[Verdict]) -> list[str | int | float]:
-    tally = Tally(tuple(verdicts))
-    ratios = tally.ratios or [float("nan")]
-    return [name, len(verdicts), tally.covered, len(tally.ratios), tally.median_ratio, max(ratios), min(ratios)]
 
 
 if __name__ == "__main__":

@@ -1,53 +1,85 @@
-"""Random pairs of surfaces of each kind."""
+"""Random pairs of spheres and meshes, by kind."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
-from sobolev_batch import Mesh, icosphere
+from sobolev_batch import Mesh, Similarity, Sphere, icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from tests.coverage.draws import (
-    changed,
-    cortex,
-    direction,
-    placed,
-    random_box,
-    random_sphere,
-    rotation,
-    small_amount,
-    sphere_at,
-)
-from tests.coverage.pairs import Pair
-from tests.coverage.parts import PARTS
+from sobolev_batch.surfaces.sources.derived import decimated
+from sobolev_batch.surfaces.sources.files import FileSource
+from sobolev_batch.surfaces.sources.registry import load_mesh
+from tests.coverage.truth import Pair
 from tests.support.shapes import CENTRED_BOX as BOX
 
+Reals = NDArray[np.float64]
 Surfaces = tuple[Surface, Surface]
 
-ORDERS = (-0.6, -0.75, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -10.0)
-# Those at which something is known of any pair, if often little.
-_FROM_ONE = ORDERS[2:]
+# The cortical surface that the extra `studies` brings.
+_CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 # Vertices on multiples of this have exact midpoints.
 _GRID = 2.0**-20
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Pairs of one kind.
+def small_amount(rng: np.random.Generator) -> float:
+    """Return a random distance of near surfaces, in units of length."""
+    return float(10.0 ** rng.uniform(-4, -1))
 
-    Attributes:
-        make: Makes a random pair.
-        orders: Orders at which it is measured.
-        on_lattices: True if some are measured on a given lattice. Its errors are documented to miss surfaces of short
-            periods, and small ones far apart.
-    """
 
-    make: Callable[[np.random.Generator], Pair]
-    orders: tuple[float, ...]
-    on_lattices: bool = True
+def direction(rng: np.random.Generator) -> Reals:
+    vector = rng.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def rotation(rng: np.random.Generator) -> Reals:
+    return np.linalg.qr(rng.normal(size=(3, 3)))[0]
+
+
+def random_sphere(rng: np.random.Generator) -> Sphere:
+    radius = rng.uniform(0.2, 0.9)
+    return sphere_at(radius, rng.uniform(0, 1 - radius) * direction(rng))
+
+
+def sphere_at(radius: float, center: Reals) -> Sphere:
+    return Sphere(float(radius), (float(center[0]), float(center[1]), float(center[2])))
+
+
+def random_box(rng: np.random.Generator) -> Mesh:
+    sides = rng.uniform(0.1, 1.0, size=3)
+    vertices = 2 * (BOX.vertices > 0) - 1
+    vertices = (sides / np.linalg.norm(sides) * vertices) @ rotation(rng).T
+    size = rng.uniform(0.4, 0.95)
+    return Mesh(size * vertices + rng.uniform(0, 1 - size) * direction(rng), BOX.triangles)
+
+
+def changed(rng: np.random.Generator, mesh: Mesh) -> Mesh:
+    """Return the mesh a little scaled and moved, or sheared."""
+    amount = small_amount(rng)
+    if rng.random() < 0.5:
+        return Mesh((1 - amount * rng.random()) * mesh.vertices + amount * direction(rng), mesh.triangles)
+    return Mesh(mesh.vertices @ (np.eye(3) + amount * rng.normal(size=(3, 3)) / 2), mesh.triangles)
+
+
+def placed(mesh: Mesh, sphere: Sphere, turn: Reals | None = None) -> Mesh:
+    """Return a mesh of a unit sphere as one of a sphere, perhaps turned before."""
+    vertices = mesh.vertices if turn is None else mesh.vertices @ turn.T
+    return Mesh(sphere.radius * vertices + np.asarray(sphere.center), mesh.triangles)
+
+
+@lru_cache
+def cortex(triangles: int) -> Mesh:
+    """Return the cortical surface with a number of triangles, within the unit ball."""
+    (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
+    loaded = decimated(load_mesh(original), triangles)
+    mesh = Similarity.to_unit_ball(loaded).apply(loaded)
+    assert isinstance(mesh, Mesh)
+    return mesh
 
 
 def _near_spheres(rng: np.random.Generator) -> Surfaces:
@@ -56,28 +88,15 @@ def _near_spheres(rng: np.random.Generator) -> Surfaces:
     return sphere, sphere_at(sphere.radius + amount * rng.uniform(-1, 1), moved)
 
 
-def _far_spheres(rng: np.random.Generator) -> Surfaces:
-    return random_sphere(rng), random_sphere(rng)
-
-
 def _near_boxes(rng: np.random.Generator) -> Surfaces:
     box = random_box(rng)
     return box, changed(rng, box)
 
 
-def _far_boxes(rng: np.random.Generator) -> Surfaces:
-    return random_box(rng), random_box(rng)
-
-
-def _box_and_sphere(rng: np.random.Generator) -> Surfaces:
-    return random_box(rng), random_sphere(rng)
-
-
 def _icosphere_and_sphere(rng: np.random.Generator) -> Surfaces:
     """Return an icosphere and the sphere that it approximates, or another one."""
     level, sphere = int(rng.integers(0, 5)), random_sphere(rng)
-    mesh = icosphere(level)
-    mesh = Mesh(sphere.radius * mesh.vertices @ rotation(rng).T + np.asarray(sphere.center), mesh.triangles)
+    mesh = placed(icosphere(level), sphere, rotation(rng))
     return mesh, sphere if rng.random() < 0.6 else random_sphere(rng)
 
 
@@ -114,10 +133,6 @@ def _cortices(rng: np.random.Generator) -> Surfaces:
     return a, cortex(int(second)) if rng.random() < 0.6 else changed(rng, a)
 
 
-def _cortex_and_sphere(rng: np.random.Generator) -> Surfaces:
-    return cortex(int(rng.choice([100, 400, 1600]))), random_sphere(rng)
-
-
 def _open_surfaces(rng: np.random.Generator) -> Surfaces:
     """Return a box without some faces, part of an icosphere, or a triangle, and the same changed."""
     choice = rng.random()
@@ -134,8 +149,8 @@ def _open_surfaces(rng: np.random.Generator) -> Surfaces:
 
 
 def _placed_ball(rng: np.random.Generator, level: int) -> Mesh:
-    ball = icosphere(level)
-    return placed(Mesh(ball.vertices @ rotation(rng).T, ball.triangles), random_sphere(rng))
+    turn = rotation(rng)
+    return placed(icosphere(level), random_sphere(rng), turn)
 
 
 def _one_vertex_moved(rng: np.random.Generator) -> Surfaces:
@@ -174,7 +189,7 @@ def _remeshed(rng: np.random.Generator) -> Pair:
     else:
         mesh = other = Mesh(_GRID * np.round(mesh.vertices / _GRID), mesh.triangles)
     for _ in range(int(rng.integers(choice <= 0.7, 3))):
-        other = _quartered(other)
+        other = Mesh(*trimesh.remesh.subdivide(other.vertices, other.triangles))
     names = rng.permutation(len(other.vertices))
     vertices = np.empty_like(other.vertices)
     vertices[names] = other.vertices
@@ -182,29 +197,20 @@ def _remeshed(rng: np.random.Generator) -> Pair:
     return Pair(mesh, Mesh(vertices, np.roll(triangles, int(rng.integers(3)), axis=1)), equal=True)
 
 
-def _quartered(mesh: Mesh) -> Mesh:
-    vertices, triangles = trimesh.remesh.subdivide(mesh.vertices, mesh.triangles)
-    return Mesh(vertices, triangles)
-
-
-def _plain(make: Callable[[np.random.Generator], Surfaces]) -> Callable[[np.random.Generator], Pair]:
-    return lambda rng: Pair(*make(rng))
-
-
-KINDS: dict[str, Kind] = {
-    "near spheres": Kind(_plain(_near_spheres), ORDERS),
-    "far spheres": Kind(_plain(_far_spheres), ORDERS),
-    "near boxes": Kind(_plain(_near_boxes), _FROM_ONE),
-    "far boxes": Kind(_plain(_far_boxes), _FROM_ONE),
-    "box, sphere": Kind(_plain(_box_and_sphere), _FROM_ONE),
-    "icosphere, sphere": Kind(_plain(_icosphere_and_sphere), _FROM_ONE),
-    "icospheres": Kind(_plain(_icospheres), _FROM_ONE),
-    "solids": Kind(_plain(_solids), _FROM_ONE),
-    "cortices": Kind(_plain(_cortices), _FROM_ONE),
-    "cortex, sphere": Kind(_plain(_cortex_and_sphere), _FROM_ONE),
-    "open surfaces": Kind(_plain(_open_surfaces), _FROM_ONE),
-    "one vertex moved": Kind(_plain(_one_vertex_moved), _FROM_ONE),
-    "distant spheres": Kind(_plain(_distant_spheres), ORDERS, on_lattices=False),
-    "distant tetrahedra": Kind(_plain(_distant_tetrahedra), ORDERS, on_lattices=False),
-    "remeshed": Kind(_remeshed, ORDERS),
-} | {name: Kind(make, ORDERS, on_lattices=False) for name, make in PARTS.items()}
+MAKERS: dict[str, Callable[[np.random.Generator], Surfaces | Pair]] = {
+    "near spheres": _near_spheres,
+    "far spheres": lambda rng: (random_sphere(rng), random_sphere(rng)),
+    "near boxes": _near_boxes,
+    "far boxes": lambda rng: (random_box(rng), random_box(rng)),
+    "box, sphere": lambda rng: (random_box(rng), random_sphere(rng)),
+    "icosphere, sphere": _icosphere_and_sphere,
+    "icospheres": _icospheres,
+    "solids": _solids,
+    "cortices": _cortices,
+    "cortex, sphere": lambda rng: (cortex(int(rng.choice([100, 400, 1600]))), random_sphere(rng)),
+    "open surfaces": _open_surfaces,
+    "one vertex moved": _one_vertex_moved,
+    "distant spheres": _distant_spheres,
+    "distant tetrahedra": _distant_tetrahedra,
+    "remeshed": _remeshed,
+}

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
-from tests.coverage.draws import direction, rotation, small_amount
-from tests.coverage.pairs import Pair
+from tests.coverage.kinds import direction, rotation, small_amount
+from tests.coverage.truth import Pair
 from tests.support.rectangles import Rectangles
 
 Reals = NDArray[np.float64]

@@ -1,25 +1,26 @@
 """Independent values of distances, each with its own uncertainty.
 
-Two spheres have a radial integral, axis-parallel rectangles an exact heat trace, at every order. Meshes of few
-triangles are integrated in real space, the inner integral in closed form up to the sides of the faces, the outer with
-two rules. Others are summed in real space on triangles that are cut finer and finer, as long as that does not take too
-many points. At orders from -2 on, the rest, and what such sums find hard (surfaces nearer to each other than the
-points), is taken from a far finer lattice, and above -2 from an accuracy that few others ask for, with another seed.
-Triangles that both meshes have are left out. Whatever is most certain counts.
+Two spheres, and axis-parallel rectangles, have exact heat traces, at every order. Meshes of few triangles are
+integrated in real space, the inner integral in closed form up to the sides of the faces, the outer with two rules.
+Others are summed in real space on triangles that are cut finer and finer, as long as that does not take too many
+points. At orders from -2 on, the rest, and what such sums find hard (surfaces nearer to each other than the points),
+is taken from a far finer lattice, and above -2 from an accuracy that few others ask for, with another seed. Triangles
+that both meshes have are left out. Whatever is most certain counts.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from sobolev_batch import AccuracyError, Lattice, Mesh, Sphere, distance, fourier_transform
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
-from tests.coverage import spheres
 from tests.coverage.matern import (
     Sides,
     divided_points,
@@ -28,7 +29,7 @@ from tests.coverage.matern import (
     mesh_potentials,
     sphere_potential,
 )
-from tests.support.rectangles import Rectangles
+from tests.support.rectangles import TIMES, Rectangles, integrals_of_traces
 
 Reals = NDArray[np.float64]
 
@@ -74,9 +75,70 @@ class Truth:
         return cls(float(value), float(max(high - value, value - low)))
 
 
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two surfaces.
+
+    Attributes:
+        first: One of them.
+        second: The other one.
+        rectangles: What they were made of if they are axis-parallel rectangles, perhaps turned and moved together.
+        turned: True if they were.
+        equal: True if they are one surface in different triangles.
+    """
+
+    first: Surface
+    second: Surface
+    rectangles: tuple[Rectangles, Rectangles] | None = None
+    turned: bool = False
+    equal: bool = False
+
+    @property
+    def surfaces(self) -> tuple[Surface, Surface]:
+        """Both surfaces."""
+        return self.first, self.second
+
+    def swapped(self) -> Pair:
+        """Return the pair in the other order."""
+        return replace(self, first=self.second, second=self.first)
+
+    def truths(self, orders: Sequence[float]) -> Sequence[Truth | None]:
+        """Return the true distance for each order; None where nothing is known of it."""
+        if self.equal:
+            return [Truth(0.0, 0.0)] * len(orders)
+        if self.rectangles is not None:
+            return truths_of_rectangles(*self.rectangles, orders, turned=self.turned)
+        if isinstance(self.first, Sphere) and isinstance(self.second, Sphere):
+            return truths_of_spheres(self.first, self.second, orders)
+        return truths_in_space(self.first, self.second, orders)
+
+
 def truths_of_spheres(first: Sphere, second: Sphere, orders: Sequence[float]) -> list[Truth]:
-    """Return the distance of two spheres for each order."""
-    squares, slacks = spheres.squared_distances(first, second, orders)
+    """Return the distance of two spheres for each order, by their heat trace; see `tests.support.rectangles`.
+
+    At a distance r from the centre of a sphere of radius R, exp(-k²|x-y|²) has the mean
+    [exp(-k²(r-R)²) - exp(-k²(r+R)²)] / (4k²rR) over it, k = π/√t. Over another sphere, r has a density in proportion
+    to itself.
+    """
+    rates = np.pi / np.sqrt(TIMES)
+
+    def mean_of_gaussian(center: float, middle: float, half: float) -> Reals:
+        """Return the mean of exp(-k²(r-center)²) over the distances r within a half width of a middle."""
+        nodes, weights = np.polynomial.legendre.leggauss(16)
+        inner = np.exp(-((rates[:, None] * (middle - center + half * nodes)) ** 2)) @ weights / 2
+        low, high = (rates * (middle + sign * half - center) for sign in (-1, 1))
+        wide = rates * half > 1
+        outer = np.sqrt(np.pi) / 4 * (erf(high) - erf(low)) / np.where(wide, rates * half, 1.0)
+        return np.where(wide, outer, inner)
+
+    traces, scales = np.zeros_like(TIMES), np.zeros_like(TIMES)
+    for (one, sign), (other, other_sign) in product(((first, 1.0), (second, -1.0)), repeat=2):
+        apart = math.dist(one.center, other.center)
+        middle, half = max(apart, other.radius), min(apart, other.radius)
+        means = mean_of_gaussian(one.radius, middle, half) - mean_of_gaussian(-one.radius, middle, half)
+        terms = one.area * other.area * rates / (4 * np.pi**1.5 * one.radius * middle) * means
+        traces, scales = traces + sign * other_sign * terms, scales + terms
+    squares, slacks = integrals_of_traces(traces, scales, orders)
     return list(map(Truth.of_square, squares.tolist(), slacks.tolist()))
 
 

@@ -20,8 +20,9 @@ from sobolev_batch import Mesh
 
 Reals = NDArray[np.float64]
 
-# Least and largest time, and steps of the finer of two rules. The least resolves gaps from some 1e-6 on.
-_LEAST_TIME, _LARGEST_TIME, _STEPS = 1e-12, 80.0, 480
+# Times of the finer of two rules. The least resolves gaps from some 1e-6 on.
+TIMES: Reals = np.geomspace(1e-12, 80.0, 481)
+_STEP = float(np.log(TIMES[1] / TIMES[0]))
 # Rounding of a trace, relative to the one without signs.
 _ROUNDING = 1e-14
 
@@ -114,22 +115,27 @@ class Rectangles:
         """Return the squared distances (orders,) of the two area measures, and their uncertainties."""
         both = self.joined(other)
         signs = np.concatenate([np.ones(len(self.low)), -np.ones(len(other.low))])
-        logs = np.linspace(np.log(_LEAST_TIME), np.log(_LARGEST_TIME), _STEPS + 1)
-        times, step = np.exp(logs), logs[1] - logs[0]
-        traces, scales = _heat_traces(*_intervals(both), signs, times)
-        squares, slacks = [], []
-        for order in orders:
-            factors = times**-order * np.exp(-times) / gamma(-order)
-            fine = _integral(factors * traces, step, -order)
-            coarse = _integral((factors * traces)[::2], 2 * step, -order)
-            rounding = _ROUNDING * _integral(factors * scales, step, -order)
-            # The limit of √t G is off by terms in √t, which a change of √t by half shows.
-            later = int(np.ceil(np.log(4) / step))
-            limits = np.sqrt(times) * traces
-            unlimited = abs(limits[later] - limits[0]) / np.sqrt(times[0]) * factors[0] / (-order - 0.5)
-            squares.append(fine)
-            slacks.append(abs(fine - coarse) + rounding + unlimited)
-        return np.array(squares), np.array(slacks)
+        return integrals_of_traces(*_heat_traces(*_intervals(both), signs), orders)
+
+
+def integrals_of_traces(traces: Reals, scales: Reals, orders: Sequence[float]) -> tuple[Reals, Reals]:
+    """Return the squared norms (orders,) of heat traces at `TIMES`, and their uncertainties.
+
+    `scales` are sums of the sizes of the terms of the traces.
+    """
+    squares, slacks = [], []
+    for order in orders:
+        factors = TIMES**-order * np.exp(-TIMES) / gamma(-order)
+        fine = _integral(factors * traces, _STEP, -order)
+        coarse = _integral((factors * traces)[::2], 2 * _STEP, -order)
+        rounding = _ROUNDING * _integral(factors * scales, _STEP, -order)
+        # The limit of √t G is off by terms in √t, which a change of √t by half shows.
+        later = int(np.ceil(np.log(4) / _STEP))
+        limits = np.sqrt(TIMES) * traces
+        unlimited = abs(limits[later] - limits[0]) / np.sqrt(TIMES[0]) * factors[0] / (-order - 0.5)
+        squares.append(fine)
+        slacks.append(abs(fine - coarse) + rounding + unlimited)
+    return np.array(squares), np.array(slacks)
 
 
 def _integral(terms: Reals, step: float, power: float) -> float:
@@ -150,15 +156,13 @@ def _intervals(rectangles: Rectangles) -> tuple[list[Reals], list[NDArray[np.int
     return intervals, places
 
 
-def _heat_traces(
-    intervals: Sequence[Reals], places: Sequence[NDArray[np.int64]], signs: Reals, times: Reals
-) -> tuple[Reals, Reals]:
-    """Return the heat trace at each time, and what it would be if all signs were positive."""
+def _heat_traces(intervals: Sequence[Reals], places: Sequence[NDArray[np.int64]], signs: Reals) -> tuple[Reals, Reals]:
+    """Return the heat trace at each of the times, and what it would be if all signs were positive."""
     grids = [np.zeros([len(different) for different in intervals]) for _ in range(2)]
     for grid, weights in zip(grids, (signs, np.ones(len(signs))), strict=True):
         np.add.at(grid, tuple(places), weights)
     traces = []
-    for time in times:
+    for time in TIMES:
         factors = [_axis_factors(ends[:, 0], ends[:, 1], np.pi / np.sqrt(time)) for ends in intervals]
         if len(signs) ** 2 < grids[0].size:
             # Few rectangles with many intervals: all pairs of them.
@@ -168,7 +172,7 @@ def _heat_traces(
         else:
             sums = (np.einsum("ai,bj,ck,ijk->abc", *factors, grid, optimize=True) for grid in grids)
             traces.append([np.vdot(grid, inner) for grid, inner in zip(grids, sums, strict=True)])
-    signed, positive = (np.pi / times) ** 1.5 * np.array(traces).T
+    signed, positive = (np.pi / TIMES) ** 1.5 * np.array(traces).T
     return signed, positive
 
 
