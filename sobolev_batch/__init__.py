@@ -15,7 +15,7 @@ task; a reduction over the stored fields makes the tables. Data flows one way th
 The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`.
-- The causes of a distance: `proportion` (area or shape), `spectrum` (wavelengths), `witness` (places).
+- The causes of a distance: `spectrum` (wavelengths), `witness` (places).
 - Meshes made by the metric: `fit` and `refine` give a `Fit`, with its `FitQuality` before and after, and `FitProgress`
   on the way; `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for
   tensors.

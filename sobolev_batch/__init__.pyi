@@ -53,7 +53,6 @@ from .results.tables.league import league as league
 from .results.tables.matrix import matrix as matrix
 from .spectral.fields import fourier_transform as fourier_transform
 from .spectral.lattice import Lattice as Lattice
-from .spectral.metrics.causes import proportion as proportion
 from .spectral.metrics.causes import spectrum as spectrum
 from .spectral.metrics.causes import witness as witness
 from .spectral.metrics.norms import distance as distance

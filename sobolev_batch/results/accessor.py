@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import OperandLike, pair_of
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.metrics.causes import proportion, spectrum, witness
+from sobolev_batch.spectral.metrics.causes import spectrum, witness
 from sobolev_batch.spectral.metrics.norms import distance, norm
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.surface import Similarity
@@ -24,9 +24,8 @@ class SobolevAccessor:
     you open with plain xarray, import this class: ``from sobolev_batch import SobolevAccessor``.
 
     A field lies over xi_x, xi_y and xi_z >= 0, is the transform ∫ exp(-2πi ξ·x) dμ(x) with ξ in cycles per
-    unit length, and may be lazy. `norm`, `distance`, `proportion` and `spectrum` also take a
-    stack of fields along one more dimension, such as mesh. They read one field at a time, and their results
-    have that dimension.
+    unit length, and may be lazy. `norm`, `distance` and `spectrum` also take a stack of fields
+    along one more dimension, such as mesh. They read one field at a time, and their results have that dimension.
 
     Raises:
         LatticeError: In all methods: the array is no field, or several fields where one is needed.
@@ -59,10 +58,6 @@ class SobolevAccessor:
     def distance(self, other: OperandLike, order: Orders) -> xr.Dataset:
         """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""
         return self._each_with(other, order, lambda field, common: distance(field, common, order))
-
-    def proportion(self, other: OperandLike, order: Orders) -> xr.Dataset:
-        """Return the parts of the distance that are area and shape; see `sobolev_batch.proportion`."""
-        return self._each_with(other, order, lambda field, common: proportion(field, common, order))
 
     def spectrum(
         self,

@@ -80,7 +80,7 @@ class StoreAccessor:
     def distance(self, mesh: str, other: str, order: Orders) -> xr.Dataset:
         """Return the distance of two meshes with its error, relative to the other one, and in parts of area and shape.
 
-        See `sobolev_batch.distance` and `sobolev_batch.proportion`.
+        See `sobolev_batch.distance`.
 
         Args:
             mesh: Label of one mesh.

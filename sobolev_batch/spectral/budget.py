@@ -345,6 +345,27 @@ class ReferenceEstimate:
             return np.asarray(self.products / self.norms.values**2)
 
 
+def area_and_shape(squares: Reals, products: Reals, reference: Reals) -> Reals:
+    """Return two orthogonal parts of distances to a reference b: that of area, and the rest, (2, orders, ...).
+
+    The multiple of b nearest to a is c b with c = 1 + <e, b>/<b, b> for the difference e = a - b, in which nothing
+    cancels for near-duplicates. Then e = (c - 1) b + (a - c b).
+
+    Args:
+        squares: ||e||² (orders, ...).
+        products: <e, b>, likewise.
+        reference: ||b||² (orders,).
+
+    Returns:
+        ||(c - 1) b||, and ||a - c b||, good to 1e-15 of the squared distance in its square.
+    """
+    norm = np.sqrt(reference).reshape(-1, *[1] * (squares.ndim - 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Rounding may make the projection longer than what it projects.
+        area = np.minimum(np.abs(products) / norm, np.sqrt(squares))
+    return np.stack([area, np.sqrt(np.maximum(squares - area**2, 0.0))])
+
+
 def product_rounding(distances: NormEstimate, norms: NormEstimate) -> Reals:
     """Return how far off products may be by the errors of the values of both factors (orders,)."""
     rounding, of_reference = distances.discretisation, norms.discretisation

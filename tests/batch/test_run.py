@@ -24,11 +24,11 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
         expected = sb.fourier_transform(sb.icosphere(level), SMALL_LATTICE, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
-        assert found == pytest.approx(sb.distance(expected, sphere, study.orders)["distance"].values, rel=1e-12)
-        split = sb.proportion(expected, sphere, study.orders)
-        for name in ("area_part", "shape_part"):
+        own = sb.distance(expected, sphere, study.orders)
+        assert found == pytest.approx(own["distance"].values, rel=1e-12)
+        for name, share in (("area_part", own["area_share"]), ("shape_part", 1 - own["area_share"])):
             stored_part = variable(tree, "convergence", name).sel(mesh=f"ico/{level}").values
-            assert stored_part == pytest.approx(split[name].values, rel=1e-8)
+            assert stored_part == pytest.approx((own["distance"] * share**0.5).values, rel=1e-8)
         # A field straight from the store serves as an argument too.
         assert sb.distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
     matrix = variable(tree, "distances", "distance").sel(order=-10.0).values

@@ -33,7 +33,6 @@ def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) ->
     own: SobolevAccessor = a.sobolev
     xr.testing.assert_identical(own.norm(ORDERS), sb.norm(a, ORDERS))
     xr.testing.assert_identical(own.distance(b, -2), sb.distance(a, b, -2))
-    xr.testing.assert_identical(own.proportion(b, ORDERS), sb.proportion(a, b, ORDERS))
     xr.testing.assert_identical(own.spectrum(b, ORDERS, bands=5), sb.spectrum(a, b, ORDERS, bands=5))
     xr.testing.assert_identical(own.spectrum(None, -2), sb.spectrum(a, None, -2))
     xr.testing.assert_allclose(own.witness(b, -2, points), sb.witness(a, b, -2, points), rtol=1e-9)
@@ -69,8 +68,8 @@ def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
     distances = levels.sobolev.distance(stored.sel(mesh="reference"), [-10.0, -3.0])
     tables = variable(tree, "convergence", "distance").sel(mesh=["ico/1", "ico/3"], order=[-10.0, -3.0])
     assert distances["distance"].values == pytest.approx(tables.values, rel=1e-9)
-    shape = levels.sobolev.proportion(sb.Sphere(), -3.0)["shape_part"]
-    assert shape.values == pytest.approx(
+    found = levels.sobolev.distance(sb.Sphere(), -3.0)
+    assert (found["distance"] * (1 - found["area_share"]) ** 0.5).values == pytest.approx(
         variable(tree, "convergence", "shape_part").sel(mesh=["ico/1", "ico/3"], order=-3.0).values, rel=1e-6
     )
     bands = levels.sobolev.spectrum(None, -2.0)

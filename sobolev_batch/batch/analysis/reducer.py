@@ -20,12 +20,12 @@ from sobolev_batch.spectral.budget import (
     Support,
     add_sums,
     aliased,
+    area_and_shape,
     estimate_norms,
     sums_of_shells,
 )
 from sobolev_batch.spectral.fields import Quality, TailQuality
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.metrics.causes import area_and_shape
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
@@ -275,7 +275,7 @@ class Reducer:
             # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
             product = product + tail_product + (beyond - tail_reference.beyond - beyond_difference) / 2 * apart
             square = square + tail_reference.squares
-        area, shape, _ = area_and_shape(distances.values**2, product, square[:, 0])
+        area, shape = area_and_shape(distances.values**2, product, square[:, 0])
         return own, distances, np.stack([area, shape, beyond, beyond_difference])
 
     def _sums(self, rows: Sequence[int]) -> list[Sums]:

@@ -1,4 +1,4 @@
-"""Causes of a distance: area and shape, wavelengths, and places where the surfaces differ."""
+"""Causes of a distance: wavelengths, and places where the surfaces differ."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from sobolev_batch.spectral.fields import (
     field_of,
     pair_of,
     read_blocks,
-    shells_against,
     shells_of,
 )
 from sobolev_batch.spectral.lattice import Block, Lattice
@@ -27,7 +26,6 @@ from sobolev_batch.spectral.metrics.datasets import (
     LENGTH,
     NUMBER,
     described,
-    labelled,
     lattice_attributes,
     order_axis,
 )
@@ -39,69 +37,6 @@ from sobolev_batch.surfaces.shapes.surface import Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12
-
-
-def proportion(a: OperandLike, b: OperandLike, order: Orders, *, lattice: Lattice | None = None) -> xr.Dataset:
-    """Return the distance ||a - b||_s split into a pure change of total area and the rest.
-
-    The multiple of b nearest to a is c b with c = <a, b>_s/<b, b>_s. Then a - b = (c - 1) b + (a - c b),
-    and both parts are orthogonal in the norm of order s.
-
-    Args:
-        a: Field from `fourier_transform` or a store, or a surface.
-        b: Reference: a field on the same lattice, or a surface.
-        order: One order s < -1/2, or several.
-        lattice: Lattice to transform surfaces on. A field brings its own.
-
-    Returns:
-        Dataset over `order` with `distance`, `area_part` = |c - 1| ||b||_s, `shape_part` = ||a - c b||_s,
-        `area_share` = area_part² / distance² (NaN between equal fields), and `excess` = c - 1, positive
-        where a has more area than b. All are float64. The squares of both parts add up to that of the
-        distance. A single order has no dimension. Attributes hold the lattice and the kernel.
-
-    Raises:
-        OrderError: An order is not below -1/2.
-        LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
-        InputError: A surface comes without a lattice.
-
-    >>> from sobolev_batch import Lattice, Sphere, proportion
-    >>> parts = proportion(Sphere(0.9), Sphere(), -2.0, lattice=Lattice(3.0, 32))
-    >>> f"{parts['excess'].item():.3f}", f"{parts['area_share'].item():.2f}"
-    ('-0.206', '0.19')
-    """
-    orders = check_orders(order)
-    first, second = pair_of(a, b, lattice, orders)
-    weights = SobolevWeights(Lattice.from_field(first), orders)
-    squares, products, reference = shells_against(first, second, weights.lattice)
-    area, shape, excess = area_and_shape(*(weights.per_shell @ sums for sums in (squares, products, reference)))
-    distance = np.sqrt(weights.per_shell @ squares)
-    with np.errstate(invalid="ignore"):
-        share = (area / distance) ** 2
-    parts = {"distance": distance, "area_part": area, "shape_part": shape, "area_share": share, "excess": excess}
-    return labelled(order, parts, lattice_attributes(weights.lattice, first, second))
-
-
-def area_and_shape(squares: Reals, products: Reals, reference: Reals) -> Reals:
-    """Return two orthogonal parts of distances to a reference b, and the excess of area, (3, orders, ...).
-
-    The best multiple c of b has c - 1 = <e, b>/<b, b> for the difference e = a - b. Nothing cancels in it for
-    near-duplicates, since a itself does not occur.
-
-    Args:
-        squares: ||e||² (orders, ...).
-        products: <e, b>, likewise.
-        reference: ||b||² (orders,).
-
-    Returns:
-        ||(c - 1) b||; the rest ||a - c b||, good to 1e-15 of the squared distance in its square; and c - 1.
-    """
-    norm = np.sqrt(reference).reshape(-1, *[1] * (squares.ndim - 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        area = np.abs(products) / norm
-        excess = products / norm**2
-    # Rounding may make the projection longer than what it projects.
-    area = np.minimum(area, np.sqrt(squares))
-    return np.stack([area, np.sqrt(np.maximum(squares - area**2, 0.0)), excess])
 
 
 def spectrum(

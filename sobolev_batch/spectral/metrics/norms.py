@@ -133,7 +133,7 @@ def distance(
     Returns:
         Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. `relative` is the
         distance over the norm of b, `relative_error` its error, `area_share` the share of the squared distance that a
-        change of total area explains (see `proportion`), `area_share_error` its error, and `excess` the relative
+        change of total area explains, `area_share_error` its error, and `excess` the relative
         change of area that does so. All are float64, NaN where they are unknown. With rtol, `within` is True where the
         error is below rtol times the distance.
 

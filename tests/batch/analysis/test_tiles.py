@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Sphere, Study, fourier_transform, proportion
+from sobolev_batch import Sphere, Study, distance, fourier_transform
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
@@ -119,9 +119,10 @@ def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.comp
     # The parts of each distance are those of the library, whatever the chunks.
     for row, area, shape in zip([1, 3], areas.T, shapes.T, strict=False):
         known = fourier_transform(Sphere(0.1), reducer.lattice)
-        alone = proportion(known.copy(data=fields[row]), known.copy(data=fields[REFERENCE]), reducer.orders)
-        assert area == pytest.approx(alone["area_part"].values, rel=1e-10)
-        assert shape == pytest.approx(alone["shape_part"].values, rel=1e-12)
+        alone = distance(known.copy(data=fields[row]), known.copy(data=fields[REFERENCE]), reducer.orders)
+        whole, share = alone["distance"].values, alone["area_share"].values
+        assert area == pytest.approx(whole * share**0.5, rel=1e-10)
+        assert shape == pytest.approx(whole * (1 - share) ** 0.5, rel=1e-12)
     assert (areas**2 + shapes**2)[:, :2] == pytest.approx(to_reference.values[:, :2] ** 2, rel=1e-12)
     assert (areas[:, 2] == 0).all()
     assert (shapes[:, 2] == 0).all()

@@ -1,4 +1,4 @@
-"""Causes of distances: area and shape, wavelengths, places, against sums over the whole lattice and closed forms."""
+"""Causes of distances: area, wavelengths, places, against sums over the whole lattice and closed forms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from sobolev_batch import (
     fourier_transform,
     icosphere,
     norm,
-    proportion,
     spectrum,
     witness,
 )
@@ -29,7 +28,6 @@ from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.metrics import causes
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
-from sobolev_batch.spectral.spheres import sphere_inner_product
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
@@ -53,38 +51,22 @@ def random_values(rng: np.random.Generator) -> Complexes:
     return rng.standard_normal(SMALL.shape) + 1j * rng.standard_normal(SMALL.shape)
 
 
-# Area and shape.
+# Area.
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_is_the_projection_spelt_out(seed: int) -> None:
+def test_the_share_of_area_is_the_projection_spelt_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     b = random_values(rng)
     a = rng.uniform(-2, 2) * b + rng.uniform(0, 2) * random_values(rng)
-    dataset = proportion(as_field(a, SMALL), as_field(b, SMALL), SMALL_ORDERS)
+    dataset = distance(as_field(a, SMALL), as_field(b, SMALL), SMALL_ORDERS)
     for order in SMALL_ORDERS:
         row = dataset.sel(order=order)
-
-        def norm(values: Complexes, order: float = order) -> float:
-            return full_lattice_norm(values, SMALL, order)
-
+        plus, minus, own = (full_lattice_norm(values, SMALL, order) for values in (a + b, a - b, b))
         # The inner product by polarisation.
-        multiple = (norm(a + b) ** 2 - norm(a - b) ** 2) / (4 * norm(b) ** 2)
+        multiple = (plus**2 - minus**2) / (4 * own**2)
         assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-10, abs=1e-12)
-        assert row["area_part"].item() == pytest.approx(abs(multiple - 1) * norm(b), rel=1e-10)
-        assert row["shape_part"].item() == pytest.approx(norm(a - multiple * b), rel=1e-10)
-        # Any other multiple is farther away.
-        assert all(norm(a - (multiple + d) * b) > row["shape_part"].item() for d in (-1e-3, 1e-3))
-
-
-def test_parts_add_up_to_the_squared_distance() -> None:
-    rng = np.random.default_rng(7)
-    a, b = as_field(random_values(rng), SMALL), as_field(random_values(rng), SMALL)
-    dataset = proportion(a, b, SMALL_ORDERS)
-    squares = distance(a, b, SMALL_ORDERS)["distance"].values ** 2
-    assert (dataset["area_part"] ** 2 + dataset["shape_part"] ** 2).values == pytest.approx(squares, rel=1e-12)
-    assert dataset["distance"].values ** 2 == pytest.approx(squares, rel=1e-12)
-    assert dataset["area_share"].values == pytest.approx(dataset["area_part"].values ** 2 / squares, rel=1e-12)
+        assert row["area_share"].item() == pytest.approx((multiple - 1) ** 2 * own**2 / minus**2, rel=1e-10)
 
 
 def test_near_twins_keep_their_digits() -> None:
@@ -93,42 +75,17 @@ def test_near_twins_keep_their_digits() -> None:
     b = np.round(random_values(rng) * 2**10) / 2**10
     e = np.round((0.3 * b + random_values(rng)) * 2**6) / 2**42
     assert np.array_equal((b + e) - b, e)
-    dataset = proportion(as_field(b + e, SMALL), as_field(b, SMALL), -3.0)
-    larger = proportion(as_field(b + 2**30 * e, SMALL), as_field(b, SMALL), -3.0)
-    for name in ("excess", "area_part", "shape_part"):
-        assert 2**30 * dataset[name].item() == pytest.approx(larger[name].item(), rel=1e-12)
-
-
-@pytest.mark.parametrize("a", [Sphere(0.9), Sphere(1.0, (0.05, 0.0, 0.0))])
-@pytest.mark.parametrize("order", [-10.0, -4.0])
-def test_spheres_against_their_closed_forms(a: Sphere, order: float) -> None:
-    b = Sphere()
-    row = proportion(a, b, order, lattice=Lattice(5.0, 64))
-    multiple = sphere_inner_product(a, b, order) / sphere_inner_product(b, b, order)
-    assert row["excess"].item() == pytest.approx(multiple - 1, rel=1e-3)
-    left_over = sphere_inner_product(a, a, order) - multiple * sphere_inner_product(a, b, order)
-    assert row["shape_part"].item() ** 2 == pytest.approx(left_over, rel=2e-3)
-
-
-def test_equal_fields_and_missing_samples() -> None:
-    a = fourier_transform(BOX, SMALL)
-    same, bands = proportion(a, a, -2.0), spectrum(a, a, -2.0)
-    assert (same["distance"].item(), same["area_part"].item(), same["shape_part"].item()) == (0, 0, 0)
-    assert np.isnan(same["area_share"].item())
-    assert np.isnan(bands["share"].values).all()
-    damaged = a.copy()
-    damaged[8, 8, 0] = np.nan
-    parts, bands = proportion(damaged, a, -2.0), spectrum(damaged, a, -2.0)
-    assert all(np.isnan(parts[name].item()) for name in ("area_part", "shape_part"))
-    assert np.isnan([bands["total"].item(), bands["squared"].values[0]]).all()
+    near, larger = (distance(as_field(b + factor * e, SMALL), as_field(b, SMALL), -3.0) for factor in (1, 2**30))
+    assert 2**30 * near["excess"].item() == pytest.approx(larger["excess"].item(), rel=1e-12)
+    assert near["area_share"].item() == pytest.approx(larger["area_share"].item(), rel=1e-12)
 
 
 def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(10)
     a, b = as_field(random_values(rng), SMALL), as_field(random_values(rng), SMALL)
-    whole, read = proportion(a, b, SMALL_ORDERS), fields.read_blocks
+    whole, read = distance(a, b, SMALL_ORDERS), fields.read_blocks
     monkeypatch.setattr(fields, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=200))
-    xr.testing.assert_allclose(proportion(a, b, SMALL_ORDERS), whole, rtol=1e-12)
+    xr.testing.assert_allclose(distance(a, b, SMALL_ORDERS), whole, rtol=1e-12)
 
 
 # Wavelengths.
@@ -190,14 +147,15 @@ def test_default_bands_and_wavelengths() -> None:
     assert "own_longest_wavelength" not in spectrum(Sphere(), None, -3.0, lattice=LATTICE).coords
 
 
-def test_equal_fields_have_no_shares_and_missing_samples_no_spectrum() -> None:
+def test_equal_fields_have_no_shares_and_missing_samples_no_numbers() -> None:
     a = fourier_transform(Sphere(), LATTICE)
     assert np.isnan(spectrum(a, a, -2.0)["share"].values).all()
+    assert np.isnan(distance(a, a, -2.0)["area_share"].item())
     damaged = a.copy()
     damaged[16, 16, 0] = np.nan
-    dataset = spectrum(damaged, a, -2.0)
-    assert np.isnan(dataset["total"].item())
-    assert np.isnan(dataset["squared"].values[0])
+    bands, whole = spectrum(damaged, a, -2.0), distance(damaged, a, -2.0)
+    numbers = [bands["total"].item(), bands["squared"].values[0], *(whole[n].item() for n in ("distance", "excess"))]
+    assert np.isnan(numbers).all()
 
 
 @pytest.mark.parametrize(

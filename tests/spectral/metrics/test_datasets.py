@@ -16,7 +16,6 @@ from sobolev_batch import (
     fourier_transform,
     icosphere,
     norm,
-    proportion,
     spectrum,
     witness,
 )
@@ -28,7 +27,6 @@ POINTS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 METRICS: dict[str, Callable[[list[float]], xr.Dataset]] = {
     "norm": lambda order: norm(A, order),
     "distance": lambda order: distance(A, B, order),
-    "proportion": lambda order: proportion(A, B, order),
     "spectrum": lambda order: spectrum(A, B, order),
     "witness": lambda order: witness(A, B, order, POINTS).to_dataset(promote_attrs=True),
 }

@@ -153,7 +153,6 @@ USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "distance": lambda mesh, target: sb.distance(mesh, target, -2.0)["distance"].item(),
     "distance from": lambda mesh, _: sb.distance(BALL, mesh, -4.0, rtol=0.5)["distance"].item(),
     "norm": lambda mesh, _: sb.norm(mesh, -4.0, rtol=0.5)["norm"].item(),
-    "proportion": lambda mesh, target: sb.proportion(target, mesh, -2.0)["area_part"].item(),
     "spectrum": lambda mesh, _: sb.spectrum(mesh, None, -2.0, lattice=LATTICE)["total"].item(),
     "witness": lambda mesh, target: sb.witness(mesh, target, -2.0, [[0, 0, 0]]).item(),
     "fourier_transform": lambda mesh, _: abs(sb.fourier_transform(mesh, LATTICE)).sum().item(),
