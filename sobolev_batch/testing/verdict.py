@@ -151,10 +151,10 @@ def same_surface(
     area_change = surface.area / reference.area - 1
     similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
     pair = similarity.apply(surface), similarity.apply(reference)
-    found = relative_distance(*pair, checked_order, rtol, accuracy, available_cores(), seed)
-    lower, upper = found.bounds.lower, found.bounds.upper
+    bounds, method = relative_distance(*pair, checked_order, rtol, accuracy, available_cores(), seed)
+    lower, upper = bounds.lower, bounds.upper
     outcome: Outcome = "same" if upper <= rtol else "different" if lower > rtol else "undecided"
-    return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, found.method)
+    return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, method)
 
 
 def assert_same_surface(

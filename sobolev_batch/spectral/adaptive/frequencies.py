@@ -1,17 +1,24 @@
-"""Frequencies at which surfaces are compared, and the norms and products that follow from values there."""
+"""Frequencies at which surfaces are compared, with the norms and products that follow from values there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.adaptive.problem import Problem, Solution, support_of
-from sobolev_batch.spectral.adaptive.values import Measure, SurfaceValues
+from sobolev_batch.spectral.adaptive.problem import (
+    Problem,
+    Solution,
+    SurfaceValues,
+    centering,
+    error_target,
+    support_of,
+)
+from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.budget import (
     NormEstimate,
     ReferenceEstimate,
@@ -33,9 +40,37 @@ from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, Tr
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 Reals = NDArray[np.float64]
+Complexes = NDArray[np.complexfloating]
 
 # Random points that show what lies beyond all frequencies in a norm that is a scale.
 _POINTS_OF_SCALES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Values of a signed sum of surfaces.
+
+    Attributes:
+        lattice: Values on the half lattice, complex.
+        octaves: Values at the samples of each octave, complex.
+    """
+
+    lattice: Complexes
+    octaves: tuple[Complexes, ...]
+
+    @classmethod
+    def from_values(cls, surfaces: Sequence[SurfaceValues], signs: Sequence[int]) -> Self:
+        """Return the sum of some surfaces, each with its sign."""
+        signed = list(zip(surfaces, signs, strict=True))
+        lattice = sum(sign * one.field.values for one, sign in signed)
+        octaves = (
+            sum(sign * one.octaves[number].values for one, sign in signed) for number in range(len(surfaces[0].octaves))
+        )
+        return cls(np.asarray(lattice), tuple(map(np.asarray, octaves)))
+
+    def __add__(self, other: Measure) -> Measure:
+        octaves = (a + b for a, b in zip(self.octaves, other.octaves, strict=True))
+        return Measure(self.lattice + other.lattice, tuple(octaves))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,45 +132,7 @@ class Frequencies:
 
     def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:
         """Return the norms of a signed sum of surfaces."""
-        return self._norms(Measure.from_values(values, signs), self._errors(values), surfaces, signs)
-
-    def against(
-        self,
-        values: Sequence[SurfaceValues],
-        signs: Sequence[int],
-        reference: SurfaceValues,
-        pair: Sequence[Surface],
-    ) -> ReferenceEstimate:
-        """Return the norm of the reference b of a distance ||a - b||, and the product <a - b, b>.
-
-        Args:
-            values: Values whose signed sum is a - b: triangles that both have may be left out.
-            signs: Signs of these.
-            reference: Values of b.
-            pair: The surfaces a and b.
-        """
-        difference, own = Measure.from_values(values, signs), Measure.from_values([reference], [1])
-        distances = self._norms(difference, self._errors(values), pair, [1, -1])
-        norms = self._norms(own, self._errors([reference]), pair[1:], [1])
-        products = self._lattice_sums(difference, own)
-        if not self.has_tail:
-            return ReferenceEstimate.on_lattice(products, distances, norms, self.weights, self.widths)
-        in_octaves = self._octave_sums(difference, own)
-        statistical = statistical_errors(in_octaves) if in_octaves else 0.0
-        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-        tails = (
-            self._tail(difference + own, pair[:1], [1]),
-            self._tail(own, pair[1:], [1]),
-            self._tail(difference, pair, [1, -1]),
-        )
-        beyond = (tails[0].beyond - tails[1].beyond - tails[2].beyond) / 2
-        uncertainty = np.sum([tail.uncertainty for tail in tails], axis=0) / 2 + statistical
-        images = aliased(products, self.weights, self.widths)
-        return ReferenceEstimate(
-            norms,
-            products.totals + np.sum([one.squares for one in in_octaves], axis=0) + beyond,
-            uncertainty + images + product_rounding(distances, norms),
-        )
+        return self.norms_of(Measure.from_values(values, signs), surfaces, signs, self.errors(values))
 
     def moved(self, values: SurfaceValues, surface: Surface, length: float) -> Reals:
         """Return the distance of a surface to itself moved by a length, the root mean square over all directions.
@@ -157,39 +154,110 @@ class Frequencies:
             factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
         if self.has_tail:
-            squares = squares + 2 * self._tail(own, [surface], [1]).beyond
+            squares = squares + 2 * self.tail(own, [surface], [1]).beyond
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
-    def _errors(self, values: Sequence[SurfaceValues]) -> Reals:
+    def errors(self, values: Sequence[SurfaceValues]) -> Reals:
+        """Return the norms of the values' own errors (orders,), added."""
         return np.asarray(np.sum([one.error_norms(self.weights) for one in values], axis=0))
 
-    def _norms(
-        self, measure: Measure, errors: Reals, surfaces: Sequence[Surface], signs: Sequence[int]
+    def norms_of(
+        self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int], errors: Reals
     ) -> NormEstimate:
-        sums = self._lattice_sums(measure, measure)
+        """Return the norms of a measure from the norms of its values' own errors (orders,)."""
+        sums = self.lattice_sums(measure, measure)
         if not self.has_tail:
-            return estimate_norms(sums, self.weights, self._support(surfaces), errors)
+            support = Support(support_of(surfaces).areas, self.widths)
+            return estimate_norms(sums, self.weights, support, errors)
         images = aliased(sums, self.weights, self.widths)
-        return self._tail(measure, surfaces, signs).estimate(sums.totals, images, errors)
+        return self.tail(measure, surfaces, signs).estimate(sums.totals, images, errors)
 
-    def _support(self, surfaces: Sequence[Surface]) -> Support:
-        return Support(support_of(surfaces).areas, self.widths)
-
-    def _lattice_sums(self, measure: Measure, other: Measure) -> Sums:
+    def lattice_sums(self, measure: Measure, other: Measure) -> Sums:
         """Return the sums of Re(a conj b) over the lattice."""
         return sums_of_shells(shell_sums(measure.lattice, other.lattice, self.lattice, self.lattice.half), self.weights)
 
-    def _octave_sums(self, measure: Measure, other: Measure) -> list[OctaveSums]:
+    def octave_sums(self, measure: Measure, other: Measure) -> list[OctaveSums]:
         """Return the integrals of Re(a conj b) over each octave."""
         return [
             weights.sums((a.astype(np.complex128) * b.conj()).real)
             for weights, a, b in zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
         ]
 
-    def _tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
+    def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
         """Return the tail from the octaves, and what is known to lie beyond them."""
         cutoff = self.octaves[-1].octave.highest if self.octaves else self.lattice.xi_max
         # Norms of single surfaces serve as scales.
         points = _POINTS_OF_SCALES if len(surfaces) == 1 else None
         beyond = remainder(surfaces, signs, cutoff, self.orders, points)
-        return Tail.from_sums(self._octave_sums(measure, measure), *beyond.at(self.orders))
+        return Tail.from_sums(self.octave_sums(measure, measure), *beyond.at(self.orders))
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The reference b of a distance ||a - b||, and what is known of it.
+
+    Attributes:
+        frequencies: Frequencies of all values.
+        values: Values of b.
+        difference: Values whose signed sum is a - b; triangles that both have may be left out.
+        signs: Signs of these.
+        pair: The surfaces a and b, moved together to the centre of the lattice's period.
+    """
+
+    frequencies: Frequencies
+    values: SurfaceValues
+    difference: Sequence[SurfaceValues]
+    signs: Sequence[int]
+    pair: Sequence[Surface]
+
+    @classmethod
+    def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
+        """Return the reference of a distance.
+
+        Its values are among those that the distance was computed from. But where the surfaces share triangles, which
+        cancel, the reference has more than those, and gets frequencies of its own.
+
+        Args:
+            problem: Distance, between surfaces that are not equal.
+            solution: Its solution.
+            seed: Seed of the random frequencies of octaves.
+        """
+        if problem.is_whole:
+            frequencies = Frequencies.from_solution(problem, solution)
+            return cls(frequencies, solution.values[1], solution.values, problem.signs, problem.pair)
+        move = centering(problem.pair)
+        pair = [move.apply(surface) for surface in problem.pair]
+        support = replace(support_of(pair), areas=np.array(pair[1].area))
+        accuracy = replace(problem.accuracy, best_effort=True)
+        own = replace(problem, surfaces=pair[1:], signs=(1,), support=support, accuracy=accuracy, label="the reference")
+        of_reference = solve(own, seed)
+        frequencies = Frequencies.from_solution(own, of_reference)
+        target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
+        difference = [
+            frequencies.values(move.apply(surface), target, problem.execution) for surface in problem.surfaces
+        ]
+        return cls(frequencies, of_reference.values[0], difference, problem.signs, pair)
+
+    def estimate(self) -> ReferenceEstimate:
+        """Return the norm of b, and the product <a - b, b>."""
+        at, values = self.frequencies, self.values
+        difference, own = Measure.from_values(self.difference, self.signs), Measure.from_values([values], [1])
+        # Of a, b and their difference.
+        parts = (difference + own, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.pair, [1, -1])
+        norms = at.norms_of(*parts[1], at.errors([values]))
+        distances = at.norms_of(*parts[2], at.errors(self.difference))
+        products = at.lattice_sums(difference, own)
+        if not at.has_tail:
+            return ReferenceEstimate.on_lattice(products, distances, norms, at.weights, at.widths)
+        in_octaves = at.octave_sums(difference, own)
+        statistical = statistical_errors(in_octaves) if in_octaves else 0.0
+        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+        of_a, of_b, of_difference = (at.tail(*part) for part in parts)
+        beyond = (of_a.beyond - of_b.beyond - of_difference.beyond) / 2
+        uncertainty = np.sum([tail.uncertainty for tail in (of_a, of_b, of_difference)], axis=0) / 2 + statistical
+        images = aliased(products, at.weights, at.widths)
+        return ReferenceEstimate(
+            norms,
+            products.totals + np.sum([one.squares for one in in_octaves], axis=0) + beyond,
+            uncertainty + images + product_rounding(distances, norms),
+        )

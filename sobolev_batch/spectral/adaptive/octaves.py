@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals
-from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, error_target
-from sobolev_batch.spectral.adaptive.values import SurfaceValues
+from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, SurfaceValues, error_target
 from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice

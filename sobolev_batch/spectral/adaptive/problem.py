@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
-from sobolev_batch.spectral.adaptive.values import SurfaceValues
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Support
-from sobolev_batch.spectral.fields import USUAL_DEGREE
+from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
+from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Similarity, Surface
@@ -204,6 +205,24 @@ def centering(surfaces: Sequence[Surface]) -> Similarity:
         return Similarity()
     x, y, z = ((lowest + highest) / 2).tolist()
     return Similarity(1.0, (x, y, z))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceValues:
+    """Values of a surface at some frequencies.
+
+    Attributes:
+        field: Field on the lattice.
+        octaves: Values in the octaves beyond it.
+    """
+
+    field: Field
+    octaves: tuple[OctaveValues, ...] = ()
+
+    def error_norms(self, weights: SobolevWeights) -> Reals:
+        """Return the norms of the values' own errors (orders,)."""
+        on_lattice = self.field.quality.probe.norms(weights)
+        return np.asarray(np.hypot.reduce([on_lattice, *(one.error_norms(weights.orders) for one in self.octaves)]))
 
 
 @dataclass(frozen=True, eq=False)

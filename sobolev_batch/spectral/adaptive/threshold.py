@@ -62,23 +62,10 @@ class Interval:
         return Interval(self.lower / divisor.upper, self.upper / divisor.lower)
 
 
-@dataclass(frozen=True)
-class RelativeDistance:
-    """Distance of a surface from a reference over the norm of the reference.
-
-    Attributes:
-        bounds: Bounds on it.
-        method: What they follow from.
-    """
-
-    bounds: Interval
-    method: Method
-
-
 def relative_distance(
     surface: Surface, reference: Surface, order: float, threshold: float, accuracy: Accuracy, threads: int, seed: int
-) -> RelativeDistance:
-    """Bound a relative distance closely enough to tell on which side of a threshold it lies, if that is possible.
+) -> tuple[Interval, Method]:
+    """Bound a distance over the norm of its reference closely enough to tell on which side of a threshold it is.
 
     One lattice decides, or two, where the areas alone bound what lies beyond them; else octaves measure it.
 
@@ -91,17 +78,20 @@ def relative_distance(
         threads: Threads to compute with.
         seed: Seed of the random frequencies of octaves.
 
+    Returns:
+        The bounds, and what they follow from.
+
     Raises:
         LatticeError: A surface is too large or too small for any lattice.
         InputError: The memory is too little, or a surface is of an unknown kind.
     """
     if surface == reference:
-        return RelativeDistance(Interval(0.0, 0.0), "identical")
+        return Interval(0.0, 0.0), "identical"
     accuracy = replace(accuracy, rtol=_FIRST_RTOL, best_effort=True)
     pair = _brought_near(surface, reference), reference
     problem = Problem.from_surfaces(pair, (order,), accuracy, "the relative distance", threads)
     if not problem.surfaces:
-        return RelativeDistance(Interval(0.0, 0.0), "identical")
+        return Interval(0.0, 0.0), "identical"
     of_norm = Problem.from_surfaces([reference], (order,), accuracy, "the norm of the reference", threads)
     for norm_of in (_rough_norm, _exact_norm):
         norm = norm_of(of_norm)
@@ -109,7 +99,7 @@ def relative_distance(
         bounds, method = search.bounds(seed)
         if search.is_decided(bounds):
             break
-    return RelativeDistance(bounds.over(norm), method)
+    return bounds.over(norm), method
 
 
 @dataclass(frozen=True, eq=False)

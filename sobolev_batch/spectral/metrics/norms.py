@@ -15,8 +15,8 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import available, available_cores, check_seed
+from sobolev_batch.spectral.adaptive.frequencies import Reference
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
-from sobolev_batch.spectral.adaptive.reference import Reference
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import (

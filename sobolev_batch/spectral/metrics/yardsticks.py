@@ -13,8 +13,7 @@ import xarray as xr
 from sobolev_batch.errors import LatticeError, MeshError
 from sobolev_batch.parameters import available_cores, check_seed
 from sobolev_batch.spectral.adaptive.frequencies import Frequencies
-from sobolev_batch.spectral.adaptive.problem import support_of
-from sobolev_batch.spectral.adaptive.values import SurfaceValues
+from sobolev_batch.spectral.adaptive.problem import SurfaceValues, support_of
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import labelled
 from sobolev_batch.spectral.metrics.norms import accuracy_of, distance, to_accuracy

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral.adaptive.threshold import RelativeDistance, relative_distance
+from sobolev_batch.spectral.adaptive.threshold import Interval, Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.rectangles import Rectangles
 
 
-def bounded(surface: Surface, reference: Surface, order: float, threshold: float) -> RelativeDistance:
+def bounded(surface: Surface, reference: Surface, order: float, threshold: float) -> tuple[Interval, Method]:
     return relative_distance(surface, reference, order, threshold, Accuracy(threshold), 2, 0)
 
 
@@ -25,10 +25,10 @@ def test_spheres_against_their_closed_form(order: float, method: str, gap: float
     side = 1 + sign * gap
     surface, reference = sb.Sphere(0.97, (0.01, 0.02, 0.0)), sb.Sphere()
     truth = float(sb.distance(surface, reference, order)["distance"] / sb.norm(reference, order)["norm"])
-    found = bounded(surface, reference, order, side * truth)
-    assert found.bounds.lower <= truth <= found.bounds.upper
-    assert (found.bounds.upper <= side * truth, found.bounds.lower > side * truth) == (side > 1, side < 1)
-    assert side < 1 or found.method == method
+    found, used = bounded(surface, reference, order, side * truth)
+    assert found.lower <= truth <= found.upper
+    assert (found.upper <= side * truth, found.lower > side * truth) == (side > 1, side < 1)
+    assert side < 1 or used == method
 
 
 @pytest.mark.slow
@@ -39,21 +39,21 @@ def test_surfaces_that_repeat_beyond_the_lattice(order: float, threshold: float)
     fins = Rectangles.fins(12)
     between, nothing = fins.moved(0.0, 0.0, 1 / 24), Rectangles(np.zeros((0, 3)), np.zeros((0, 3)))
     (distance,), (norm,) = fins.distance(between, [order]), fins.distance(nothing, [order])
-    found = bounded(between.mesh(), fins.mesh(), order, threshold)
-    assert found.bounds.lower <= distance / norm <= found.bounds.upper
-    assert (found.bounds.upper <= threshold) == (distance / norm <= threshold)
+    found, _ = bounded(between.mesh(), fins.mesh(), order, threshold)
+    assert found.lower <= distance / norm <= found.upper
+    assert (found.upper <= threshold) == (distance / norm <= threshold)
 
 
 def test_a_distance_at_the_threshold_is_left_undecided() -> None:
     surface, reference = sb.Sphere(0.97), sb.Sphere()
     truth = float(sb.distance(surface, reference, -4.0)["distance"] / sb.norm(reference, -4.0)["norm"])
-    found = bounded(surface, reference, -4.0, truth)
-    assert found.bounds.lower <= truth <= found.bounds.upper
+    found, _ = bounded(surface, reference, -4.0, truth)
+    assert found.lower <= truth <= found.upper
     # Not for lack of effort.
-    assert found.bounds.upper - found.bounds.lower < 0.01 * truth
+    assert found.upper - found.lower < 0.01 * truth
 
 
 def test_surfaces_that_do_not_feel_each_other_are_as_far_apart_as_their_norms_say() -> None:
-    found = bounded(sb.Sphere(1.0, (1e6, -2e6, 0.0)), sb.Sphere(), -4.0, 1e-3)
-    assert found.bounds.lower == pytest.approx(2**0.5, rel=0.05)
-    assert found.bounds.lower <= 2**0.5 <= found.bounds.upper
+    found, _ = bounded(sb.Sphere(1.0, (1e6, -2e6, 0.0)), sb.Sphere(), -4.0, 1e-3)
+    assert found.lower == pytest.approx(2**0.5, rel=0.05)
+    assert found.lower <= 2**0.5 <= found.upper
