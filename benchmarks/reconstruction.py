@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import sobolev_batch as sb
 from benchmarks.table import Row, as_seconds, format_table
 from benchmarks.timing import Effort, elapsed_seconds
-from sobolev_batch.results.figures.views import MeshView, render
+from sobolev_batch.results.figures.views import MeshView, draw_mesh
 
 _MEASURED_AT = (-2.0, -4.0)
 # Steps of the fits that are drawn.
@@ -158,11 +158,10 @@ def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Pa
         },
         "target": reconstruction.target(),
     }
-    (pictures,) = render([_row(list(meshes.values()), up)], 1, side=500 * len(meshes))
-    height, width = pictures.shape[1:3]
-    figure = Figure(figsize=(width / 200, height / 200 + 0.5))
-    axes = figure.add_axes((0.0, 0.0, 1.0, height / (height + 100)), frameon=False, xticks=[], yticks=[])
-    axes.imshow(pictures[0])
+    figure = Figure(figsize=(2.5 * len(meshes), 3.0))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 0.85))
+    axes.margins(0.01)
+    draw_mesh(axes, _row(list(meshes.values()), up))
     for i, (name, mesh) in enumerate(meshes.items()):
         place = ((i + 0.5) / len(meshes), 1.0)
         text = f"{name}\n{len(mesh.triangles):,} triangles"

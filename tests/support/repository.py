@@ -1,11 +1,9 @@
-"""The checkout and the machine that the tests run on: pages, what modules import, what cannot be drawn."""
+"""The checkout that the tests run on: pages, and what modules import."""
 
 from __future__ import annotations
 
 import ast
 import re
-import sys
-from ctypes.util import find_library
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +50,3 @@ def run_blocks(path: str) -> dict[str, Any]:
     for block in blocks(path, "python"):
         exec(compile(block, path, "exec"), found)
     return found
-
-
-def obstacle() -> str | None:
-    """Return what keeps VTK from drawing here, looked up without it; None where nothing does."""
-    if sys.platform == "linux" and find_library("EGL_mesa") is None and find_library("OSMesa") is None:
-        return "no OpenGL without a display: apt-get install libegl1 libgl1-mesa-dri libx11-6"
-    return None

@@ -1,23 +1,18 @@
-"""Meshes of a store with their witness functions for display: simplified, drawn off screen, and in plots."""
+"""Meshes of a store with their witness functions for display: simplified, and in plots."""
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Literal, Self, get_args
 
 import fast_simplification
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
@@ -78,18 +73,14 @@ _LARGEST_MADE = 2_000_000
 # Meshes, triangles of each (larger ones are simplified), and values of all meshes and orders together. A page takes 4
 # bytes for each value, and beyond these limits long to load and to turn.
 PAGE_LIMITS = 4, 8_000, 300_000
-# A picture has hardly more dots on a mesh; values take 8 bytes each, in memory.
-PICTURE_LIMITS = 100, 200_000, 50_000_000
+# A picture shows hardly more triangles; values take 8 bytes each, in memory.
+PICTURE_LIMITS = 100, 60_000, 50_000_000
 
-
-# Pictures (k, height, width, 3) in red, green and blue.
-Pictures = NDArray[np.uint8]
-
-_PROGRAM = Path(__file__).with_name("_render_process.py")
-_REMEDY = (
-    "drawing without a display needs EGL and a renderer, on Debian and Ubuntu: "
-    "apt-get install libegl1 libgl1-mesa-dri libx11-6"
-)
+# Upwards in a picture, to the light, which is above the viewer's left shoulder, and the part of light from all around:
+# dim enough to keep colours distinct and bright enough for shapes.
+_UP: Reals = np.array([0.0, 0.0, 1.0])
+_LIGHT: Reals = np.array([-0.5, 0.7, 1.5]) / np.linalg.norm([-0.5, 0.7, 1.5])
+_AMBIENT = 0.62
 
 
 @dataclass(frozen=True)
@@ -246,84 +237,39 @@ def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Real
     return vertices, triangles
 
 
-def render(
-    views: Sequence[MeshView],
-    orders: int,
-    side: int = 900,
-    *,
-    common: bool = False,
-    program: Path = _PROGRAM,
-    timeout_seconds: float = 300.0,
-) -> list[Pictures]:
-    """Draw each mesh from the side of its eye, once for each of its first orders.
+def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = None) -> None:
+    """Draw a mesh on axes from the side of its eye, the farthest triangles first, so that nearer ones hide them.
 
-    Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" between plus and
-    minus `color_limits`.
+    Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" from minus to plus a limit.
 
     Args:
-        views: Meshes to draw.
-        orders: Number of orders of each, at most.
-        side: Longer side of each picture, in pixels.
-        common: Colour all meshes on one scale.
-        program: Program that draws.
-        timeout_seconds: Time for all pictures, at a second or two of a processor each.
-
-    Raises:
-        InputError: VTK is not installed, or cannot draw on this machine.
+        axes: Axes to draw on.
+        view: Mesh to draw.
+        index: Number of the order.
+        limit: End of the scale of colours; default that of `color_limits`.
     """
-    if not views:
-        return []
-    if find_spec("pyvista") is None:
-        raise InputError(
-            "drawing meshes needs the library pyvista, which is not installed; "
-            "the extra has it: pip install 'sobolev-batch[vtk]'"
+    right = np.cross(_UP, view.eye)
+    right /= np.linalg.norm(right)
+    corners = (view.vertices @ np.stack([right, np.cross(view.eye, right), view.eye], axis=1))[view.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # The orientation of triangles is not to be trusted: all of them face the viewer.
+    normals *= np.where(normals[:, 2:] < 0, -1, 1) / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _LIGHT, 0, 1)
+    values = view.values[index][view.triangles].mean(axis=1)
+    colors = _mapping(view.color_limits[index] if limit is None else limit).to_rgba(values)[:, :3] * light[:, None]
+    order = np.argsort(corners[:, :, 2].mean(axis=1))
+    axes.add_collection(
+        PolyCollection(
+            list(corners[order, :, :2]), facecolors=colors[order], edgecolors="face", linewidths=0.3, rasterized=True
         )
-    scene: dict[str, Any] = {"count": np.array(len(views)), "side": np.array(side)}
-    for i, (view, limits) in enumerate(zip(views, color_limits(views, common), strict=True)):
-        scene |= {
-            f"limits_{i}": limits[:orders],
-            f"eye_{i}": view.eye,
-            f"vertices_{i}": view.vertices,
-            f"triangles_{i}": view.triangles,
-            f"values_{i}": view.values[:orders],
-        }
-    with tempfile.TemporaryDirectory(prefix="sobolev-") as folder:
-        files = Path(folder, "scene.npz"), Path(folder, "pictures.npz")
-        np.savez(files[0], **scene)
-        _draw([str(program), *map(str, files)], Path(folder), timeout_seconds)
-        with np.load(files[1], allow_pickle=False) as pictures:  # noqa: TID251
-            return [pictures[f"picture_{i}"] for i in range(len(views))]
+    )
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_axis_off()
 
 
-def color_limits(views: Sequence[MeshView], common: bool) -> list[Reals]:
-    """Return the end of the scale of colours for each order, of each mesh or the same for all of them."""
-    limits = [view.color_limits for view in views]
-    return [np.max(limits, axis=0)] * len(views) if common else limits
-
-
-def _draw(arguments: Sequence[str], folder: Path, timeout_seconds: float) -> None:
-    """Draw in a process of its own: without OpenGL, VTK crashes instead of raising."""
-    environment = dict(os.environ)
-    if sys.platform == "linux":
-        # Otherwise VTK tries a display first, which may be remote or gone. Without EGL it takes OSMesa.
-        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    # -P keeps modules beside the program from shadowing libraries of the same name.
-    command = [sys.executable, "-P", *arguments]
-    try:
-        done = subprocess.run(  # noqa: S603
-            command, env=environment, cwd=folder, capture_output=True, timeout=timeout_seconds, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise InputError(f"meshes cannot be drawn here: VTK took more than {timeout_seconds:g} s") from error
-    if done.returncode:
-        raise InputError(f"meshes cannot be drawn here: {_reason(done.returncode, done.stderr)}; {_REMEDY}")
-
-
-def _reason(status: int, errors: bytes) -> str:
-    if status < 0:
-        return f"VTK crashed ({signal.strsignal(-status) or f'signal {-status}'})"
-    lines = errors.decode(errors="replace").strip().splitlines()
-    return f"VTK failed ({lines[-1] if lines else f'exit status {status}'})"
+def _mapping(limit: float) -> ScalarMappable:
+    return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
 
 
 def plot_witness(
@@ -337,8 +283,8 @@ def plot_witness(
 ) -> Axes:
     """Plot a mesh coloured by its witness function: red where it has area that the reference lacks, else blue.
 
-    The study makes the mesh again, and VTK draws it; this needs the extra "vtk". It is seen from the front and above,
-    or from the side of the worst places if these are hidden there; then the title says so. Where a few values are far
+    The study makes the mesh again. It is seen from the front and above, or from the side of the worst places if these
+    are hidden there; then the title says so. Where a few values are far
     larger than all others, the colours end below them: the colour bar has arrows, with at most 1 % of the area beyond.
 
     Args:
@@ -353,8 +299,7 @@ def plot_witness(
         The axes.
 
     Raises:
-        InputError: The label is unknown, or the mesh cannot be made again, is not the one that was computed, or
-            cannot be drawn on this machine.
+        InputError: The label is unknown, or the mesh cannot be made again, or is not the one that was computed.
         DamageError: A field is damaged.
 
     >>> import sobolev_batch as sb
@@ -369,10 +314,8 @@ def plot_witness(
     for label, reason in missing.items():
         raise InputError(f"{label}: {reason}")
     (view,) = views
-    ((picture,),) = render([view], 1)
     axes = ax or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
-    axes.set_axis_off()
-    axes.imshow(picture)
+    draw_mesh(axes, view)
     set_title(axes, escaped(mesh), _seen(view))
     _add_colorbar(axes.figure, axes, [view], view.color_limits[0], 0)  # type: ignore[arg-type]
     return axes
@@ -412,70 +355,60 @@ def write_witness_plots(
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
     compared = [replace(view, eye=FRONT) for view in views[:_MOST_COMPARED]]
-    try:
-        rendered = render(views, MOST_ORDERS)
-        on_one_scale = render(compared, 1, common=True) if len(compared) > 1 else []
-    except InputError as error:
-        return (), {**missing, **{view.label: str(error) for view in views}}
     with drawing(size):
         figures = {
-            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, pictures, size)
-            for view, pictures in zip(views, rendered, strict=True)
+            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, size) for view in views
         }
-        if on_one_scale:
-            pictures = [one_order for (one_order, *_) in on_one_scale]
-            figures["witness"] = _comparison_figure(compared, pictures, len(views), size)
+        if len(compared) > 1:
+            figures["witness"] = _comparison_figure(compared, len(views), size)
     return write_figures(figures, output_folder, formats, size), missing
 
 
-def witness_figure(view: MeshView, pictures: Pictures, size: Size | None = None) -> Figure:
-    """Return a mesh seen from one side, with a panel for each order that was rendered."""
+def witness_figure(view: MeshView, size: Size | None = None) -> Figure:
+    """Return a mesh seen from one side, with a panel for each of its first orders."""
+    count = min(len(view.orders), MOST_ORDERS)
     # Below each panel its colours, above all of them the name of the mesh.
-    figure, panels = _panels(pictures, size, above=0.3, beside=0.7)
-    for i in range(len(pictures)):
-        _add_colorbar(figure, panels.ravel()[i], [view], view.color_limits[i], i)
-    omission = f"{len(pictures)} of {len(view.orders)} orders" if len(pictures) < len(view.orders) else ""
+    figure, panels = _panels(count, size, above=0.3, beside=0.7)
+    for i, axes in enumerate(panels):
+        draw_mesh(axes, view, i)
+        _add_colorbar(figure, axes, [view], view.color_limits[i], i)
+    omission = f"{count} of {len(view.orders)} orders" if count < len(view.orders) else ""
     figure.suptitle("\n".join(filter(None, (escaped(view.label), _seen(view), omission))), fontsize="medium")
     return figure
 
 
-def _panels(
-    pictures: Sequence[np.ndarray] | Pictures, size: Size | None, *, above: float, beside: float
-) -> tuple[Figure, np.ndarray]:
-    """Return a figure with pictures beside each other, of a size, or with inches for what is above and in each row."""
-    columns = min(_PANELS_IN_A_ROW, len(pictures))
-    rows = -(-len(pictures) // columns)
-    tallest = max(picture.shape[0] / picture.shape[1] for picture in pictures)
-    height = min(tallest * WIDTH_INCHES / columns, _HEIGHT_INCHES)
-    figure = Figure(figsize=size or (WIDTH_INCHES, above + rows * (beside + height)), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.ravel():
+def _panels(count: int, size: Size | None, *, above: float, beside: float) -> tuple[Figure, Sequence[Axes]]:
+    """Return a figure with panels beside each other, of a size, or with inches for what is above and in each row."""
+    columns = min(_PANELS_IN_A_ROW, count)
+    rows = -(-count // columns)
+    height = above + rows * (beside + min(WIDTH_INCHES / columns, _HEIGHT_INCHES))
+    figure = Figure(figsize=size or (WIDTH_INCHES, height), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for axes in panels:
         axes.set_axis_off()
-    for axes, picture in zip(panels.ravel(), pictures, strict=False):
-        axes.imshow(picture)
-    return figure, panels
+    return figure, panels[:count]
 
 
 def _seen(view: MeshView) -> str:
     return "" if np.array_equal(view.eye, FRONT) else "seen from the side of the largest values"
 
 
-def _comparison_figure(
-    views: Sequence[MeshView], pictures: Sequence[np.ndarray], total: int, size: Size | None
-) -> Figure:
+def _comparison_figure(views: Sequence[MeshView], total: int, size: Size | None) -> Figure:
     """Return meshes beside each other, with their witness functions of the first order on one scale."""
     omission = f"{len(views)} of {total} meshes" if len(views) < total else ""
-    figure, panels = _panels(pictures, size, above=0.8 + 0.3 * bool(omission), beside=0.3)
-    for axes, view in zip(panels.ravel(), views, strict=False):
+    figure, panels = _panels(len(views), size, above=0.8 + 0.3 * bool(omission), beside=0.3)
+    limit = max(view.color_limits[0] for view in views)
+    for axes, view in zip(panels, views, strict=True):
+        draw_mesh(axes, view, limit=limit)
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
     if omission:
         figure.suptitle(omission, fontsize="medium")
-    _add_colorbar(figure, panels, views, color_limits(views, common=True)[0][0], 0)
+    _add_colorbar(figure, panels, views, limit, 0)
     return figure
 
 
 def _add_colorbar(
-    figure: Figure, panels: Axes | np.ndarray, views: Sequence[MeshView], limit: float, index: int
+    figure: Figure, panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int
 ) -> None:
     """Add the colours of some meshes at one of their orders, with arrows where values lie beyond them."""
     numbers = ScalarFormatter()
@@ -485,7 +418,7 @@ def _add_colorbar(
         max(view.values[index].max() for view in views) > limit,
     )
     bar = figure.colorbar(
-        ScalarMappable(Normalize(-limit, limit), "RdBu_r"),
+        _mapping(limit),
         ax=panels,
         shrink=0.8,
         orientation="horizontal",
