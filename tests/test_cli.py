@@ -129,7 +129,7 @@ def test_the_smallest_mesh_below_a_bound(folder: Path) -> None:
     assert "nearest: ico/1" in output("table", STORE, "--below", "0.001 %", folder=folder)
 
 
-PICTURES = ["convergence", "matrix", "map", "spectrum", "energy", "witness-0001-ico-1"]
+PICTURES = ["convergence", "matrix", "spectrum", "energy", "witness-0001-ico-1"]
 
 
 def test_plot_draws_every_picture(folder: Path) -> None:

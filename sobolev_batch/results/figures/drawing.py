@@ -154,7 +154,7 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     axes.set_ylabel("relative Sobolev distance")
 
 
-LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6, "Mean relative distance by method")
+LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
 
 
 # Smaller fractions are not written into their cells.
@@ -226,7 +226,7 @@ def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
     axes.set_ylabel("energy over its limit")
 
 
-# In matrices and on maps.
+# In matrices.
 MOST_MESHES = 300
 # Points of the font of labels beside a matrix; smaller ones are left out.
 _SMALLEST_FONT, _LARGEST_FONT = 4.0, 8.0
@@ -242,24 +242,18 @@ def has_pairs(selection: Selection) -> bool:
     return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
 
 
-def _chosen(selection: Selection, order: float) -> tuple[Reals, list[str], str]:
-    """Return the distances of the chosen meshes, their labels, and a note on those left out."""
-    tree, family_of = selection.tree, families_of(selection.tree)
-    reference = reference_of(tree)
-    meshes = [label for label in complete_meshes(tree) if family_of[label] in selection.families or label == reference]
-    pairs = pairs_of(tree, order, MOST_MESHES, meshes)
+def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
+    """Draw the distances of all pairs as a heat map, with similar meshes beside each other."""
+    tree, reference = selection.tree, reference_of(selection.tree)
+    chosen = [label for label, family in families_of(tree).items() if family in selection.families]
+    complete = [label for label in complete_meshes(tree) if label in chosen or label == reference]
+    pairs = pairs_of(tree, order, MOST_MESHES, complete)
     if pairs is None:
         raise InputError(
             'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
         )
-    shown = pairs.sizes["mesh"]
-    omission = f"the first {shown} of {len(meshes)} meshes" if shown < len(meshes) else ""
-    return pairs["distance"].values, pairs["mesh"].values.tolist(), omission
-
-
-def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
-    """Draw the distances of all pairs as a heat map, with similar meshes beside each other."""
-    distances, meshes, omission = _chosen(selection, order)
+    distances, meshes = pairs["distance"].values, pairs["mesh"].values.tolist()
+    omission = f"the first {len(meshes)} of {len(complete)} meshes" if len(meshes) < len(complete) else ""
     arrangement = clustered_order(distances)
     values = distances[np.ix_(arrangement, arrangement)]
     set_title(axes, f"Sobolev distance of order {order:g}", omission)
@@ -297,28 +291,6 @@ def _color_range(positive: Reals) -> tuple[float, float, str]:
     return (low, high, extend) if low < high else (low / 1.1, high * 1.1, extend)
 
 
-def draw_map(selection: Selection, order: float, axes: Axes) -> None:
-    """Draw the meshes as points of a plane whose distances approximate the Sobolev distances."""
-    distances, labels, omission = _chosen(selection, order)
-    reference, family_of = reference_of(selection.tree), families_of(selection.tree)
-    points, share = embedded(distances)
-    families = [family_of[label] for label in labels]
-    for name in dict.fromkeys(families):
-        chosen = [i for i, label in enumerate(labels) if families[i] == name and label != reference]
-        if chosen:
-            look = {**selection.styles[name], "linestyle": "none", "markersize": 5, "alpha": 0.85}
-            axes.plot(*points[chosen].T, label=shortened(name), **look)
-    center = labels.index(reference) if reference in labels else None
-    if center is not None:
-        axes.plot(*points[center], "*", color="black", markersize=12, label=escaped(reference))
-    explained = "" if np.isnan(share) else f", {share:.0%} of the variance"
-    set_title(axes, f"map at order {order:g}{explained}", omission)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.1)
-    axes.grid(visible=True, alpha=0.3)
-    axes.set_xlabel("in the unit of distances")
-
-
 def clustered_order(distances: Reals) -> NDArray[np.intp]:
     """Return indices of meshes with similar ones beside each other, from distances (meshes, meshes) without NaN.
 
@@ -331,34 +303,6 @@ def clustered_order(distances: Reals) -> NDArray[np.intp]:
     return np.asarray(leaves_list(linkage(pairs, method="average", optimal_ordering=True)), dtype=np.intp)
 
 
-def embedded(distances: Reals) -> tuple[Reals, float]:
-    """Return meshes as points (meshes, 2) of the plane that is nearest to all, by classical scaling, and its share.
-
-    Distances of a norm are those of points in a Euclidean space, so that double centring gives their inner products
-    exactly, up to the errors of the distances. The first two principal axes, the longer one first, show most of the
-    variance; the share is the fraction that they show, NaN where all meshes are equal. Distances in the plane are never
-    larger than the true ones.
-
-    Source: W. S. Torgerson, "Multidimensional scaling: I. Theory and method" (1952), doi:10.1007/BF02288916.
-    """
-    count = len(distances)
-    if count == 0:
-        return np.zeros((0, 2)), float("nan")
-    centring = np.eye(count) - 1 / count
-    products = -centring @ (distances**2 + distances.T**2) @ centring / 4
-    eigenvalues, axes = np.linalg.eigh(products)
-    # Rounding and the errors of the distances make some of them negative.
-    variances = np.maximum(eigenvalues[::-1], 0.0)
-    points = np.zeros((count, 2))
-    shown = min(2, count)
-    points[:, :shown] = axes[:, ::-1][:, :shown] * np.sqrt(variances[:shown])
-    # Eigenvectors have no sign of their own: maps would flip between machines.
-    for axis in points.T:
-        axis *= np.sign(axis[np.argmax(np.abs(axis))]) or 1.0
-    total = variances.sum()
-    return points, float(variances[:2].sum() / total) if total > 0 else float("nan")
-
-
 def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequence[float]]:
     """Return a function that returns the orders of a selection which has what a plot shows, else none."""
     return lambda selection: selection.orders if has(selection) else ()
@@ -366,19 +310,9 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
 
 # By the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
-    "convergence": Plot(
-        draw_convergence, lambda selection: selection.orders, 3.6, "Relative distance over mean edge length"
-    ),
-    "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6, "Distance over time"),
-    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6, "Distances of all pairs", "compressed"),
-    "map": Plot(draw_map, _orders_if(has_pairs), 4.4, "Map of the meshes"),
-    "spectrum": Plot(
-        draw_spectrum, _orders_if(lambda selection: selection.has_spectra), 4.0, "Squared distance by wavelength"
-    ),
-    "energy": Plot(
-        draw_energy,
-        lambda selection: (None,) if selection.has_spectra else (),
-        3.6,
-        "Energy of the differences by wavelength",
-    ),
+    "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
+    "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6),
+    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6, "compressed"),
+    "spectrum": Plot(draw_spectrum, _orders_if(lambda selection: selection.has_spectra), 4.0),
+    "energy": Plot(draw_energy, lambda selection: (None,) if selection.has_spectra else (), 3.6),
 }

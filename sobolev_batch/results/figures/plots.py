@@ -60,15 +60,13 @@ def plot(
     - "over-time": the distances of meshes that move, with a dotted line at the first time at which a new mesh pays.
     - "matrix": the distances of all pairs as a heat map, with similar meshes beside each other, on a logarithmic scale
       of colours. Where a few distances lie far beyond the others, arrows end it. White pairs are equal.
-    - "map": the meshes as points of the plane that shows most of their variance (classical scaling); distances in it
-      are never larger than the true ones.
     - "spectrum": the fractions of each squared distance to the reference by wavelength, as a heat map.
     - "energy": ∫_{|ξ|=r} |a^ - b^|² dS for each difference from the reference, at all orders the same, as a fraction of
       its limit for large |ξ|: twice the area of both surfaces, if no parts of them coincide. A mesh agrees with the
       reference at the wavelengths where its line is far below 1; where it reaches 1, they have nothing in common.
 
-    Matrix and map show up to 300 meshes, the first ones and the reference. Spectrum and energy read the field of each
-    mesh, and show up to 24, evenly through each family; the title says so.
+    A matrix shows up to 300 meshes, the first ones and the reference. Spectrum and energy read the field of each mesh,
+    and show up to 24, evenly through each family; the title says so.
 
     Args:
         store: Path, URL or opened DataTree of the store.

@@ -80,14 +80,12 @@ class Plot:
         draw: Function that draws an item of the subject on axes.
         items: Function that returns the items, such as orders; none where the subject has nothing to draw.
         height: Height of a panel in inches.
-        text: Alternative text of a picture.
         layout: Layout of the figure.
     """
 
     draw: Callable[[Any, Any, Axes], None]
     items: Callable[[Any], Sequence[Any]]
     height: float
-    text: str
     layout: Layout = "constrained"
 
     def figure(self, subject: Any, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:

@@ -23,7 +23,7 @@ from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.figures.drawing import MOST_MESHES, clustered_order, embedded
+from sobolev_batch.results.figures.drawing import MOST_MESHES, clustered_order
 from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.views import Axis, MeshView, make_views
 from sobolev_batch.results.open import (
@@ -237,7 +237,6 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshV
         "name": tree.attrs["study"]["table"]["study"]["name"],
         "orders": [minus(f"{order:g}") for order in orders],
         "families": list(dict.fromkeys(families_of(tree).values())),
-        "reference": reference_of(tree),
         "convergence": _convergence(tree, orders, MOST_POINTS // len(orders)),
         "evolution": _evolution(tree, MOST_POINTS // len(orders)),
         "matrix": _matrices(tree, orders),
@@ -344,15 +343,13 @@ def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
 
 
 def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
-    """Return for each order the lower triangle of distances and errors, an order of similar meshes, and the map."""
+    """Return for each order the lower triangle of distances and errors, and an order of similar meshes."""
     most = min(MOST_MESHES, int(math.sqrt(MOST_NUMBERS / len(orders))))
     matrices = [pairs for order in orders if (pairs := pairs_of(tree, order, most)) is not None]
     if not matrices or not matrices[0].sizes["mesh"]:
         return None
-    family_of, labels = families_of(tree), matrices[0]["mesh"].values.tolist()
     return {
-        "labels": labels,
-        "families": [family_of[label] for label in labels],
+        "labels": matrices[0]["mesh"].values.tolist(),
         "total": len(complete_meshes(tree)),
         "orders": [_matrix(matrix) for matrix in matrices],
     }
@@ -360,13 +357,10 @@ def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
 
 def _matrix(pairs: xr.Dataset) -> Json:
     distances = pairs["distance"].values
-    points, explained = embedded(distances)
     return {
         "values": [_numbers(row[:i]) for i, row in enumerate(distances)],
         "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
         "clustered": clustered_order(distances).tolist(),
-        "points": [_numbers(axis, digits=5) for axis in points.T],
-        "explained": None if math.isnan(explained) else round(explained, 4),
     }
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.drawing import PLOTS, clustered_order, embedded
+from sobolev_batch.results.figures.drawing import PLOTS, clustered_order
 from sobolev_batch.results.figures.plots import write_plots
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
@@ -36,16 +36,13 @@ def pairs(tree: xr.DataTree) -> xr.DataTree:
 
 
 @pytest.mark.slow
-def test_pairs_get_a_heat_map_and_a_map(pairs: xr.DataTree, tmp_path: Path) -> None:
+def test_pairs_get_a_heat_map(pairs: xr.DataTree, tmp_path: Path) -> None:
     axes = sb.plot(pairs, "matrix", -10.0)
     assert axes.get_title().startswith("Sobolev distance of order -10")
     shown = [text.get_text() for text in axes.get_yticklabels()]
     assert shown in ([r"\$^\$/0", r"\$^\$/1", "reference"], ["reference", r"\$^\$/1", r"\$^\$/0"])
-    places = np.concatenate([line.get_xydata() for line in sb.plot(pairs, "map", -10.0).lines])
-    assert np.ptp(places[:, 0]) == pytest.approx(0.4)
-    assert np.allclose(places[:, 1], 0, atol=1e-7)
     paths, _ = write_plots(Selection.from_store(pairs), tmp_path)
-    assert [path.name for path in paths] == ["convergence.png", "matrix.png", "map.png"]
+    assert [path.name for path in paths] == ["convergence.png", "matrix.png"]
     alone = sb.plot(pairs, "matrix", -10.0, family="_*")
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
@@ -71,9 +68,8 @@ def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
         sb.plot(tree, x="weight")
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
     alone = xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest})
-    for kind in ("matrix", "map"):
-        with pytest.raises(sb.InputError, match="distances to the reference alone; set pairs"):
-            sb.plot(alone, kind)
+    with pytest.raises(sb.InputError, match="distances to the reference alone; set pairs"):
+        sb.plot(alone, "matrix")
 
 
 def lines(_subject: object, count: int, axes: Axes) -> None:
@@ -87,7 +83,7 @@ def lines(_subject: object, count: int, axes: Axes) -> None:
 @pytest.mark.parametrize("count", [1, 8, 40])
 def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: tuple[float, float]) -> None:
     with drawing(size):
-        figure = Plot(lines, lambda _: (), 3.6, "").figure(None, [1, count], size)
+        figure = Plot(lines, lambda _: (), 3.6).figure(None, [1, count], size)
         figure.draw_without_rendering()
     (legend,) = figure.legends
     names = [text.get_text() for text in legend.get_texts()]
@@ -229,31 +225,6 @@ def test_groups_stand_together() -> None:
     order = clustered_order(cdist(places, places))
     sorted_places = places[order, 0]
     assert (np.diff(sorted_places) > 0).all() or (np.diff(sorted_places) < 0).all()
-
-
-def test_a_plane_is_found_again() -> None:
-    rng = np.random.default_rng(3)
-    points = np.zeros((20, 5))
-    points[:, :2] = rng.normal(size=(20, 2)) * [3, 1]
-    turn = np.linalg.qr(rng.normal(size=(5, 5)))[0]
-    distances = cdist(points @ turn, points @ turn)
-    points, explained = embedded(distances)
-    assert np.allclose(cdist(points, points), distances, atol=1e-12)
-    assert explained == pytest.approx(1.0)
-    assert points[:, 0].var() >= points[:, 1].var()
-
-
-def test_a_map_never_exaggerates() -> None:
-    points = np.random.default_rng(4).normal(size=(15, 6))
-    distances = cdist(points, points)
-    points, explained = embedded(distances)
-    assert (cdist(points, points) <= distances + 1e-12).all()
-    assert 0.3 < explained < 1
-
-
-def test_few_and_equal_meshes() -> None:
     for count in (0, 1, 2):
         distances = np.arange(count) - np.arange(count)[:, None] + np.zeros((count, count))
         assert clustered_order(abs(distances)).tolist() == list(range(count))
-        assert embedded(abs(distances))[0].shape == (count, 2)
-    assert np.isnan(embedded(np.zeros((4, 4)))[1])

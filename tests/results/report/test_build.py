@@ -60,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("report")
 
 
-_CHARTS = ("convergence", "matrix", "map", "spectrum", "energy", "witness")
+_CHARTS = ("convergence", "matrix", "spectrum", "energy", "witness")
 
 
 @pytest.fixture(scope="module")

@@ -189,31 +189,6 @@
     });
   };
 
-  const map = () => {
-    const { labels, families, orders } = data.matrix;
-    const { points: [x, y], explained } = orders[state.order];
-    const traces = [...new Set(families)].map((family) => {
-      const chosen = labels.flatMap((label, i) => (families[i] === family && label !== data.reference ? [i] : []));
-      return {
-        type: "scatter", mode: "markers", name: short(family, 40), x: chosen.map((i) => x[i]), y: chosen.map((i) => y[i]),
-        text: chosen.map((i) => plain(labels[i])), hoverinfo: "text",
-        marker: { color: series(family), symbol: symbol(family), size: 9, opacity: 0.85 },
-      };
-    }).filter((trace) => trace.x.length);
-    const center = labels.indexOf(data.reference);
-    if (center >= 0) {
-      traces.push({
-        type: "scatter", mode: "markers", name: short(data.reference, 40), x: [x[center]], y: [y[center]],
-        text: [plain(data.reference)], hoverinfo: "text", marker: { color: color("ink"), symbol: "star", size: 14 },
-      });
-    }
-    document.getElementById("explained").textContent = explained === null ? "" : `: ${(100 * explained).toFixed(1)} %`;
-    draw("map", traces, {
-      height: narrow() ? 380 : 480, xaxis: { title: { text: "in the unit of distances" } },
-      yaxis: { scaleanchor: "x", scaleratio: 1 },
-    });
-  };
-
   const spectrum = () => {
     const { labels, bands, shares } = data.spectrum;
     const z = shares[state.order];
@@ -283,7 +258,7 @@
   };
 
   const drawings = [data.convergence && convergence, data.league?.length && league, data.evolution && evolution,
-    data.matrix && matrix, data.matrix && map, data.spectrum && spectrum, data.energy && energy,
+    data.matrix && matrix, data.spectrum && spectrum, data.energy && energy,
     data.witness?.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
