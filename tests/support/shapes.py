@@ -11,6 +11,8 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sobolev_batch import Interval, Mesh, ParametrisedSurface, Torus
+from sobolev_batch.surfaces.shapes.smooth import Smooth
+from sobolev_batch.surfaces.shapes.surface import Point
 
 Reals = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -84,25 +86,9 @@ def ball(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
     return np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)
 
 
-def ball_derivatives(u: Reals, v: Reals) -> tuple[tuple[Reals, Reals, Reals], tuple[Reals, Reals, float]]:
-    """The derivatives of the unit sphere."""
-    along_u = np.cos(u) * np.cos(v), np.cos(u) * np.sin(v), -np.sin(u)
-    return along_u, (-np.sin(u) * np.sin(v), np.sin(u) * np.cos(v), 0.0)
-
-
 def plate(u: Reals, v: Reals) -> tuple[Reals, Reals, float]:
     """A flat rectangle."""
     return u, v, 0.0
-
-
-def roof(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
-    """Two flat halves that meet in a ridge."""
-    return u, v, -np.abs(u)
-
-
-def roof_derivatives(u: Reals, v: Reals) -> tuple[tuple[float, float, Reals], tuple[float, float, float]]:
-    """The derivatives of the roof; its area element is constant."""
-    return (1.0, 0.0, -np.sign(u)), (0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -116,11 +102,38 @@ class Turned:
         return np.asarray(np.tensordot(ROTATION, self.torus.positions(u, v), axes=1))
 
 
-def angular_ball(derivatives: bool) -> ParametrisedSurface:
-    """Return the unit sphere in its two angles."""
-    return ParametrisedSurface(ball, HALF_TURN, TURN, ball_derivatives if derivatives else None)
-
-
 def turned_torus(torus: Torus) -> ParametrisedSurface:
-    """Return a torus turned about its centre, without derivatives."""
+    """Return a torus turned about its centre."""
     return ParametrisedSurface(Turned(torus), TURN, TURN)
+
+
+def angular_ball() -> ParametrisedSurface:
+    """Return the unit sphere in its two angles."""
+    return ParametrisedSurface(ball, HALF_TURN, TURN)
+
+
+@dataclass(frozen=True)
+class Roof(Smooth):
+    """Two flat halves that meet in a ridge: no smooth surface, but its area element is constant."""
+
+    scale: float = 1.0
+    origin: Point = (0.0, 0.0, 0.0)
+
+    @property
+    def intervals(self) -> tuple[Interval, Interval]:
+        """The same twice, with the ridge off the middle."""
+        return Interval(-0.9, 1.0), Interval(-0.9, 1.0)
+
+    def positions(self, u: Reals, v: Reals) -> Reals:
+        """The positions (3, ...)."""
+        return np.asarray(self.scale * (np.stack([u, v, -np.abs(u)]) - np.reshape(self.origin, (3, *[1] * u.ndim))))
+
+    def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
+        """The exact derivatives (3, ...)."""
+        one, zero = np.full_like(u, self.scale), np.zeros_like(u)
+        return np.stack([one, zero, -self.scale * np.sign(u)]), np.stack([zero, one, zero])
+
+    def moved(self, scale: float, origin: Point) -> Roof:
+        """The roof after x -> scale * (x - origin)."""
+        x, y, z = (old + shift / self.scale for old, shift in zip(self.origin, origin, strict=True))
+        return Roof(scale * self.scale, (x, y, z))

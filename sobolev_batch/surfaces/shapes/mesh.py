@@ -352,18 +352,9 @@ def _boundary_and_nonmanifold_edges(triangles: NDArray[np.int64], vertex_count: 
 
 def _duplicate_triangles(triangles: NDArray[np.int64]) -> int:
     """Return the number of triangles that repeat the three vertices of an earlier one."""
-    hashes = np.empty(len(triangles), dtype=np.uint64)
-    for start in range(0, len(triangles), _BATCH):
-        low, middle, high = np.sort(triangles[start : start + _BATCH], axis=1).astype(np.uint64).T
-        hashes[start : start + len(low)] = (low * _MIXERS[0] + middle) * _MIXERS[1] + high
-    ordered = np.sort(hashes)
-    repeated = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
-    if not repeated.size:
-        return 0
-    # Different triangles may have one hash, so those with a repeated hash are compared themselves.
-    nearest = np.minimum(np.searchsorted(repeated, hashes), len(repeated) - 1)
-    candidates = np.sort(triangles[repeated[nearest] == hashes], axis=1)
-    return len(candidates) - len(np.unique(candidates, axis=0))
+    ordered = np.sort(triangles, axis=1)
+    ordered = ordered[np.lexsort(ordered.T)]
+    return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))
 
 
 def shared_triangles(

@@ -14,7 +14,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.surfaces.sources.registry import SurfaceMember
-from tests.support.shapes import roof, roof_derivatives
+from tests.support.shapes import Roof
 from tests.support.studies import small_table, variable
 
 RING = {"R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}
@@ -101,11 +101,9 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sobolev_batch.spectral.quadrature.smooth.MOST_NODES", 1 << 14)
-    side = sb.Interval(-0.9, 1.0)
-    rough = sb.ParametrisedSurface(roof, side, side, roof_derivatives)
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]
     study = sb.Study.from_table(torus_table(family=family))
-    member = SurfaceMember("own", -1, rough, {"test": 1})
+    member = SurfaceMember("own", -1, Roof(), {"test": 1})
     object.__setattr__(study, "reference", SimpleNamespace(members=lambda folder: (member,)))
     summary = sb.run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}

@@ -35,10 +35,9 @@ from tests.support.oracles import ellipsoid_value_along_c, spheroid_value, torus
 from tests.support.shapes import (
     HALF_TURN,
     TURN,
+    Roof,
     angular_ball,
     plate,
-    roof,
-    roof_derivatives,
     turned_torus,
 )
 
@@ -65,10 +64,9 @@ def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivatives", [False, True])
-def test_the_sphere_as_a_parametrised_surface_is_the_closed_form(derivatives: bool) -> None:
+def test_the_sphere_as_a_parametrised_surface_is_the_closed_form() -> None:
     exact = fourier_transform(Sphere(), LATTICE)
-    for surface in (Ellipsoid(), angular_ball(derivatives)):
+    for surface in (Ellipsoid(), angular_ball()):
         field = fourier_transform(surface, LATTICE, 1e-14, threads=1)
         assert np.abs(field.values - exact.values).max() < 1e-12 * 4 * math.pi
         orders = [-2.0, -5.0, -10.0]
@@ -143,7 +141,7 @@ def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("surface", [*SMOOTH, angular_ball(False)], ids=lambda surface: type(surface).__name__)
+@pytest.mark.parametrize("surface", [*SMOOTH, angular_ball()], ids=lambda surface: type(surface).__name__)
 @pytest.mark.parametrize("highest", [0.5, 7.0, 20.0])
 def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float) -> None:
     counts, change = resolution_of(surface, highest, 1e-9)
@@ -170,8 +168,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
 
 def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resolution, "MOST_NODES", 1 << 14)
-    side = Interval(-0.9, 1.0)
-    surface = ParametrisedSurface(roof, side, side, roof_derivatives)
+    surface = Roof()
     with pytest.raises(
         InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
     ):
@@ -189,7 +186,7 @@ def test_a_surface_beyond_the_period_is_refused() -> None:
     with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 5"):
         fourier_transform(Ellipsoid((5.0, 1.0, 1.0)), LATTICE)
     with pytest.raises(LatticeError, match="the surface reaches"):
-        fourier_transform(Similarity(1.0, (4.0, 0.0, 0.0)).apply(angular_ball(True)), LATTICE)
+        fourier_transform(Similarity(1.0, (4.0, 0.0, 0.0)).apply(angular_ball()), LATTICE)
 
 
 # What is said of the error.
@@ -221,8 +218,7 @@ def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_what_doubling_the_nodes_changes_is_reported() -> None:
-    side = Interval(-0.9, 1.0)
-    surface = ParametrisedSurface(roof, side, side, roof_derivatives)
+    surface = Roof()
     corners = [[u, v, -abs(u)] for u in (-0.9, 0.0, 1.0) for v in (-0.9, 1.0)]
     mesh = Mesh(corners, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     assert mesh.area == pytest.approx(surface.area, rel=1e-12)
