@@ -57,17 +57,11 @@ class Descent:
 
     Args:
         objective: Squared distance, or a weighted sum of several.
-        vertices: Positions (n, 3) to start from, in units of length.
+        vertices: Positions (n, 3) to start from, in units of length; later the last ones that were accepted.
         smoothing: Smoothing of the steps.
         floor: Squared distance below which nothing is left to gain.
         unit: Length of a long step, such as that of an edge.
         notify: Called with the positions and the objective after each step.
-
-    Attributes:
-        vertices: The last positions that were accepted.
-        value: Weighted squared distances there, with the penalty of shapes.
-        steps: Number of steps so far.
-        end: Why it ended.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.

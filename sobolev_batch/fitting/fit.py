@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -161,14 +162,13 @@ def fit(
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     problem = FitProblem.for_target(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
     before = start_quality(problem)
-    run = FitRun(problem, notify)
-    return conclude(mesh, before, run, run.finish())
+    return conclude(mesh, before, FitRun(problem, notify).finish())
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
     """Return the mesh that `fit` finds, without measures of its distance."""
     problem = FitProblem.for_target(mesh, target, None, settings, execution)
-    return problem.given_mesh(FitRun(problem).finish())
+    return problem.given_mesh(FitRun(problem).finish().mesh)
 
 
 class FitRun:
@@ -182,12 +182,16 @@ class FitRun:
 
     def __init__(self, problem: FitProblem, notify: Callable[[FitProgress], None] | None = None) -> None:
         self.problem, self.notify, self.free = problem, notify, problem.free_vertices
-        self.taken = 0
-        self.end = End.CONVERGED
+        self.taken, self.end = 0, End.CONVERGED
         self.vertices = np.asarray(problem.start.vertices)
 
-    def finish(self) -> Mesh:
-        """Carry the fit out, and return the prepared mesh at its end, or the start if that is nearer."""
+    @property
+    def mesh(self) -> Mesh:
+        """The prepared mesh after the last step."""
+        return Mesh(self.vertices, self.problem.start.triangles)
+
+    def finish(self) -> Self:
+        """Carry the fit out, go back to the start if that is nearer, and return the run."""
         start, order = self.vertices, self.problem.settings.order
         self.descend()
         try:
@@ -197,7 +201,7 @@ class FitRun:
         else:
             if after > before:
                 self.vertices, self.end = start, End.FARTHER
-        return Mesh(self.vertices, self.problem.start.triangles)
+        return self
 
     def descend(self) -> None:
         """Move the vertices to the end of all stages, or to the last step before an interrupt."""
@@ -285,12 +289,12 @@ def start_quality(problem: FitProblem) -> FitQuality:
     return before
 
 
-def conclude(start: Mesh, before: FitQuality, run: FitRun, fitted: Mesh) -> Fit:
-    """Return a fit with its end, the prepared mesh of the last run, or with the start if that is nearer."""
+def conclude(start: Mesh, before: FitQuality, run: FitRun) -> Fit:
+    """Return a fit with the mesh of its last run, or with the start if that is nearer."""
     problem = run.problem
-    mesh, remarks, end = problem.given_mesh(fitted), [], run.end
+    mesh, remarks, end = problem.given_mesh(run.mesh), [], run.end
     try:
-        after = measure_quality(problem, fitted)
+        after = measure_quality(problem, run.mesh)
     except KeyboardInterrupt:
         after, end = FitQuality(np.nan, np.nan), End.INTERRUPTED
         remarks.append("it was interrupted before the mesh was measured")

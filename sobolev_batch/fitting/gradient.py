@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -23,7 +22,6 @@ from sobolev_batch.spectral.fields import (
     common_lattice,
     field_of,
     field_values,
-    fourier_transform,
     quality_of,
 )
 from sobolev_batch.spectral.lattice import Lattice
@@ -54,9 +52,9 @@ class SquaredDistance:
     """The squared distance ||mesh - target||_s² over a lattice, as a function of the mesh's vertices.
 
     Call it with positions of the vertices, (n, 3) or flat (3n,): it returns the value and its derivative in the same
-    shape, as `scipy.optimize.minimize` takes them with ``jac=True``. The derivative is exactly that of the value,
-    to eps: both are sums over the same quadrature nodes, which move with the vertices. Their number follows from
-    the shape of the mesh at first. Make a new function once triangles have become much larger.
+    shape, as `scipy.optimize.minimize` takes them with ``jac=True``. The derivative is that of the value to eps: both
+    are sums over the same quadrature nodes, which move with the vertices. Their number follows from the first shape of
+    the mesh. Make a new function once triangles have become much larger.
 
     Attributes:
         transform: Transform of the mesh.
@@ -155,9 +153,6 @@ def factors_of(weights: SobolevWeights) -> Reals:
 def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
     """Return a squared distance as a differentiable function of a PyTorch tensor.
 
-    Args:
-        squared: The squared distance.
-
     Returns:
         Function of a tensor of vertices, (n, 3) or (3n,), that returns a scalar tensor of the same dtype and device. It
         computes in double precision on the processor; a double tensor there is read without a copy. It can be
@@ -200,9 +195,6 @@ def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
 
 def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
     """Return a squared distance as a differentiable function of a JAX array.
-
-    Args:
-        squared: The squared distance.
 
     Returns:
         Function of an array of vertices, (n, 3) or (3n,), that returns a scalar of the same dtype. It works under
@@ -306,7 +298,7 @@ def gradient(
     finer = TransformSettings(max(settings.eps / _REFINEMENT, FINEST_EPS["complex128"]))
     execution = Execution(backend_named(backend), thread_count(threads))
     own = common_lattice((target,), lattice)
-    pair = [_Difference.from_target(mesh, target, own, orders, one, execution) for one in (settings, finer)]
+    pair = [_Difference(mesh, target, own, orders, one, execution) for one in (settings, finer)]
     coarser, gradients = (one.gradients(one.factors) for one in pair)
     fine = pair[-1]
     parts = fine.errors(gradients)
@@ -320,52 +312,25 @@ def gradient(
     return dataset.assign(gradient=(dims, values, VARIABLES["gradient"])).assign_coords(axis=["x", "y", "z"])
 
 
-@dataclass(frozen=True, eq=False)
 class _Difference:
-    """The difference of the transforms of a mesh and its target, by one choice of settings.
+    """The difference of the transforms of a mesh and its target on the half lattice, by one choice of settings."""
 
-    Attributes:
-        mesh: The mesh.
-        transform: Its transform.
-        field: Field of the target.
-        is_given: True if the field was given, with the error that it has.
-        weights: Weights of the orders.
-    """
-
-    mesh: Mesh
-    transform: MeshTransform
-    field: xr.DataArray
-    is_given: bool
-    weights: SobolevWeights
-
-    @classmethod
-    def from_target(
-        cls,
+    def __init__(
+        self,
         mesh: Mesh,
         target: Operand,
         lattice: Lattice | None,
         orders: tuple[float, ...],
         settings: TransformSettings,
         execution: Execution,
-    ) -> Self:
-        is_given = isinstance(target, xr.DataArray)
-        if is_given or lattice is None:
-            field = field_of(target, lattice, orders)
-        else:
-            field = fourier_transform(target, lattice, settings.eps, order=orders)
-        own = Lattice.from_field(field)
-        transform = MeshTransform.from_mesh(mesh, own, settings, execution)
-        return cls(mesh, transform, field, is_given, SobolevWeights(own, orders))
-
-    @cached_property
-    def values(self) -> Complexes:
-        """Difference on the half lattice."""
-        return self.transform.transform(np.asarray(self.mesh.vertices)) - field_values(self.field)
-
-    @cached_property
-    def factors(self) -> Reals:
-        """Weight of each sample in the squared norms, (orders, *lattice.shape)."""
-        return factors_of(self.weights)
+    ) -> None:
+        self.mesh, self.field = mesh, field_of(target, lattice, orders, settings.eps)
+        # A given field has an error of its own.
+        self.is_given = isinstance(target, xr.DataArray)
+        self.weights = SobolevWeights(Lattice.from_field(self.field), orders)
+        self.factors = factors_of(self.weights)
+        self.transform = MeshTransform.from_mesh(mesh, self.weights.lattice, settings, execution)
+        self.values = self.transform.transform(np.asarray(mesh.vertices)) - field_values(self.field)
 
     def squares(self, factors: Reals) -> Reals:
         """Return the sums of the squared difference with some factors of samples, (orders,)."""

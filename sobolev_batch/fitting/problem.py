@@ -212,32 +212,22 @@ class FitProblem:
 
 def require_comparable(mesh: Mesh, target: Operand) -> None:
     """Refuse a mesh and target that lie apart or are in different units."""
-    if isinstance(target, xr.DataArray):
-        quality = quality_of(target)
-        extent = None if quality is None else quality.extent
-    else:
-        extent = target.extent
-    if extent is not None:
-        _require_one_place(mesh.extent, extent)
-
-
-def _require_one_place(start: Extent, target: Extent) -> None:
-    ratio = float(start.widths.max() / target.widths.max())
+    found = quality_of(target) if isinstance(target, xr.DataArray) else target
+    if found is None:
+        return
+    ratio = float(mesh.extent.widths.max() / found.extent.widths.max())
     if not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
         raise InputError(
-            f"the start is {start.widths.max():.3g} units wide and the target {target.widths.max():.3g}: "
+            f"the start is {mesh.extent.widths.max():.3g} units wide and the target {found.extent.widths.max():.3g}: "
             "are both in the same unit of length?"
         )
-    (low, high), (other_low, other_high) = start.box, target.box
+    (low, high), (other_low, other_high) = mesh.extent.box, found.extent.box
     if np.any(low > other_high) or np.any(other_low > high):
+        corners = ["(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high, other_low, other_high)]
         raise InputError(
-            f"the start ({_corners(low, high)}) and the target ({_corners(other_low, other_high)}) do not overlap: "
+            f"the start ({corners[0]} to {corners[1]}) and the target ({corners[2]} to {corners[3]}) do not overlap: "
             "move one of them to the other first"
         )
-
-
-def _corners(low: Reals, high: Reals) -> str:
-    return " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high))
 
 
 def welded(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:

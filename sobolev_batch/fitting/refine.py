@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -32,6 +33,8 @@ _STEPS_BETWEEN = 40
 MOST_TRIANGLES = 1_000_000
 
 Notify = Callable[[FitProgress], None]
+# Makes the problem of a round from its mesh.
+Make = Callable[[Mesh], FitProblem]
 
 
 def refine(
@@ -55,17 +58,17 @@ def refine(
     triangles are split. An interrupt (Ctrl-C) ends with the best mesh so far.
 
     Args:
-        mesh: Mesh to start from, or what `as_mesh` makes one of. Vertices at one place become one.
-        target: Surface in the same unit of length, or its field; see `fit`.
-        order: Order s < -1/2 of the distance.
+        mesh: Mesh to start from, as for `fit`. Vertices at one place become one.
+        target: As for `fit`.
+        order: As for `fit`.
         triangles: Number of triangles to reach, up to 1,000,000. The result may have a few less, as splits come in
             groups.
         lattice: Lattice of the frequencies to look at; chosen by the mean edge of each mesh if not given. A field
             brings its own.
         steps: Largest number of steps after the last split, and up to 40 after each before.
-        smoothing: Weight λ of the mesh's Laplacian in steps.
+        smoothing: As for `fit`.
         keep_boundary: Leave vertices of open boundaries where they are. Their edges may be split.
-        threads: Threads of the NUFFT; one per core by default.
+        threads: As for `fit`.
         notify: Called after each step.
 
     Returns:
@@ -84,10 +87,11 @@ def refine(
     """
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    make = _problems(target, lattice, settings, Execution(threads=thread_count(threads)))
+    execution = Execution(threads=thread_count(threads))
+    make = partial(FitProblem.for_target, target=target, lattice=lattice, settings=settings, execution=execution)
     problem = _first_problem(mesh, triangles, make)
     before = start_quality(problem)
-    refined = conclude(mesh, before, *_refine(problem, triangles, make, notify))
+    refined = conclude(mesh, before, _refine(problem, triangles, make, notify))
     count = len(refined.mesh.triangles)
     if count >= triangles or refined.end == End.INTERRUPTED.value:
         return refined
@@ -97,19 +101,12 @@ def refine(
 
 def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
     """Return the mesh that `refine` finds, without measures of its distance."""
-    make = _problems(target, None, settings, execution)
-    last, fitted = _refine(_first_problem(mesh, triangles, make), triangles, make)
-    return last.problem.given_mesh(fitted)
+    make = partial(FitProblem.for_target, target=target, lattice=None, settings=settings, execution=execution)
+    last = _refine(_first_problem(mesh, triangles, make), triangles, make)
+    return last.problem.given_mesh(last.mesh)
 
 
-def _problems(
-    target: Operand, lattice: Lattice | None, settings: FitSettings, execution: Execution
-) -> Callable[[Mesh], FitProblem]:
-    """Return the function that makes the problem of a round from its mesh."""
-    return lambda mesh: FitProblem.for_target(mesh, target, lattice, settings, execution)
-
-
-def _first_problem(mesh: Mesh, goal: int, make: Callable[[Mesh], FitProblem]) -> FitProblem:
+def _first_problem(mesh: Mesh, goal: int, make: Make) -> FitProblem:
     """Return the problem of the first round, and refuse a number of triangles that is out of range."""
     count = len(mesh.triangles)
     if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
@@ -119,10 +116,8 @@ def _first_problem(mesh: Mesh, goal: int, make: Callable[[Mesh], FitProblem]) ->
     return make(welded(mesh)[0])
 
 
-def _refine(
-    problem: FitProblem, triangles: int, make: Callable[[Mesh], FitProblem], notify: Notify | None = None
-) -> tuple[FitRun, Mesh]:
-    """Return the last run, with the steps of all rounds, and the prepared mesh at its end."""
+def _refine(problem: FitProblem, triangles: int, make: Make, notify: Notify | None = None) -> FitRun:
+    """Return the last run, with the steps of all rounds."""
     settings = problem.settings
     between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
     goals, taken = _goals(len(problem.start.triangles), triangles), 0
@@ -133,21 +128,20 @@ def _refine(
             notify(FitProgress(taken + progress.step, total, progress.relative))
 
     for goal in (*goals, None):
-        run = FitRun(problem if goal is None else replace(problem, settings=between), count)
-        fitted = run.finish()
+        run = FitRun(problem if goal is None else replace(problem, settings=between), count).finish()
         taken += run.taken
         run.taken = taken
         if goal is None or run.end is End.INTERRUPTED:
             break
         try:
-            problem = make(_split(problem.given_mesh(fitted), goal, make))
+            problem = make(_split(problem.given_mesh(run.mesh), goal, make))
         except KeyboardInterrupt:
             run.end = End.INTERRUPTED
             break
-    return run, fitted
+    return run
 
 
-def _split(mesh: Mesh, triangles: int, make: Callable[[Mesh], FitProblem]) -> Mesh:
+def _split(mesh: Mesh, triangles: int, make: Make) -> Mesh:
     """Return a fitted mesh with the edges split where that helps most."""
     edges = Edges.from_mesh(mesh)
     everywhere = edges.split(np.ones(len(edges.ends), dtype=bool))

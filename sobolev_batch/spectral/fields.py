@@ -261,7 +261,9 @@ def as_operand(a: OperandLike) -> Operand:
     return a if isinstance(a, xr.DataArray) else as_surface(a)
 
 
-def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -> xr.DataArray:
+def field_of(
+    a: OperandLike, lattice: Lattice | None, orders: Sequence[float], eps: float | None = None
+) -> xr.DataArray:
     """Return a field as it is, or transform a surface on a lattice.
 
     Raises:
@@ -283,7 +285,7 @@ def field_of(a: OperandLike, lattice: Lattice | None, orders: Sequence[float]) -
             f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
             "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"
         )
-    return fourier_transform(surface, lattice, order=orders)
+    return fourier_transform(surface, lattice, eps, order=orders)
 
 
 def field_values(field: xr.DataArray) -> Complexes:
