@@ -7,8 +7,8 @@ import re
 import signal
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
-import fast_simplification
 import numpy as np
 import pytest
 
@@ -23,13 +23,8 @@ from sobolev_batch.fitting.descent import (
     smallest_angle,
     triangle_qualities,
 )
-
-
-def decimated(mesh: sb.Mesh, count: int) -> sb.Mesh:
-    vertices, triangles = fast_simplification.simplify(
-        np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32), target_count=count
-    )
-    return sb.Mesh(vertices, triangles)
+from sobolev_batch.surfaces.shapes.subdivision import Edges
+from sobolev_batch.surfaces.sources.derived import decimated
 
 
 def bumpy(level: int) -> sb.Mesh:
@@ -77,15 +72,6 @@ def test_it_keeps_the_triangles_turns_none_over_and_reports_distances_of_points(
 
 
 @pytest.mark.all
-def test_a_field_is_target_enough(fitted: sb.Fit) -> None:
-    field = sb.fourier_transform(TARGET, sb.Lattice(6.0, 54), 1e-7, order=[-4.0])
-    from_field = sb.fit(START, field, -4.0)
-    assert from_field.after.distance < from_field.before.distance / 3
-    assert np.isnan(from_field.after.hausdorff)
-    assert sb.distance(from_field.mesh, TARGET, -4.0, rtol=1e-2)["distance"] < fitted.before.distance / 3
-
-
-@pytest.mark.all
 def test_a_ball_becomes_something_else() -> None:
     ball = sb.icosphere(2)
     fitted = sb.fit(sb.Mesh(0.5 * ball.vertices, ball.triangles), TARGET, -2.0, steps=80)
@@ -102,31 +88,21 @@ def test_moving_both_moves_the_result() -> None:
 
 
 @pytest.mark.slow
-def test_boundaries_stay_if_asked() -> None:
+def test_boundaries_stay_if_asked_and_triangles_without_common_vertices_together() -> None:
     cap = np.asarray(START.vertices)[START.triangles][:, :, 2].mean(axis=1) > 0.1
     half = sb.Mesh(START.vertices, START.triangles[cap])
-    sides = np.sort(half.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, counts = np.unique(sides, axis=0, return_counts=True)
-    rim = np.unique(edges[counts == 1])
+    soup = sb.Mesh(half.vertices[half.triangles].reshape(-1, 3), np.arange(3 * cap.sum()).reshape(-1, 3))
+    edges = Edges.from_mesh(half)
+    rim = np.unique(edges.ends[edges.on_boundary])
     stray = np.setdiff1d(np.arange(len(half.vertices)), half.triangles)
-    free, kept = (sb.fit(half, TARGET, -4.0, steps=10, keep_boundary=keep).mesh for keep in (False, True))
+    free, apart = (sb.fit(mesh, TARGET, -4.0, steps=10).mesh for mesh in (half, soup))
+    kept = sb.fit(half, TARGET, -4.0, steps=10, keep_boundary=True).mesh
     np.testing.assert_allclose(kept.vertices[rim], half.vertices[rim], rtol=0, atol=1e-14)
     assert np.abs(free.vertices[rim] - half.vertices[rim]).max() > 1e-3
     for mesh in (free, kept):
         np.testing.assert_allclose(mesh.vertices[stray], half.vertices[stray], rtol=0, atol=1e-14)
         assert np.abs(mesh.vertices - half.vertices).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_triangles_without_common_vertices_stay_together() -> None:
-    soup = sb.Mesh(
-        np.asarray(START.vertices)[START.triangles].reshape(-1, 3), np.arange(3 * len(START.triangles)).reshape(-1, 3)
-    )
-    fitted, whole = (sb.fit(mesh, TARGET, -4.0, steps=10).mesh for mesh in (soup, START))
-    np.testing.assert_allclose(
-        np.asarray(fitted.vertices)[fitted.triangles], np.asarray(whole.vertices)[whole.triangles], atol=1e-3
-    )
-    assert len(np.unique(fitted.vertices, axis=0)) == len(np.unique(START.vertices, axis=0))
+    np.testing.assert_allclose(apart.vertices[apart.triangles], free.vertices[free.triangles], atol=1e-3)
 
 
 @pytest.mark.slow
@@ -172,19 +148,6 @@ def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPa
     assert fitted.end == "no nearer mesh was found"
 
 
-def measuring(*found: sb.FitQuality | type[BaseException]) -> Any:
-    """A stand-in for measures of the start and of the result."""
-    answers = iter(found)
-
-    def measure(problem: Any, mesh: sb.Mesh) -> sb.FitQuality:
-        answer = next(answers)
-        if isinstance(answer, sb.FitQuality):
-            return answer
-        raise answer
-
-    return measure
-
-
 @pytest.mark.parametrize(
     ("after", "remark"),
     [
@@ -195,7 +158,8 @@ def measuring(*found: sb.FitQuality | type[BaseException]) -> Any:
     ],
 )
 def test_what_one_should_know_is_remarked(monkeypatch: pytest.MonkeyPatch, after: Any, remark: str) -> None:
-    monkeypatch.setattr(module, "measure_quality", measuring(sb.FitQuality(1.0, 0.1, hausdorff=2.0), after))
+    measure = Mock(side_effect=[sb.FitQuality(1.0, 0.1, hausdorff=2.0), after])
+    monkeypatch.setattr(module, "measure_quality", measure)
     fitted = sb.fit(START, TARGET, -4.0, steps=2)
     assert len(fitted.remarks) == 1
     assert remark in fitted.remarks[0]
@@ -248,13 +212,10 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
         ({"order": -0.5}, "finite only for orders below -1/2, found -0.5"),
         ({"order": [-2.0, -3.0]}, "one order is needed, found 2"),
         ({"steps": 0}, "steps must be a whole number from 1 on, found 0"),
-        ({"smoothing": -1.0}, "smoothing must be a number from 0 on, found -1.0"),
         ({"smoothing": np.nan}, "smoothing must be a number from 0 on, found nan"),
         ({"keep_boundary": "no"}, "keep_boundary must be True or False, found 'no'"),
-        ({"threads": 0}, "threads must be a whole number from 1 to 1,024, found 0"),
         ({"threads": 10**6}, "threads must be a whole number from 1 to 1,024, found 1000000"),
         ({"order": "a"}, "an order is a number, such as -2.0, or a list of numbers; found 'a'"),
-        ({"order": [[-2.0]]}, "an order is a number, such as -2.0, or a list of numbers; found [[-2.0]]"),
         ({"lattice": sb.Lattice(8.0, 8)}, "the mesh reaches to |coordinate|"),
         ({"keep_boundary": True, "mesh": sb.Mesh(np.eye(3), [[0, 1, 2]])}, "all vertices lie on the boundary"),
     ],
@@ -278,16 +239,12 @@ def test_a_field_must_be_whole_on_the_lattice_and_serve_the_order() -> None:
             use(START, broken, -4.0)
 
 
-def test_shapes_that_hardly_change_or_were_bad_before_cost_nothing() -> None:
-    ball, rng = sb.icosphere(2), np.random.default_rng(0)
-    references = lowest_free_qualities(np.array(ball.vertices), ball.triangles)
-    vertices = ball.vertices + 0.01 * rng.normal(size=ball.vertices.shape)
-    value, gradient = shape_penalty(vertices, ball.triangles, references)
-    assert value == 0
-    assert not gradient.any()
+def test_shapes_that_were_bad_before_cost_nothing_until_they_are_worse() -> None:
     sliver = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0]])
     references = lowest_free_qualities(sliver, TRIANGLE)
-    assert shape_penalty(sliver, TRIANGLE, references)[0] == 0
+    value, gradient = shape_penalty(sliver, TRIANGLE, references)
+    assert value == 0
+    assert not gradient.any()
     assert shape_penalty(sliver * [1, 0.25, 1], TRIANGLE, references)[0] == pytest.approx(0.25, rel=1e-3)
 
 
@@ -323,20 +280,15 @@ def test_the_smallest_angle(corners: list[list[float]], degrees: float) -> None:
     assert smallest_angle(sb.Mesh(corners, triangles)) == pytest.approx(degrees, rel=1e-9)
 
 
-def dense(mesh: sb.Mesh) -> np.ndarray:
-    """The graph Laplacian of a mesh, edge by edge."""
-    found = np.zeros((len(mesh.vertices),) * 2)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        found[mesh.triangles[:, [a, b]], mesh.triangles[:, [b, a]]] = -1
-    return found - np.diag(found.sum(axis=1))
-
-
 def test_smoothing_solves_with_the_graph_laplacian() -> None:
     mesh, rng = sb.Mesh(sb.icosphere(1).vertices, sb.icosphere(1).triangles[:60]), np.random.default_rng(2)
     free = np.array([0, 2, 3, 5, 8, 13, 21])
     smoothing = Smoothing.from_mesh(mesh, free, 3.0)
     steps, slopes = rng.normal(size=(7, 3)), rng.normal(size=mesh.vertices.shape)
-    matrix = np.eye(7) + 3.0 * dense(mesh)[np.ix_(free, free)]
+    graph = np.zeros((len(mesh.vertices),) * 2)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        graph[mesh.triangles[:, [a, b]], mesh.triangles[:, [b, a]]] = -1
+    matrix = np.eye(7) + 3.0 * (graph - np.diag(graph.sum(axis=1)))[np.ix_(free, free)]
     movement = smoothing.movement(steps)
     np.testing.assert_allclose(movement[free], np.linalg.solve(matrix, steps), rtol=1e-10)
     assert not np.delete(movement, free, axis=0).any()
