@@ -58,8 +58,6 @@ def test_understated_errors_are_called_uncovered(sample: pd.DataFrame) -> None:
     true_error = (telling["value"] - telling["truth"]).abs()
     for understated in (0.5 * true_error, np.nan):
         assert not judged(telling.assign(reported=understated))["covered"].any()
-    # Nor would a twentieth of the errors do for the sample as a whole.
-    assert judged(telling.assign(reported=telling["reported"] / 20))["covered"].mean() < 0.5
 
 
 def test_judgement_allows_for_what_is_uncertain_about_the_truth() -> None:
