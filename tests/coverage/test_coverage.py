@@ -58,6 +58,8 @@ def test_understated_errors_are_called_uncovered(sample: pd.DataFrame) -> None:
     true_error = (telling["value"] - telling["truth"]).abs()
     for understated in (0.5 * true_error, np.nan):
         assert not judged(telling.assign(reported=understated))["covered"].any()
+    # Nor does the check pass if all errors are a third of what they are.
+    assert not show(judged(telling.assign(reported=telling["reported"] / 3)))
 
 
 def test_judgement_allows_for_what_is_uncertain_about_the_truth() -> None:

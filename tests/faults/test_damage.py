@@ -1,7 +1,11 @@
-"""Stores that something else has damaged: named, never shown as data, and repaired by a run."""
+"""Stores that something else has damaged: named, never shown as data, and mended by a run.
+
+Files are cut, altered or lost, lie in wrong places, or are those of an earlier state.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -13,13 +17,16 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, status, verify
+from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, status, table, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
-from tests.faults.conftest import FIELD
+from sobolev_batch.results.store_accessor import StoreAccessor
+from tests.faults.conftest import FIELD, LABELS
 from tests.support.commands import call, write_toml
-from tests.support.stores import put_back
+from tests.support.stores import contents, put_back
 from tests.support.studies import small_table, variable
+
+RECORD = "records/record/c/{row}"
 
 
 def truncate(chunk: Path) -> None:
@@ -50,26 +57,120 @@ def swap_octaves(chunk: Path) -> None:
     shutil.copy(chunk.parents[1] / "0/0", chunk)
 
 
-DAMAGES = (truncate, empty, flip, delete, swap)
 Damage = Callable[[Path], None]
+# Of a store and an earlier state of it.
+Change = Callable[[Path, Path], None]
 
 
-def load(store: Path) -> None:
-    for node in open_store(store).subtree:
-        node.to_dataset().load()
+def at(key: str, damage: Damage) -> Change:
+    return lambda store, earlier: damage(store / key)
 
 
-def test_verify_names_the_mesh_and_run_repairs_it(store: Path, mended: Callable[..., None]) -> None:
-    for damage in DAMAGES:
+def exchange(one: str, other: str) -> Change:
+    def change(store: Path, earlier: Path) -> None:
+        before = (store / one).read_bytes()
+        (store / one).write_bytes((store / other).read_bytes())
+        (store / other).write_bytes(before)
+
+    return change
+
+
+def restore(*names: str) -> Change:
+    """Bring keys and groups back as a backup has them."""
+
+    def change(store: Path, earlier: Path) -> None:
+        for name in names:
+            if (earlier / name).is_dir():
+                shutil.rmtree(store / name)
+                shutil.copytree(earlier / name, store / name)
+            else:
+                shutil.copyfile(earlier / name, store / name)
+
+    return change
+
+
+def relabel(store: Path, earlier: Path) -> None:
+    """Write labels in another order. The keys in the records say which field is whose."""
+    there = Store.open(store)
+    there.write("fourier/mesh", ..., np.array(there.labels()[::-1], dtype=object))
+
+
+def trade(store: Path, earlier: Path) -> None:
+    for name in (FIELD, RECORD):
+        exchange(name.format(row=1), name.format(row=2))(store, earlier)
+    assert status(store).lost_records == LABELS[1:3]
+
+
+SMALL: list[tuple[Damage, str]] = [
+    (truncate, "convergence/distance/c/0/0"),
+    (empty, "meshes/status/c/0"),
+    (flip, "meshes/triangles/c/0"),
+    (delete, "distances/error/c/0/0/0"),
+    (flip, "fourier/xi_x/c/0"),
+    (delete, "fourier/xi_y/c/0"),
+    (delete, "fourier/mesh/c/0"),
+    (truncate, "fourier/quality/c/0"),
+]
+# Changes that do not touch each other, with the meshes and the tables that `verify` then names: None for any.
+GROUPS: dict[str, list[tuple[Change, tuple[str, ...], set[str] | None]]] = {
+    "fields": [
+        (at(FIELD.format(row=row), damage), (LABELS[row],), set())
+        for row, damage in ((1, swap), (0, empty), (2, delete), (3, flip), (4, truncate))
+    ],
+    "tables and coordinates": [(at(key, damage), (), {key.partition("/c/")[0]}) for damage, key in SMALL],
+    "in another place or of an earlier state": [
+        # Of equal length.
+        (exchange("distances/aliasing/c/0/0/0", "distances/discretisation/c/0/0/0"), (), None),
+        (exchange("meshes/edge_length_mean/c/0", "meshes/area/c/0"), (), None),
+        (exchange("fourier/xi_x/c/0", "convergence/edge_length/c/0"), (), None),
+        (restore("convergence/distance/c/0/0"), (), None),
+        (restore("fourier/quality/c/0"), (), None),
+        (relabel, (), None),
+    ],
+    "fields of two meshes": [(exchange(FIELD.format(row=1), FIELD.format(row=2)), LABELS[1:3], set())],
+    "fields and records of two meshes": [(trade, LABELS[1:3], set())],
+}
+
+
+@pytest.fixture(scope="module")
+def earlier(sound: Path, threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same store before its fields were computed again, with other keys."""
+    path = Path(shutil.copytree(sound, tmp_path_factory.mktemp("earlier") / "results.zarr"))
+    run(Study.from_table(small_table(transform={"eps": 1e-7})), path, threads)
+    return path
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_each_change_is_named_and_a_run_mends_all(
+    group: str, store: Path, earlier: Path, mended: Callable[..., None]
+) -> None:
+    for number, (change, meshes, tables) in enumerate(GROUPS[group]):
         with put_back(store):
-            damage(store / FIELD.format(row=2))
+            change(store, earlier)
             found = verify(store)
-            assert (list(found.fields), found.tables, found.withdrawn) == (["ico/2"], {}, True), damage
-            assert (found.complete, found.total) == (5, 5)
-    for row, damage in zip((4, 3, 2, 1), (truncate, flip, delete, swap), strict=True):
-        damage(store / FIELD.format(row=row))
-    assert sorted(verify(store).fields) == ["ico/1", "ico/2", "ico/3", "reference"]
-    mended("ico/1", "ico/2", "ico/3", "reference")
+            assert tuple(found.fields) == meshes, number
+            assert set(found.tables) == tables or (tables is None and found.tables), number
+            assert found.withdrawn or not meshes
+            assert found.total == 5
+    for change, *_ in GROUPS[group]:
+        change(store, earlier)
+    found = verify(store)
+    damaged = {mesh for _, meshes, _ in GROUPS[group] for mesh in meshes}
+    assert set(found.fields) == damaged
+    assert set(found.tables) >= {name for *_, tables in GROUPS[group] for name in tables or ()}
+    mended(*damaged)
+    field = variable(open_store(store), "fourier", "fourier").sel(mesh="ico/2")
+    assert np.isfinite(norm(field, -3.0)["error"].item())
+
+
+def test_damaged_tables_are_never_read(store: Path) -> None:
+    for damage, key in SMALL:
+        # Where coordinates are gone, the fill values are left.
+        if damage is not delete or not key.startswith("fourier/"):
+            with put_back(store):
+                damage(store / key)
+                with pytest.raises(DamageError):
+                    [node.to_dataset().load() for node in open_store(store).subtree]
 
 
 @pytest.mark.parametrize(
@@ -80,11 +181,10 @@ def test_a_reduction_names_the_mesh_and_computes_it_again(
     damage: Damage, pairs: str, row: int, store: Path, threads: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     damage(store / FIELD.format(row=row))
-    label = ("ico/1", "reference")[row == 4]
     # New orders need all fields and no transform.
     study = Study.from_table(small_table(norm={"orders": [-4.0], "pairs": pairs}))
-    assert run(study, store, threads).computed == (label,)
-    assert f"the field of {label} is damaged" in caplog.text
+    assert run(study, store, threads).computed == (LABELS[row],)
+    assert f"the field of {LABELS[row]} is damaged" in caplog.text
     assert np.isfinite(variable(open_store(store), "convergence", "distance").values).all()
 
 
@@ -102,37 +202,6 @@ def test_a_run_with_nothing_to_do_sees_what_is_missing(store: Path, study: Study
     truncate(store / FIELD.format(row=3))
     delete(store / FIELD.format(row=1))
     assert run(study, store, threads).computed == ("ico/1", "ico/3")
-
-
-SMALL: list[tuple[Damage, str]] = [
-    (truncate, "convergence/distance/c/0/0"),
-    (empty, "meshes/status/c/0"),
-    (flip, "meshes/triangles/c/0"),
-    (delete, "distances/error/c/0/0/0"),
-    (flip, "fourier/xi_x/c/0"),
-    (delete, "fourier/xi_y/c/0"),
-    (delete, "fourier/mesh/c/0"),
-    (truncate, "fourier/quality/c/0"),
-]
-
-
-def test_tables_and_coordinates_are_named_never_read_damaged_and_made_again(
-    store: Path, mended: Callable[..., None]
-) -> None:
-    for damage, key in SMALL:
-        with put_back(store):
-            damage(store / key)
-            # Of a coordinate, the fill values are left.
-            if damage is not delete or not key.startswith("fourier/"):
-                with pytest.raises(DamageError):
-                    load(store)
-            assert list(verify(store).tables) == [key.partition("/c/")[0]]
-    for damage, key in SMALL:
-        damage(store / key)
-    assert set(verify(store).tables) == {key.partition("/c/")[0] for _, key in SMALL}
-    mended()
-    field = variable(open_store(store), "fourier", "fourier").sel(mesh="ico/2")
-    assert np.isfinite(norm(field, -3.0)["error"].item())
 
 
 def test_a_damaged_record_counts_as_none(store: Path, mended: Callable[..., None]) -> None:
@@ -217,15 +286,122 @@ def test_fields_that_are_replaced_are_not_described_any_more(store: Path, thread
     assert verify(store).is_sound
 
 
-@pytest.mark.parametrize("damage", [truncate, empty, delete])
-def test_damaged_metadata_are_told(damage: Damage, store: Path, study: Study, threads: Client) -> None:
+def test_an_earlier_field_with_its_record(store: Path, earlier: Path, mended: Callable[..., None]) -> None:
+    bring_back = restore(FIELD.format(row=1), RECORD.format(row=1))
+    bring_back(store, earlier)
+    assert list(verify(store).fields) == ["ico/1"]
+    bring_back(store, earlier)
+    assert status(store).lost_records == ("ico/1",)
+    tree = open_store(store)
+    with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
+        table(tree, -3.5)
+    fields = StoreAccessor(tree)
+    with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
+        fields.distance("ico/1", "reference", -3.0)
+    assert fields.norm("ico/2", -3.0)["norm"] > 0
+    mended("ico/1")
+
+
+def test_earlier_tables_and_root_with_newer_fields(
+    store: Path, earlier: Path, finished_store: Path, mended: Callable[..., None]
+) -> None:
+    restore("zarr.json", "meshes", "norms", "distances", "convergence", "fourier/quality")(store, earlier)
+    found = verify(store)
+    assert len(found.fields) == 5
+    assert "fourier/quality" in found.tables
+    restore("records/record")(store, finished_store)
+    mended()
+
+
+@pytest.mark.parametrize("name", ["meshes/area", "fourier/fourier", "records"])
+def test_metadata_of_one_node(name: str, store: Path, mended: Callable[..., None]) -> None:
+    path = store / name / "zarr.json"
+    content = path.read_bytes()
+    other = json.dumps({**json.loads(content), "node_type": "x"}).encode()
+    for damaged in (None, other, content[: len(content) // 2], bytes(len(content))):
+        path.unlink(missing_ok=True)
+        if damaged is not None:
+            path.write_bytes(damaged)
+        assert set(verify(store).tables) == {"records" if name == "records" else "zarr.json"}, damaged
+    mended()
+
+
+def alter(store: Path, *place: str, value: object) -> None:
+    """Write another value into the metadata at the root."""
+    root = node = json.loads((store / "zarr.json").read_text())
+    for name in place[:-1]:
+        node = node[name]
+    assert node.get(place[-1]) != value
+    node[place[-1]] = value
+    (store / "zarr.json").write_text(json.dumps(root))
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("attributes", "study", "orders"), [-11.0, -3.0]),
+        (("attributes", "similarity", "scale"), 2.0),
+        (("attributes", "study", "lattice", "M"), 18),
+        (("consolidated_metadata", "metadata", "fourier/fourier", "shape"), [5, 18, 17, 9]),
+    ],
+)
+def test_metadata_at_the_root_that_were_altered(
+    place: tuple[str, ...], value: object, store: Path, finished_store: Path, mended: Callable[..., None]
+) -> None:
+    alter(store, *place, value=value)
+    assert not verify(store).is_sound
+    restore("records/record")(store, finished_store)
+    mended()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("fill_value", "x"),
+        ("codecs", [{"name": "bytes"}]),
+        ("dimension_names", ["a", "b", "c"]),
+        ("data_type", "float32"),
+        ("shape", [3]),
+    ],
+)
+def test_metadata_that_make_no_sense_are_damage(name: str, value: object, store: Path) -> None:
+    alter(store, "consolidated_metadata", "metadata", "meshes/area", name, value=value)
+    with pytest.raises(DamageError):
+        open_store(store)["meshes"].to_dataset().load()
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "message"),
+    [
+        (truncate, DamageError, r"zarr\.json is damaged"),
+        (empty, DamageError, r"zarr\.json is damaged"),
+        (delete, StoreError, "it holds no store of a study"),
+    ],
+)
+def test_a_root_that_cannot_be_read(
+    damage: Damage, error: type[Exception], message: str, store: Path, threads: Client, mended: Callable[..., None]
+) -> None:
     damage(store / "zarr.json")
-    for use in (Store.open, open_store):
-        with pytest.raises(StoreError, match=r"results\.zarr: .*it holds no store of a study"):
+    for use in (Store.open, open_store, status, verify):
+        with pytest.raises(error, match=message):
             use(store)
-    if damage is delete:
-        with pytest.raises(StoreError, match=r"results\.zarr: .*holds no store"):
-            run(study, store, threads)
+    before = contents(store)
+    other = Study.from_table(small_table(transform={"eps": 1e-7}))
+    with pytest.raises(StoreError, match=r"no field of this study is found in the store|holds no store"):
+        run(other, store, threads)
+    assert contents(store) == before
+    if damage is not delete:
+        mended()
+
+
+def test_the_record_of_a_run_that_was_altered(store: Path, study: Study, threads: Client) -> None:
+    path = store / "records/zarr.json"
+    path.write_text(path.read_text().replace('"state": "done"', '"state": "failed"'))
+    with pytest.raises(DamageError, match="the record of the latest run is damaged"):
+        status(store)
+    assert list(verify(store).tables) == ["records"]
+    run(study, store, threads)
+    assert verify(store).is_sound
 
 
 def test_a_field_of_zeros_is_one(store: Path, study: Study, threads: Client) -> None:

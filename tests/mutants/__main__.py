@@ -6,14 +6,15 @@ import ast
 import os
 import random
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import click
 
@@ -27,60 +28,47 @@ _TEST_SECONDS = 300
 _PASSED = (0, 5)
 
 
-@dataclass(frozen=True)
-class Guard:
+class Guard(NamedTuple):
     """A condition that ends in an exception, or a call that may raise one and does nothing else.
 
     Attributes:
         path: Path of the module, from the root of the repository.
-        line: Its first line.
+        line: Its line.
         text: Its condition or call.
-        start, end: Places of the text in the module, in bytes.
-        replacement: What the text is replaced by.
+        without: The source of the module without it.
     """
 
     path: str
     line: int
     text: str
-    start: int
-    end: int
-    replacement: str
-
-    def taken_out(self, source: bytes) -> bytes:
-        """Return the source of its module without it."""
-        return source[: self.start] + self.replacement.encode() + source[self.end :]
+    without: str
 
 
-def guards_of(source: bytes, path: str) -> Iterator[Guard]:
+def guards_of(source: str, path: str) -> Iterator[Guard]:
     """Yield the guards of a module in the order of its syntax tree."""
-    starts = [0]
-    for line in source.splitlines(keepends=True):
-        starts.append(starts[-1] + len(line))
-
-    def guard(node: ast.expr, replacement: str) -> Guard:
-        start = starts[node.lineno - 1] + node.col_offset
-        end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
-        return Guard(path, node.lineno, " ".join(source[start:end].decode().split()), start, end, replacement)
-
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        field = ""
         if isinstance(node, ast.If) and any(isinstance(statement, ast.Raise) for statement in node.body):
-            yield guard(node.test, "False")
+            field = "test"
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            function = node.value.func
-            name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
-            if _IS_CHECK.match(name):
-                yield guard(node.value, "None")
+            field = "value" if _IS_CHECK.match(ast.unparse(node.value.func).rpartition(".")[2]) else ""
+        if field:
+            guard = getattr(node, field)
+            setattr(node, field, ast.Constant(None))
+            yield Guard(path, guard.lineno, ast.unparse(guard), ast.unparse(tree))
+            setattr(node, field, guard)
 
 
 def killer_of(copy: Path, guard: Guard) -> str:
     """Take a guard out of a copy of the repository, and return the first test that fails; empty if all pass."""
     module = copy / guard.path
-    source = module.read_bytes()
-    module.write_bytes(guard.taken_out(source))
+    source = module.read_text()
+    module.write_text(guard.without)
     try:
         return next(filter(None, (_first_failure(copy, tests) for tests in mirrors_of(copy, guard.path))), "")
     finally:
-        module.write_bytes(source)
+        module.write_text(source)
 
 
 def mirrors_of(root: Path, path: str) -> list[str]:
@@ -114,7 +102,7 @@ def _copy(folder: Path) -> Path:
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes((ROOT / name).read_bytes())
+            shutil.copyfile(ROOT / name, folder / name)
     return folder
 
 
@@ -130,21 +118,21 @@ def main(paths: tuple[str, ...], count: int | None, seed: int, jobs: int) -> Non
         for path in paths or PATHS
         for module in (sorted((ROOT / path).rglob("*.py")) if (ROOT / path).is_dir() else [ROOT / path])
     ]
-    found = [guard for module in modules for guard in guards_of(module.read_bytes(), str(module.relative_to(ROOT)))]
+    found = [guard for module in modules for guard in guards_of(module.read_text(), str(module.relative_to(ROOT)))]
     chosen = random.Random(seed).sample(found, min(count or len(found), len(found)))
-    copies: Queue[Path] = Queue()
-
-    def tried(guard: Guard) -> str:
-        copy = copies.get()
-        try:
-            return killer_of(copy, guard)
-        finally:
-            copies.put(copy)
-
     survivors = 0
     with TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
+        copies: Queue[Path] = Queue()
         for number in range(jobs):
             copies.put(_copy(Path(folder, f"copy-{number}")))
+
+        def tried(guard: Guard) -> str:
+            copy = copies.get()
+            try:
+                return killer_of(copy, guard)
+            finally:
+                copies.put(copy)
+
         for guard, killer in zip(chosen, pool.map(tried, chosen), strict=True):
             survivors += not killer
             verdict = f"killed by {killer}" if killer else "SURVIVED"

@@ -6,8 +6,9 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -16,6 +17,7 @@ from sobolev_batch import SobolevBatchError, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from tests.soak.studies import STUDY, write_meshes
 from tests.support.commands import call
+from tests.support.stores import contents, put_back
 
 _MESHES = 2
 _SPHERES = """
@@ -48,9 +50,8 @@ def finished_stores(folder: Path) -> dict[str, Path]:
     return stores
 
 
-@dataclass(frozen=True)
-class Corruption:
-    """A file of a store that was damaged.
+class Corruption(NamedTuple):
+    """A store of which a file was damaged.
 
     Attributes:
         kind: What was done to it.
@@ -66,41 +67,64 @@ class Corruption:
 
 
 def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
-    """Yield so many corruptions of one store."""
+    """Yield a number of corruptions of one store."""
     stores = finished_stores(folder)
-    whole = stores["whole"]
-    chance = random.Random(seed)
-    keys = sorted(str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file())
-    damaged = folder / "damaged.zarr"
-    shutil.copytree(whole, damaged)
-    truths = {name: read(damaged) for name, read in WAYS.items()}
-    while count:
-        kind = chance.choice(sorted(KINDS))
-        changed = KINDS[kind](damaged, chance.choice(keys), stores, chance)
-        if not changed:
-            continue
-        answers = {
-            name: _answer(read, damaged, truths[name])
-            for name, read in WAYS.items()
-            if name != "report" or not count % _REPORTS_EVERY
-        }
+    store = stores["whole"]
+    truths = {name: read(store) for name, read in WAYS.items()}
+    states = {
+        name: {path.relative_to(place).as_posix(): content for path, content in contents(place).items()}
+        for name, place in stores.items()
+    }
+    for number, (kind, changes) in enumerate(islice(damages(states, random.Random(seed)), count)):
+        with put_back(store):
+            for key, content in changes.items():
+                (store / key).unlink()
+                if content is not None:
+                    (store / key).write_bytes(content)
+            answers = {
+                name: _answer(read, store, truths[name])
+                for name, read in WAYS.items()
+                if name != "report" or not number % _REPORTS_EVERY
+            }
         if answers["verify"] == "told":
             answers = {name: "verified" if answer == "silent" else answer for name, answer in answers.items()}
-        yield Corruption(kind, changed, answers)
-        shutil.rmtree(damaged)
-        shutil.copytree(whole, damaged)
-        count -= 1
+        yield Corruption(kind, tuple(changes), answers)
+
+
+def damages(
+    states: Mapping[str, Mapping[str, bytes]], chance: random.Random
+) -> Iterator[tuple[str, dict[str, bytes | None]]]:
+    """Yield kinds of damage to the files of a whole store, and what changed files then hold: None if they are gone."""
+    whole = states["whole"]
+    while True:
+        key = chance.choice(sorted(whole))
+        content = whole[key]
+        place, end = sorted(chance.choices(range(len(content)), k=2))
+        others = [name for name in sorted(whole) if whole[name] != content]
+        other = chance.choice([name for name in others if len(whole[name]) == len(content)] or others)
+        flipped = content[place] ^ chance.randrange(1, 256)
+        kinds: dict[str, dict[str, bytes | None]] = {
+            "byte flipped": {key: content[:place] + bytes([flipped]) + content[place + 1 :]},
+            "cut short": {key: content[:place]},
+            "stretch zeroed": {key: content[:place] + bytes(end + 1 - place) + content[end + 1 :]},
+            "deleted": {key: None},
+            "exchanged with another": {key: whole[other], other: content},
+            "from an earlier state": {key: states["earlier"].get(key, content)},
+            "from another store": {key: states["foreign"].get(key, content)},
+        }
+        kind = chance.choice(sorted(kinds))
+        if kinds[kind][key] != content:
+            yield kind, kinds[kind]
 
 
 def _answer(read: Callable[[Path], dict[str, str]], store: Path, truth: dict[str, str]) -> str:
     """Return what a way to read a store did."""
     try:
-        found = read(store)
+        return answer_to(read(store), truth)
     except _ToldError:
         return "told"
     except Exception:
         return "unnamed"
-    return answer_to(found, truth)
 
 
 def answer_to(found: Mapping[str, str], truth: Mapping[str, str]) -> str:
@@ -173,64 +197,4 @@ WAYS: dict[str, Callable[[Path], dict[str, str]]] = {
     "open_store": _arrays,
     # Last, since it withdraws what is damaged.
     "verify": _command("verify", "STORE"),
-}
-
-
-# Damages a file of a store, by its key; gives the keys of the files whose content changed.
-_Damage = Callable[[Path, str, Mapping[str, Path], random.Random], tuple[str, ...]]
-
-
-def _rewritten(change: Callable[[bytes, random.Random], bytes]) -> _Damage:
-    def damage(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
-        before = (store / key).read_bytes()
-        after = change(before, chance)
-        (store / key).write_bytes(after)
-        return (key,) if after != before else ()
-
-    return damage
-
-
-def _flipped(content: bytes, chance: random.Random) -> bytes:
-    place = chance.randrange(len(content))
-    return content[:place] + bytes([content[place] ^ chance.randrange(1, 256)]) + content[place + 1 :]
-
-
-def _zeroed(content: bytes, chance: random.Random) -> bytes:
-    start = chance.randrange(len(content))
-    end = chance.randrange(start, len(content)) + 1
-    return content[:start] + bytes(end - start) + content[end:]
-
-
-def _delete(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
-    (store / key).unlink()
-    return (key,)
-
-
-def _swap(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
-    """Exchange a file with another one, of equal size where there is one."""
-    content = (store / key).read_bytes()
-    others = [path for path in store.rglob("*") if path.is_file() and path.read_bytes() != content]
-    alike = [path for path in others if path.stat().st_size == len(content)]
-    other = chance.choice(sorted(alike or others))
-    (store / key).write_bytes(other.read_bytes())
-    other.write_bytes(content)
-    return (key, str(other.relative_to(store)))
-
-
-def _from(state: str) -> _Damage:
-    def replace(store: Path, key: str, stores: Mapping[str, Path], chance: random.Random) -> tuple[str, ...]:
-        source = stores[state] / key
-        return _rewritten(lambda *_: source.read_bytes())(store, key, stores, chance) if source.exists() else ()
-
-    return replace
-
-
-KINDS: dict[str, _Damage] = {
-    "byte flipped": _rewritten(_flipped),
-    "cut short": _rewritten(lambda content, chance: content[: chance.randrange(len(content))]),
-    "stretch zeroed": _rewritten(_zeroed),
-    "deleted": _delete,
-    "exchanged with another": _swap,
-    "from an earlier state": _from("earlier"),
-    "from another store": _from("foreign"),
 }

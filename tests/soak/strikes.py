@@ -19,13 +19,14 @@ from pathlib import Path
 
 import psutil
 
-from sobolev_batch import Study, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.storage.location import Location
-from tests.soak.studies import differences, write_study
+from tests.soak.studies import write_study
 from tests.support.commands import COMMAND
 from tests.support.object_storage import BUCKET, HEALTHY, Rule, Server, serving, taken_for_s3
 from tests.support.processes import free_port
+from tests.support.stores import differences
 
 SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP}
 ROLES = ("worker", "nanny", "scheduler", "driver")
@@ -110,7 +111,9 @@ def _strike(struck: _Run, clean: Location, seed: int, strikes: tuple[Strike, ...
     if server is not None:
         server.rule, failures = HEALTHY, Counter(map(str, server.failures().elements()))
     came = strikes[: len(strikes) - len(due)]
-    return Outcome(came, seconds, struck.commands, failures, tuple(differences(struck.store, clean)))
+    return Outcome(
+        came, seconds, struck.commands, failures, tuple(differences(open_store(struck.store), open_store(clean)))
+    )
 
 
 class _Run:

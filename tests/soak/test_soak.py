@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch.batch.storage.location import Location
+from sobolev_batch import open_store
 from tests.soak.corruptions import BAD, answer_to, corruptions
 from tests.soak.strikes import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, strikes_of
-from tests.soak.studies import differences
+from tests.support.stores import differences
 
 pytestmark = pytest.mark.all
 
@@ -33,7 +33,7 @@ def test_nothing_is_lost_by_strikes_and_failing_requests_and_it_would_be_noticed
     (fields / "3" / "0" / "0" / "0").unlink()
     (other / "records" / "record" / "c" / "4").unlink()
     shutil.copyfile(other / "norms" / "norm" / "c" / "0" / "0", other / "norms" / "error" / "c" / "0" / "0")
-    found = list(differences(Location.parse(other), Location.parse(clean)))
+    found = list(differences(open_store(other), open_store(clean)))
     assert found[:3] == ["bumpy/000002: another field", "bumpy/000003: another field", "bumpy/000004: missing"]
     assert [difference.split(":")[0] for difference in found[3:]] == ["norms"]
 
