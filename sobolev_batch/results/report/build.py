@@ -40,7 +40,8 @@ from sobolev_batch.results.open import (
     reference_of,
     require_unchanged,
 )
-from sobolev_batch.results.report.content import utc_text
+from sobolev_batch.results.report.collection import league_content
+from sobolev_batch.results.report.content import PageTable, study_content, utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
@@ -149,8 +150,6 @@ def make_report(
 
 
 def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis) -> Page:
-    from sobolev_batch.results.report.content import study_content
-
     tree = as_tree(store)
     content = study_content(tree, Status.from_store(store))
     selection = Selection.from_store(tree)
@@ -158,21 +157,19 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
     charts = chart_data(tree, spectra, views)
-    text = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
+    content["omissions"] += chart_omissions(tree, charts, spectra, views, missing)
+    page = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
     require_unchanged(tree)
-    return text, (*content["omissions"], *chart_omissions(tree, charts, spectra, views, missing))
+    return page
 
 
 def _collection_page(collection: CollectionStore) -> Page:
-    from sobolev_batch.results.report.collection import league_content
-
     content = league_content(collection, Status.of_collection(collection))
-    charts = league_data(content["leagues"], content["name"], content["orders"])
-    return _filled("league", content, charts), content["omissions"]
+    return _filled("league", content, league_data(content["leagues"], content["name"], content["orders"]))
 
 
-def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) -> str:
-    """Return a page from its template, with all that it needs to be drawn."""
+def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
+    """Return a page from its template, with all that it needs to be drawn, and what it leaves out."""
     import jinja2
     import plotly.offline
     from jinja2.utils import htmlsafe_json_dumps
@@ -188,7 +185,7 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(f"{template}.html.jinja").render(
+    text = environment.get_template(f"{template}.html.jinja").render(
         content=content,
         charts=charts,
         data=htmlsafe_json_dumps(_shown_data(charts), allow_nan=False, separators=(",", ":")),
@@ -201,6 +198,8 @@ def _filled(template: str, content: Any, charts: dict[str, Any], **values: Any) 
         written=utc_text(utc_now()),
         **values,
     )
+    tables = [table for table in content.values() if isinstance(table, PageTable) and table.omitted]
+    return text, (*(f"the table {one.name}: {one.omitted:,} more rows" for one in tables), *content["omissions"])
 
 
 def _shown(value: Any) -> Any:

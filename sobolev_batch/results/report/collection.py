@@ -11,15 +11,7 @@ import pandas as pd
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import open_store
-from sobolev_batch.results.report.content import (
-    PageTable,
-    Row,
-    large_count,
-    reasons_table,
-    run_facts,
-    source_text,
-    study_text,
-)
+from sobolev_batch.results.report.content import PageTable, Row, common_content, common_settings
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import tables_of
 from sobolev_batch.results.tables.league import (
@@ -33,7 +25,7 @@ from sobolev_batch.results.tables.league import (
     pair_lines,
     percent_text,
 )
-from sobolev_batch.results.tables.text import Column, duration, minus, percent
+from sobolev_batch.results.tables.text import Column, minus, percent
 
 _OBJECT_COLUMNS = (
     Column("object", "object", kind="label"),
@@ -49,8 +41,8 @@ _OBJECT_COLUMNS = (
 _LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
 
 _NO_LEAGUE = "Methods cannot be compared over the objects."
-# Methods that a sentence names, and missing meshes that are listed with their reasons.
-_MOST_NAMED, _MOST_REASONS = 3, 2_000
+# Methods that a sentence names.
+_MOST_NAMED = 3
 
 
 def league_content(collection: CollectionStore, status: Status) -> dict[str, Any]:
@@ -68,26 +60,19 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
     objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
     at_orders = [league.order for league in leagues]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
+    versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
     return {
-        "title": collection.title,
-        "name": collection.name,
+        **common_content(collection.title, collection.table, tables, status, status.failed, versions),
+        "settings": dict(common_settings(collection.table)),
         "leagues": leagues,
         "no_league": no_league,
         "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
-        "orders": tuple(minus(f"{s:g}") for s in orders),
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
-        "failed": reasons_table("failed", "mesh", dict(list(status.failed.items())[:_MOST_REASONS])),
-        "not_compared": reasons_table("lacking", "mesh", dict(list(status.not_compared.items())[:_MOST_REASONS])),
-        "summary": dict(_summary(tables, orders)),
-        "settings": dict(_settings(collection.table)),
-        "run": dict(run_facts(status)),
-        "versions": open_store(collection.location.below(next(iter(tables)))).attrs["versions"],
-        "study_text": study_text(collection.table),
-        "omissions": tuple(_omissions(collection, status, leagues)),
+        "omissions": tuple(_omissions(collection, leagues)),
     }
 
 
@@ -162,29 +147,7 @@ def _best(league: League, number: int) -> Row:
     }
 
 
-def _summary(tables: Mapping[str, pd.DataFrame], orders: Sequence[float]) -> Iterator[tuple[str, str]]:
-    once = [frame[frame["order"] == frame["order"].iloc[0]] for frame in tables.values()]
-    meshes = pd.concat(once, ignore_index=True)
-    yield "objects", f"{len(tables):,}"
-    yield "methods", f"{meshes['family'].nunique():,}"
-    yield "meshes compared", f"{int(meshes['distance'].notna().sum()):,} of {len(meshes):,}"
-    yield "orders" if len(orders) > 1 else "order", minus(", ".join(f"{s:g}" for s in orders))
-    yield "triangles in all", large_count(int(meshes["triangles"].sum()))
-    yield "computing time", duration(float(meshes["seconds"].sum()))
-
-
-def _settings(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for family in table.get("family", ()):
-        yield f"method {family['name']}", source_text(family)
-    if "reference" in table:
-        yield "reference", source_text(table["reference"])
-    if "accuracy" in table:
-        yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
-
-
-def _omissions(collection: CollectionStore, status: Status, leagues: Sequence[League]) -> Iterator[str]:
+def _omissions(collection: CollectionStore, leagues: Sequence[League]) -> Iterator[str]:
     one = collection.location.below(collection.objects[0])
     yield f"single meshes: each object has a report of its own, such as that of {one}"
     yield from (f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues))
-    if len(status.failed) > _MOST_REASONS:
-        yield f"missing meshes: only {_MOST_REASONS:,} of {len(status.failed):,} are listed"

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -18,8 +17,8 @@ from sobolev_batch.results.tables.convergence import nearest, page_columns, smal
 from sobolev_batch.results.tables.text import Column, count, duration, minus, percent
 from sobolev_batch.spectral.lattice import Lattice
 
-# Rows of all convergence tables together, and of the table of meshes; browsers become slow beyond.
-MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS = 10_000, 5_000
+# Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
+MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
 _LONGEST_VALUE = 300
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
@@ -60,8 +59,9 @@ class PageTable:
 def reasons_table(name: str, label: str, reasons: Mapping[str, str]) -> PageTable | None:
     """Return the table of reasons by mesh or object; None where there are none."""
     columns = Column(label, label, kind="label"), Column("reason", "reason", kind="text")
-    rows = [{label: key, "reason": reason} for key, reason in reasons.items()]
-    return PageTable(name, columns, rows, is_sortable=False) if rows else None
+    rows = [{label: key, "reason": reason} for key, reason in list(reasons.items())[:_MOST_REASONS]]
+    omitted = len(reasons) - len(rows)
+    return PageTable(name, columns, rows, is_sortable=False, omitted=omitted) if rows else None
 
 
 def utc_text(time: str) -> str:
@@ -69,12 +69,52 @@ def utc_text(time: str) -> str:
     return time.replace("T", " ").removesuffix("Z")
 
 
-def study_text(table: Mapping[str, Any]) -> str:
-    """Return the study file of a study, without its comments and layout."""
+def common_content(
+    title: str,
+    study: Mapping[str, Any],
+    frames: Mapping[str, pd.DataFrame],
+    status: Status,
+    failed: Mapping[str, str],
+    versions: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return the texts and tables that the pages of a study and of a collection both have.
+
+    Args:
+        title: Title.
+        study: Table of the study file.
+        frames: Rows of `table` of each object.
+        status: Status of the store.
+        failed: Reasons of what failed, by label.
+        versions: Versions of libraries.
+    """
     # Of the extra, which `make_report` looks for.
     import tomli_w
 
-    return tomli_w.dumps(_without_nulls(table))
+    rows = pd.concat(frames.values(), ignore_index=True)
+    meshes = rows[rows["order"] == rows["order"].iloc[0]]
+    orders = [minus(f"{order:g}") for order in rows["order"].drop_duplicates()]
+    triangles, seconds = meshes["triangles"].sum(), float(meshes["seconds"].sum())
+    return {
+        "title": title,
+        "name": study["study"]["name"],
+        "orders": orders,
+        "summary": {
+            **(
+                {"objects": f"{len(frames):,}", "methods": f"{meshes['family'].nunique():,}"}
+                if "object" in study
+                else {}
+            ),
+            "meshes compared": f"{meshes['distance'].notna().sum():,} of {len(meshes):,}",
+            "orders" if len(orders) > 1 else "order": ", ".join(orders) if len(orders) < 5 else f"{len(orders)}",
+            "triangles in all": f"{triangles:,}" if triangles < 1e6 else f"{triangles / 1e6:,.3g} million",
+            "computing time": duration(seconds),
+        },
+        "failed": reasons_table("failed", "mesh", failed),
+        "not_compared": reasons_table("lacking", "mesh", status.not_compared),
+        "run": dict(_run_facts(status)),
+        "versions": versions,
+        "study_text": tomli_w.dumps(_without_nulls(study)),
+    }
 
 
 def _without_nulls(value: Any) -> Any:
@@ -84,15 +124,17 @@ def _without_nulls(value: Any) -> Any:
     return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
 
 
-def large_count(count: int) -> str:
-    """Return a count in words where it is large."""
-    for size, unit in ((1e9, "billion"), (1e6, "million")):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count:,}"
+def common_settings(study: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what the file of a study or collection says of families, reference and accuracy, by keyword."""
+    for family in study.get("family", ()):
+        yield f"family {family['name']}", _source_text(family)
+    if "reference" in study:
+        yield "reference", _source_text(study["reference"])
+    if "accuracy" in study:
+        yield "accuracy", f"rtol {study['accuracy']['rtol']:g} of every distance to the reference"
 
 
-def source_text(entry: Mapping[str, Any]) -> str:
+def _source_text(entry: Mapping[str, Any]) -> str:
     """Return a source and its parameters on one line."""
     parameters = [f"{key} {_value_text(value)}" for key, value in entry.items() if key not in ("name", "source")]
     text = ", ".join([str(entry.get("source", "")), *parameters])
@@ -101,13 +143,13 @@ def source_text(entry: Mapping[str, Any]) -> str:
 
 def _value_text(value: Any) -> str:
     if isinstance(value, Mapping):
-        return f"({source_text(value)})"
+        return f"({_source_text(value)})"
     if isinstance(value, list):
         return ", ".join(map(_value_text, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def run_facts(status: Status) -> Iterator[tuple[str, str]]:
+def _run_facts(status: Status) -> Iterator[tuple[str, str]]:
     """Yield facts about the latest run, by keyword."""
     yield "store", status.store
     yield "surfaces", f"{status.complete} of {status.total} complete, {len(status.failed)} failed"
@@ -275,34 +317,21 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
     attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
-    orders = tuple(minus(f"{order:g}") for order in convergence["order"].values.tolist())
-    frame, failed = table(tree), _failures(meshes)
+    frame, failed, study = table(tree), _failures(meshes), attributes["study"]["table"]
     sentences, verdict, omitted = study_verdict(frame, failed)
-    distances = convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // len(orders))
-    sizes = _meshes_table(meshes, families, MOST_MESH_ROWS)
-    tables = {"distances": distances, "meshes and timings": sizes}
-    cut = [f"the table of {name}: {table.omitted:,} more meshes" for name, table in tables.items() if table.omitted]
     return {
-        "title": attributes["title"],
-        "name": attributes["study"]["table"]["study"]["name"],
+        **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
         "reference": convergence.attrs["reference"],
-        "settings": dict(_settings(attributes, meshes)),
-        "summary": dict(_summary(meshes, convergence, orders)),
-        "orders": orders,
+        "settings": dict(_settings(attributes)),
         "sentences": sentences,
         "verdict": verdict,
         "verdict_omitted": omitted,
-        "convergence": distances,
-        "meshes": sizes,
-        "omissions": [*cut, *([f"verdict: only {omitted} are shown"] if omitted else [])],
-        "failed": reasons_table("failed", "mesh", failed),
-        "not_compared": reasons_table("lacking", "mesh", status.not_compared),
+        "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
+        "meshes": _meshes_table(meshes, families),
+        "omissions": [f"verdict: only {omitted} are shown"] if omitted else [],
         "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
         "rtol": convergence.attrs.get("rtol"),
         "has_proximity": has_proximity(tree),
-        "run": dict(run_facts(status)),
-        "versions": attributes["versions"],
-        "study_text": study_text(attributes["study"]["table"]),
     }
 
 
@@ -333,10 +362,10 @@ _MESH_COLUMNS = (
 )
 
 
-def _meshes_table(meshes: xr.Dataset, families: Sequence[str], most: int) -> PageTable:
+def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
     frame = meshes.reset_coords().to_dataframe().reset_index()
     # Surfaces in closed form have no counts.
-    rows = frame[:most].assign(
+    rows = frame[:MOST_MESH_ROWS].assign(
         **{name: frame[name].astype(object).where(frame["triangles"] > 0, None) for name in _COUNTS},
         color=frame["family"].map(families.index),
         finished=frame["finished"].map(utc_text),
@@ -351,29 +380,14 @@ def _failures(meshes: xr.Dataset) -> dict[str, str]:
     }
 
 
-def _summary(meshes: xr.Dataset, convergence: xr.Dataset, orders: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    status = meshes["status"].values
-    others = meshes["mesh"].values != convergence.attrs["reference"]
-    done = int((status[others] == "complete").sum())
-    yield "meshes compared", f"{done:,} of {int(others.sum()):,}"
-    yield "orders" if len(orders) > 1 else "order", ", ".join(orders) if len(orders) < 5 else f"{len(orders)}"
-    yield "triangles in all", large_count(int(np.nansum(meshes["triangles"].values)))
-    yield "computing time", duration(float(np.nansum(meshes["seconds"].values)))
-
-
-def _settings(attributes: Mapping[str, Any], meshes: xr.Dataset) -> Iterator[tuple[str, str]]:
+def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     study, table = attributes["study"], attributes["study"]["table"]
     lattice = Lattice(**study["lattice"])
-    families = meshes["family"].values.tolist()
-    for family in table["family"]:
-        count = families.count(family["name"])
-        yield f"family {family['name']}", f"{count:,} {'mesh' if count == 1 else 'meshes'}: {source_text(family)}"
-    reference = source_text(table["reference"])
-    yield "reference", reference if study["reference"] == REFERENCE_LABEL else f"{study['reference']}: {reference}"
-    if "accuracy" in table:
-        yield "accuracy", f"rtol {table['accuracy']['rtol']:g} of every distance to the reference"
-        for reason in (study.get("choice") or {}).get("reasons", ()):
-            yield "chosen", reason
+    yield from common_settings(table)
+    if study["reference"] != REFERENCE_LABEL:
+        yield "reference mesh", study["reference"]
+    for reason in (study.get("choice") or {}).get("reasons", ()):
+        yield "chosen", reason
     yield (
         "lattice",
         f"frequencies up to {lattice.xi_max:.6g} cycles per unit length on each axis, {lattice.M} intervals "

@@ -268,15 +268,15 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
         monkeypatch.setattr(module, name, most)
     page, omissions = make_report(store, folder=folder)
     for note in (
-        "2 more meshes are not shown here; <code>sobolev-batch table --format csv</code>",
-        "4 more meshes are not shown here.",
+        "2 more rows are not shown here; <code>sobolev-batch table --format csv</code>",
+        "4 more rows are not shown here",
         "The first 3 of 5 meshes are shown, including the reference",
         "2 of 4 meshes are shown, spread evenly through the study",
     ):
         assert note in page
     for omission in (
-        "the table of distances: 2 more meshes",
-        "the table of meshes and timings: 4 more meshes",
+        "the table convergence: 2 more rows",
+        "the table meshes: 4 more rows",
         "the chart of convergence: only 6 of 8 distances are drawn",
         "all pairs: only 3 of 5 meshes are shown",
         "spectra: only those of 2 of 4 meshes are shown",
