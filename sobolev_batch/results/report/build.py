@@ -252,18 +252,20 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "orders": list(orders),
         "families": list(leagues[0].methods) if leagues else [],
         "size": label_of(leagues[0].x) if leagues else "",
-        "league": [[_method(method, league) for method in league.methods] for league in leagues],
+        "league": [
+            [
+                _line(method, np.exp(curve.sizes), np.exp(curve.values), curve.bars)
+                for method in league.methods
+                for curve in [league.mean_curve(method)]
+            ]
+            for league in leagues
+        ],
     }
 
 
-def _method(method: str, league: League) -> Json:
-    curve = league.mean_curve(method)
-    return {
-        "family": method,
-        "sizes": _numbers(np.exp(curve.sizes)),
-        "values": _numbers(np.exp(curve.values)),
-        "errors": _numbers(curve.bars, digits=2),
-    }
+def _line(family: str, places: Any, values: Any, errors: Any, **others: Any) -> Json:
+    """Return the data of a line with error bars in the colour of a family."""
+    return {"family": family, "x": _numbers(places), "y": _numbers(values), "errors": _numbers(errors, 2), **others}
 
 
 def chart_omissions(
@@ -294,7 +296,15 @@ def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list
     frame = _drawable(tree)
     return [
         [
-            _family(str(family), rows.sort_values("edge_length"))
+            _line(
+                str(family),
+                rows["edge_length"],
+                rows["relative"],
+                rows["relative_error"],
+                joined=is_sequence(rows),
+                labels=rows["mesh"].tolist(),
+                triangles=rows["triangles"].tolist(),
+            )
             for family, rows in frame[frame["order"] == order][:most].groupby("family", sort=False)
         ]
         for order in orders
@@ -303,20 +313,8 @@ def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list
 
 def _drawable(tree: xr.DataTree) -> pd.DataFrame:
     """Return the rows of `table` that have a place on logarithmic axes."""
-    frame = table(tree)
+    frame = table(tree).sort_values("edge_length", kind="stable")
     return frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
-
-
-def _family(family: str, rows: Any) -> Json:
-    return {
-        "family": family,
-        "joined": is_sequence(rows),
-        "labels": rows["mesh"].tolist(),
-        "triangles": rows["triangles"].tolist(),
-        "sizes": _numbers(rows["edge_length"]),
-        "values": _numbers(rows["relative"]),
-        "errors": _numbers(rows["relative_error"]),
-    }
 
 
 def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
@@ -328,12 +326,7 @@ def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
         return None
     return [
         [
-            {
-                "family": family,
-                "times": line["time"].values.tolist(),
-                "values": _numbers(line["distance"].values),
-                "errors": _numbers(line["error"].values, digits=2),
-            }
+            {**_line(family, [], line["distance"].values, line["error"].values), "x": line["time"].values.tolist()}
             for family in found["family"].values.tolist()
             for line in [found.sel(order=order, family=family).dropna("time", subset=["distance"])]
         ]
@@ -371,14 +364,11 @@ def _spectra(spectra: Spectra) -> Json:
     }
 
 
-def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> Json:
-    return {
-        "labels": spectra.labels,
-        "families": [family_of[label] for label in spectra.labels],
-        "wavelengths": _numbers(spectra.wavelengths),
-        "values": [_numbers(row) for row in spectra.energies],
-        "errors": [_numbers(row, digits=2) for row in spectra.energy_errors],
-    }
+def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> list[Json]:
+    return [
+        _line(family_of[label], spectra.wavelengths, energies, errors, label=label)
+        for label, energies, errors in zip(spectra.labels, spectra.energies, spectra.energy_errors, strict=True)
+    ]
 
 
 def _view(view: MeshView) -> Json:

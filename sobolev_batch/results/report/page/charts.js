@@ -96,54 +96,53 @@
     const families = data.convergence[state.order] ?? [];
     const traces = families.map((line) => ({
       type: "scatter", mode: line.joined ? "lines+markers" : "markers", name: short(line.family, 40),
-      x: line.sizes, y: line.values,
-      error_y: bars(line.values, line.errors),
+      x: line.x, y: line.y, error_y: bars(line.y, line.errors),
       line: { color: series(line.family), width: 1.8 },
       marker: { color: series(line.family), symbol: symbol(line.family), size: 8 },
       text: line.labels.map((label, i) =>
-        `${plain(label)}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.sizes[i])}` +
-        `<br>relative distance ${number(100 * line.values[i])} % ± ${line.errors[i] == null ? "?" : `${(100 * line.errors[i]).toPrecision(2)} %`}`),
+        `${plain(label)}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.x[i])}` +
+        `<br>relative distance ${number(100 * line.y[i])} % ± ${line.errors[i] == null ? "?" : `${(100 * line.errors[i]).toPrecision(2)} %`}`),
       hoverinfo: "text",
     }));
     const all = (key) => families.flatMap((line) => line[key]);
-    if (all("sizes").length) {
+    if (all("x").length) {
       const middle = (values) => Math.exp(values.reduce((sum, x) => sum + Math.log(x), 0) / values.length);
-      const ends = [Math.min(...all("sizes")), Math.max(...all("sizes"))];
-      const [size, value] = [middle(all("sizes")), middle(all("values"))];
+      const ends = [Math.min(...all("x")), Math.max(...all("x"))];
+      const [size, value] = [middle(all("x")), middle(all("y"))];
       traces.push({
         type: "scatter", mode: "lines", name: "slope 2", x: ends, y: ends.map((x) => value * (x / size) ** 2),
         line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
       });
     }
     draw("convergence", traces, {
-      xaxis: { type: "log", ...(all("sizes").length ? ticks(all("sizes")) : {}), title: { text: "mean edge length" } },
-      yaxis: { type: "log", ...(all("values").length ? ticks(all("values")) : {}), title: { text: narrow() ? "" : "relative distance" } },
+      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: "mean edge length" } },
+      yaxis: { type: "log", ...(all("y").length ? ticks(all("y")) : {}), title: { text: narrow() ? "" : "relative distance" } },
     });
   };
 
   const league = () => {
     const methods = data.league[state.order];
-    const traces = methods.map(({ family, sizes, values, errors }) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), x: sizes, y: values, error_y: bars(values, errors),
+    const traces = methods.map(({ family, x, y, errors }) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors),
       line: { color: series(family), width: 1.8 },
       marker: { color: series(family), symbol: symbol(family), size: 8 },
-      text: values.map((value, i) => `${plain(family)}<br>${plain(data.size)}: ${number(sizes[i])}` +
+      text: y.map((value, i) => `${plain(family)}<br>${plain(data.size)}: ${number(x[i])}` +
         `<br>mean relative distance ${number(100 * value)} %`),
       hoverinfo: "text",
     }));
     draw("league", traces, {
-      xaxis: { type: "log", ...ticks(methods.flatMap(({ sizes }) => sizes)), title: { text: plain(data.size) } },
-      yaxis: { type: "log", ...ticks(methods.flatMap(({ values }) => values)), title: { text: narrow() ? "" : "mean relative distance" } },
+      xaxis: { type: "log", ...ticks(methods.flatMap(({ x }) => x)), title: { text: plain(data.size) } },
+      yaxis: { type: "log", ...ticks(methods.flatMap(({ y }) => y)), title: { text: narrow() ? "" : "mean relative distance" } },
     });
   };
 
   const evolution = () => {
-    const traces = data.evolution[state.order].map(({ family, times, values, errors }) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), x: times, y: values, error_y: bars(values, errors),
+    const traces = data.evolution[state.order].map(({ family, x, y, errors }) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors),
       line: { color: series(family), width: 1.8 },
       marker: { color: series(family), symbol: symbol(family), size: 6 },
-      text: values.map((value, i) =>
-        `${plain(family)}<br>time ${times[i]}<br>distance ${number(value)} ± ${errors[i] ?? "?"}`),
+      text: y.map((value, i) =>
+        `${plain(family)}<br>time ${x[i]}<br>distance ${number(value)} ± ${errors[i] ?? "?"}`),
       hoverinfo: "text",
     }));
     draw("evolution", traces, {
@@ -215,13 +214,14 @@
   };
 
   const energy = () => {
-    const { labels, families, wavelengths, values, errors } = data.energy;
-    const traces = values.map((y, i) => ({
-      type: "scatter", mode: "lines+markers", name: short(families[i], 40), legendgroup: families[i],
-      showlegend: families.indexOf(families[i]) === i, x: wavelengths, y, error_y: bars(y, errors[i]),
-      line: { color: series(families[i]), width: 1.3 },
-      marker: { color: series(families[i]), symbol: symbol(families[i]), size: 5 },
-      text: y.map((value, j) => `${plain(labels[i])}<br>wavelength ${number(wavelengths[j])}<br>${number(value)} of the limit`),
+    const wavelengths = data.energy.flatMap(({ x }) => x);
+    const families = data.energy.map(({ family }) => family);
+    const traces = data.energy.map(({ family, label, x, y, errors }, i) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), legendgroup: family,
+      showlegend: families.indexOf(family) === i, x, y, error_y: bars(y, errors),
+      line: { color: series(family), width: 1.3 },
+      marker: { color: series(family), symbol: symbol(family), size: 5 },
+      text: y.map((value, j) => `${plain(label)}<br>wavelength ${number(x[j])}<br>${number(value)} of the limit`),
       hoverinfo: "text",
     }));
     traces.push({
