@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self, overload
+from typing import overload
 
 from distributed import Client
 
@@ -37,72 +37,45 @@ _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 _FEWEST_RECORDS = 3
 
 
-@dataclass(frozen=True)
-class Forecast:
-    """Time that a run will take.
+def forecast(
+    plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
+) -> tuple[float, float, list[str]]:
+    """Predict the time of a run.
 
-    Attributes:
-        surfaces: Number of surfaces whose fields are missing.
-        processor_seconds: Processor time of all tasks and processes.
-        seconds: Time from the start to the end, if the workers have their cores for themselves.
-        threads: Number of tasks that run at once.
-        basis: What the speed was measured by.
+    Args:
+        plan: Plan of the study.
+        stored: Records of fields that are stored, and not to be computed again, by label.
+        workers: Workers to compute on.
+        client: Client of their cluster; None if the run starts them on this machine.
+        planning_seconds: Time of planning, which a run does again; 0 where it takes the choice of its store.
+
+    Returns:
+        Seconds from the start to the end, if the workers have their cores for themselves; seconds of a processor, of
+        all tasks and processes; and lines that show both.
     """
-
-    surfaces: int
-    processor_seconds: float
-    seconds: float
-    threads: int
-    basis: str
-
-    @classmethod
-    def for_plan(
-        cls, plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
-    ) -> Self:
-        """Predict the time of a run.
-
-        Args:
-            plan: Plan of the study.
-            stored: Records of fields that are stored, and not to be computed again, by label.
-            workers: Workers to compute on.
-            client: Client of their cluster; None if the run starts them on this machine.
-            planning_seconds: Time of planning, which a run does again; 0 where it takes the choice of its store.
-        """
-        predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
-        missing = [row.label for row in plan.rows if row.label not in stored]
-        if not missing:
-            return cls(0, 0.0, 0.0, workers.threads, "")
-        if len(stored) >= _FEWEST_RECORDS:
-            spent = sum(record.seconds for record in stored.values())
-            factor = spent / sum(predicted[label] for label in stored)
-            basis = f"the {len(stored)} fields that are stored"
-        elif client is None:
-            factor, basis = slowness(), "a transform on this machine"
-        else:
-            factor, basis = worker_slowness(client, workers.members[0].address), "a transform on a worker"
-        times = [factor * predicted[label] for label in missing]
-        processes = 0.0 if client else _PROCESS_SECONDS * (1 + len(workers.members))
-        start = 0.0 if client else _CLUSTER_SECONDS
-        return cls(
-            len(missing),
-            planning_seconds + processes + sum(times),
-            planning_seconds + start + max(sum(times) / workers.threads, *times),
-            workers.threads,
-            basis,
-        )
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """The forecast as ``sobolev-batch plan`` shows it."""
-        if not self.surfaces:
-            return ("nothing is missing",)
-        total, processor = (duration(seconds, digits=2) for seconds in (self.seconds, self.processor_seconds))
-        missing = f"{self.surfaces} missing field{'s' * (self.surfaces != 1)}"
-        tasks = f"{self.threads} task{'s' * (self.threads != 1)} at once"
-        return (
-            f"about {total} for {missing}, with {tasks}",
-            f"{processor} of processor time; the speed is that of {self.basis}",
-        )
+    predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
+    missing = [row.label for row in plan.rows if row.label not in stored]
+    if not missing:
+        return 0.0, 0.0, ["nothing is missing"]
+    if len(stored) >= _FEWEST_RECORDS:
+        spent = sum(record.seconds for record in stored.values())
+        factor = spent / sum(predicted[label] for label in stored)
+        basis = f"the {len(stored)} fields that are stored"
+    elif client is None:
+        factor, basis = slowness(), "a transform on this machine"
+    else:
+        factor, basis = worker_slowness(client, workers.members[0].address), "a transform on a worker"
+    times = [factor * predicted[label] for label in missing]
+    processes, start = (0.0, 0.0) if client else (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS)
+    processor_seconds = planning_seconds + processes + sum(times)
+    seconds = planning_seconds + start + max(sum(times) / workers.threads, *times)
+    fields = f"{len(missing)} missing field{'s' * (len(missing) != 1)}"
+    tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
+    lines = [
+        f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
+        f"{duration(processor_seconds, digits=2)} of processor time; the speed is that of {basis}",
+    ]
+    return seconds, processor_seconds, lines
 
 
 def _row_seconds(plan: Plan, row: Row) -> float:
@@ -350,10 +323,9 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         for row in study_plan.rows
         if row.label in records and records[row.label].completes(row.key)
     }
-    forecast = Forecast.for_plan(study_plan, stored, workers, client, planning_seconds)
+    seconds, processor_seconds, (first, *others) = forecast(study_plan, stored, workers, client, planning_seconds)
     doubtful, count = _doubts_of(study_plan), len(study_plan.rows)
     total_bytes = format_bytes(study_plan.field_bytes * count)
-    first, *others = forecast.lines
     lines = [
         *_study_lines(study_plan),
         *_task_lines(study_plan, workers, sizes, refused, doubtful),
@@ -377,8 +349,8 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         similarity=study_plan.similarity,
         field_bytes=study_plan.field_bytes,
         memory_bytes={label: size.projected_bytes for label, size in sizes.items()},
-        seconds=forecast.seconds,
-        processor_seconds=forecast.processor_seconds,
+        seconds=seconds,
+        processor_seconds=processor_seconds,
         lines=tuple(lines),
     )
 
