@@ -6,10 +6,12 @@ import logging
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import textwrap
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +21,6 @@ from sobolev_batch.spectral import backends
 from sobolev_batch.spectral.backends import (
     CPU,
     GPU_COSTS,
-    ComplexDtype,
     Gpu,
     backend_named,
     combine,
@@ -67,18 +68,29 @@ def assert_agree(found: Transformed, expected: Transformed, mesh: Mesh, toleranc
     assert np.abs(found.values - expected.values).max() < tolerance * mesh.area
 
 
+SETTINGS = [
+    *((TransformSettings(1e-13, quadrature=quadrature), 1e-12) for quadrature in ("auto", "gauss8", 7)),
+    (TransformSettings(1e-13, tolerance=1e-2), 1e-12),
+    (TransformSettings(1e-6, "complex64"), 1e-5),
+]
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Iterator[Gpu]:
+    try:
+        yield gpu_backend()
+    except BackendError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("device", ["fake", "gpu"])
 @pytest.mark.parametrize("name", MESHES)
-@pytest.mark.parametrize(
-    ("settings", "tolerance"),
-    [
-        *((TransformSettings(1e-13, quadrature=quadrature), 1e-12) for quadrature in ("auto", "gauss8", 7)),
-        (TransformSettings(1e-13, tolerance=1e-2), 1e-12),
-        (TransformSettings(1e-6, "complex64"), 1e-5),
-    ],
-)
-def test_the_fake_agrees_with_the_processor(name: str, settings: TransformSettings, tolerance: float) -> None:
-    mesh = MESHES[name]
-    assert_agree(on(Device().backend(), mesh, settings), on(CPU, mesh, settings), mesh, tolerance)
+@pytest.mark.parametrize(("settings", "tolerance"), SETTINGS)
+def test_a_gpu_agrees_with_the_processor(
+    request: pytest.FixtureRequest, device: str, name: str, settings: TransformSettings, tolerance: float
+) -> None:
+    backend = Device().backend() if device == "fake" else request.getfixturevalue("gpu")
+    assert_agree(on(backend, MESHES[name], settings), on(CPU, MESHES[name], settings), MESHES[name], tolerance)
 
 
 def test_the_uneven_mesh_has_every_kind_of_rule() -> None:
@@ -170,11 +182,9 @@ def test_the_processor_steps_in(device: Device, reason: str, warnings: int, capl
 
 
 def test_arrays_that_run_out_of_memory_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh, device = icosphere(3), Device(capacity=3e5)
     monkeypatch.setattr(Gpu, "free_bytes", 1e9)  # as with a limit on CuPy's pool, which CUDA does not know
-    found = on(device.backend(), mesh)
+    found = on(Device(capacity=3e5).backend(), icosphere(3))
     assert found.backend == "finufft after cufinufft: out of memory"
-    assert np.array_equal(found.values, on(CPU, mesh).values)
 
 
 def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
@@ -254,27 +264,20 @@ def test_importing_the_package_loads_nothing_of_a_gpu() -> None:
         assert not {name.split(".")[0] for name in imported(path)} & {"cupy", "cufinufft", "cuda"}, path
 
 
-class Loader:
+def pathfinder(missing: str = "") -> Any:
     """A pathfinder that does not find one of the libraries."""
 
-    def __init__(self, missing: str = "") -> None:
-        self.missing = missing
-
-    def load_nvidia_dynamic_lib(self, name: str) -> Any:
-        if name == self.missing:
+    def load(name: str) -> Any:
+        if name == missing:
             raise RuntimeError("not found")
         return SimpleNamespace(abs_path=None)  # the process itself
 
+    return SimpleNamespace(load_nvidia_dynamic_lib=load)
+
 
 def no_device(status: int, driver: int = 0) -> Any:
-    def get_device_count() -> int:
-        if status:
-            raise CUDARuntimeError(status)
-        return 0
-
-    runtime = SimpleNamespace(
-        CUDARuntimeError=CUDARuntimeError, getDeviceCount=get_device_count, driverGetVersion=lambda: driver
-    )
+    count = Mock(return_value=0, side_effect=CUDARuntimeError(status) if status else None)
+    runtime = SimpleNamespace(CUDARuntimeError=CUDARuntimeError, getDeviceCount=count, driverGetVersion=lambda: driver)
     return SimpleNamespace(cuda=SimpleNamespace(runtime=runtime))
 
 
@@ -283,21 +286,19 @@ def no_device(status: int, driver: int = 0) -> Any:
     [
         ({}, r"^no GPU: cuda-pathfinder is not installed: pip install 'sobolev-batch\[gpu\]'$"),
         (
-            {"cuda.pathfinder": Loader("cudart")},
+            {"cuda.pathfinder": pathfinder("cudart")},
             r"^no GPU: the CUDA runtime \(cudart\) is not installed or cannot .*gpu",
         ),
-        ({"cuda.pathfinder": Loader("cufft")}, r"^no GPU: cuFFT \(cufft\) is not installed .*pip install"),
-        ({"cuda.pathfinder": Loader("nvrtc")}, r"^no GPU: the CUDA compiler NVRTC \(nvrtc\) is not .*pip install"),
-        ({"cuda.pathfinder": Loader()}, r"^no GPU: CuPy is not installed: pip install"),
-        ({"cuda.pathfinder": Loader(), "cupy": no_device(0)}, r"^no GPU: cuFINUFFT is not installed: pip install"),
+        ({"cuda.pathfinder": pathfinder("cufft")}, r"^no GPU: cuFFT \(cufft\) is not installed .*pip install"),
+        ({"cuda.pathfinder": pathfinder()}, r"^no GPU: CuPy is not installed: pip install"),
+        ({"cuda.pathfinder": pathfinder(), "cupy": no_device(0)}, r"^no GPU: cuFINUFFT is not installed: pip install"),
         (
-            {"cuda.pathfinder": Loader(), "cupy": no_device(0), "cufinufft": ImportError("bad\nlibrary")},
+            {"cuda.pathfinder": pathfinder(), "cupy": no_device(0), "cufinufft": ImportError("bad\nlibrary")},
             r"^no GPU: cuFINUFFT is installed but cannot be imported \(bad library\): pip install",
         ),
         ({"cupy": no_device(35)}, "^no GPU: the NVIDIA driver is not installed on this machine$"),
         ({"cupy": no_device(35, 11000)}, "^no GPU: the NVIDIA driver is too old for CUDA 12: update it"),
-        ({"cupy": no_device(100)}, "^no GPU: the NVIDIA driver sees no device; is CUDA_VISIBLE_DEVICES"),
-        ({"cupy": no_device(0)}, "^no GPU: the NVIDIA driver sees no device; is CUDA_VISIBLE_DEVICES"),
+        *(({"cupy": no_device(n)}, "^no GPU: the NVIDIA driver sees no device; is CUDA_VIS") for n in (0, 100)),
         ({"cupy": no_device(999)}, "^no GPU: CUDA says cudaError 999$"),
     ],
 )
@@ -305,12 +306,10 @@ def test_says_in_one_line_what_is_missing(
     modules: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "cuda.pathfinder" not in modules and modules:
-        modules = {"cuda.pathfinder": Loader(), "cufinufft": SimpleNamespace(), **modules}
+        modules = {"cuda.pathfinder": pathfinder(), "cufinufft": SimpleNamespace(), **modules}
 
     def import_module(name: str) -> Any:
-        found = modules.get(name)
-        if found is None:
-            raise ModuleNotFoundError(name)
+        found = modules.get(name, ModuleNotFoundError(name))
         if isinstance(found, ImportError):
             raise found
         return found
@@ -320,12 +319,18 @@ def test_says_in_one_line_what_is_missing(
         Gpu.load()
 
 
-# The real libraries, without a device.
+# The real libraries, with or without a device.
 
 
 @pytest.fixture(scope="module")
 def real_cupy() -> Any:
+    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
     return pytest.importorskip("cupy", reason="CuPy comes with the extra 'gpu'")
+
+
+def run_program(code: str, *options: str) -> subprocess.CompletedProcess[str]:
+    program = f"from sobolev_batch.spectral import backends\n{textwrap.dedent(code)}"
+    return subprocess.run([sys.executable, *options, "-c", program], capture_output=True, text=True, check=True)
 
 
 def test_cupy_answers_what_the_fake_answers(real_cupy: Any) -> None:
@@ -333,153 +338,55 @@ def test_cupy_answers_what_the_fake_answers(real_cupy: Any) -> None:
         assert getattr(real_cupy, name) is not getattr(np, name), name
     for name in UFUNCS:
         assert isinstance(getattr(real_cupy, name), real_cupy.ufunc), name
-    public = {name for name in vars(Array) if not name.startswith("_")}
-    assert public <= set(dir(real_cupy.ndarray))
-
-
-def test_numpys_functions_reach_cupy(real_cupy: Any) -> None:
-    """Each call that the package makes gets through to CUDA, which then may well miss its driver."""
-    memory = real_cupy.cuda.UnownedMemory(1 << 12, 1 << 20, None, 0)
-
-    def phantom(*shape: int, dtype: Any = np.float64) -> Any:
-        return real_cupy.ndarray(shape, dtype=dtype, memptr=real_cupy.cuda.MemoryPointer(memory, 0))
-
-    try:
-        has_device = real_cupy.cuda.runtime.getDeviceCount() > 0
-    except real_cupy.cuda.runtime.CUDARuntimeError:
-        has_device = False
-    make = real_cupy.zeros if has_device else lambda shape, dtype=np.float64: phantom(*shape, dtype=dtype)
-    rows, row = make((3, 5)), make((5,))
-    indices, complexes, flags = make((5,), np.int64), make((5,), np.complex128), make((5,), np.bool_)
-    calls: dict[str, Callable[[], object]] = {
-        "empty": lambda: np.empty((3, 4), dtype=np.int64, like=row),
-        "zeros": lambda: np.zeros(3, dtype="complex64", like=row),
-        "asarray": lambda: np.asarray(np.arange(3.0), like=row),
-        "arange": lambda: np.arange(5, like=indices),
-        "ascontiguousarray": lambda: np.ascontiguousarray(rows[0], dtype=np.float32, like=rows),
-        "concatenate": lambda: np.concatenate([rows, rows], axis=1),
-        "stack": lambda: np.stack([row, row]),
-        "tile": lambda: np.tile(row, 4),
-        "repeat": lambda: np.repeat(row, 3),
-        "unique": lambda: np.unique(indices, return_inverse=True),
-        "bincount": lambda: np.bincount(indices, weights=row),
-        "flatnonzero": lambda: np.flatnonzero(flags),
-        "cumsum": lambda: np.cumsum(indices),
-        "multiply": lambda: np.multiply(row, row, out=complexes.real, casting="same_kind"),
-        "not_equal": lambda: np.not_equal(indices[1:], indices[:-1], out=flags[1:]),
-        "left_shift": lambda: np.left_shift(np.minimum(indices, indices), 3, out=indices),
-        "tan": lambda: np.tan(0.5 * row),
-        "exp": lambda: np.exp(1j * row),
-        "numpy scalar": lambda: np.float64(2) * row,
-        "list index": lambda: rows[[0, 2]],
-        "assignment": lambda: indices.__setitem__(indices, 1),
-        "imaginary part": lambda: setattr(complexes, "imag", 0),
-        # Without a driver, sorting itself ends some versions of CuPy.
-        "sort": lambda: indices.sort() if has_device else None,
-        "iteration": lambda: [each.ravel() for each in rows],
-    }
-    for name, call in calls.items():
-        try:
-            call()
-        except real_cupy.cuda.runtime.CUDARuntimeError:
-            assert not has_device, name
-    assert calls.keys() >= FUNCTIONS
+    assert {name for name in vars(Array) if not name.startswith("_")} <= set(dir(real_cupy.ndarray))
 
 
 def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cupy: Any) -> None:
-    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
-    code = """
-import sys
-from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends import gpu_backend
-try:
-    print("found", gpu_backend().description)
-except BackendError as error:
-    print("cufinufft" in sys.modules, error)
-"""
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+    done = run_program(
+        """
+        import sys
+        try:
+            print("found", backends.gpu_backend().description)
+        except backends.BackendError as error:
+            print("cufinufft" in sys.modules, error)
+        """,
+        "-W",
+        "error",
+    )
     assert done.stdout.startswith(("found", "True no GPU: the NVIDIA driver")), done.stdout
     assert not done.stderr
 
 
-def test_a_plan_that_cannot_be_made_leaves_nothing_behind(real_cupy: Any) -> None:
-    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
+def test_a_plan_that_cannot_be_made_leaves_nothing_behind_and_options_are_those_of_the_fake(real_cupy: Any) -> None:
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
-    code = """
-from sobolev_batch.spectral import backends
-from sobolev_batch.spectral.backends import Gpu, NufftSpec
-backends._require_device = lambda cupy: None
-backend = Gpu.load()
-try:
-    backend.plan(NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
-except RuntimeError as error:
-    print(error, backend.is_out_of_memory(error))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "Error creating plan. False\n"
+    done = run_program("""
+        backends._require_device = lambda cupy: None
+        backend = backends.Gpu.load()
+        try:
+            backend.plan(backends.NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
+        except RuntimeError as error:
+            print(error, backend.is_out_of_memory(error))
+        from cufinufft._cufinufft import NufftOpts
+        print(*(name for name, _ in NufftOpts._fields_))
+    """)
+    failure, options = done.stdout.splitlines()
+    assert failure == "Error creating plan. False"
+    assert set(options.split()) == OPTIONS
     assert "Exception ignored" not in done.stderr
     assert "upsampfac=1.5 cannot be handled" in done.stderr
 
 
-def test_cufinuffts_options_are_those_of_the_fake(real_cupy: Any) -> None:
-    pytest.importorskip("cuda.pathfinder", reason="cuda-pathfinder comes with the extra 'gpu'")
-    code = """
-from sobolev_batch import BackendError
-from sobolev_batch.spectral.backends import Gpu
-try:
-    Gpu.load()
-except BackendError:
-    pass
-from cufinufft._cufinufft import NufftOpts
-print(*(name for name, _ in NufftOpts._fields_))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == OPTIONS
-
-
-# A real GPU.
-
-
-@pytest.fixture(scope="module")
-def gpu() -> Iterator[Gpu]:
-    try:
-        yield gpu_backend()
-    except BackendError as error:
-        pytest.skip(str(error))
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_a_gpu_agrees_with_the_processor(gpu: Gpu, name: str) -> None:
-    mesh = MESHES[name]
-    assert_agree(on(gpu, mesh), on(CPU, mesh), mesh)
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [("complex128", 1e-12), ("complex64", 1e-5)])
-@pytest.mark.parametrize("rule_tolerance", [1e-2, 1e-4])
-def test_a_gpu_agrees_in_both_precisions(
-    gpu: Gpu, dtype: ComplexDtype, tolerance: float, rule_tolerance: float
-) -> None:
-    settings = TransformSettings(1e-13 if dtype == "complex128" else 1e-6, dtype, tolerance=rule_tolerance)
-    mesh = uneven()
-    assert_agree(on(gpu, mesh, settings, batch=20_000), on(CPU, mesh, settings), mesh, tolerance)
-
-
-def test_a_gpu_agrees_in_parts(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh = icosphere(5)
-    monkeypatch.setattr(Gpu, "free_bytes", 7e7)
-    assert_agree(on(gpu, mesh), on(CPU, mesh), mesh)
-
-
-def test_a_gpu_out_of_memory_falls_back(gpu: Gpu) -> None:
-    pool = gpu.cupy.get_default_memory_pool()
+def test_a_gpu_agrees_in_parts_and_falls_back_without_memory(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, pool = icosphere(4), gpu.cupy.get_default_memory_pool()
     pool.free_all_blocks()
     pool.set_limit(size=1 << 16)
     try:
-        found = on(gpu, icosphere(4))
+        found = on(gpu, mesh)
     finally:
         pool.set_limit(size=0)
     assert found.backend == "finufft after cufinufft: out of memory"
-    assert on(gpu, icosphere(4)).backend == "cufinufft"
+    monkeypatch.setattr(Gpu, "free_bytes", 7e7)
+    assert_agree(on(gpu, icosphere(5)), on(CPU, icosphere(5)), icosphere(5))
 
 
 def test_the_exceptions_agree_with_numpy() -> None:

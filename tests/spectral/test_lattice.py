@@ -21,6 +21,8 @@ def test_frequencies_run_over_the_half_lattice_with_both_ends() -> None:
     assert (x[0], x[64], x[-1]) == (-5.0, 0.0, 5.0)
     assert np.array_equal(x, y)
     assert (z[0], z[-1]) == (0.0, 5.0)
+    shells = lattice.shells(lattice.half)
+    assert (shells[64, 64, 0], shells[0, 0, 64], shells.max()) == (0, 3 * 64**2, lattice.shell_count - 1)
 
 
 @pytest.mark.parametrize(
@@ -42,14 +44,6 @@ def test_trapezoid_weights_of_the_half_integrate_the_whole_cube() -> None:
     assert (weights * product).sum() == pytest.approx(9.0**3, rel=1e-14)
 
 
-def test_shells_are_squared_index_lengths() -> None:
-    lattice = Lattice(2.0, 4)
-    shells = lattice.shells(lattice.half)
-    assert shells[0, 0, 2] == 12
-    assert shells[2, 2, 0] == 0
-    assert shells.max() == lattice.shell_count - 1
-
-
 @pytest.mark.parametrize("largest", [1, 7, 50, 300, 10_000])
 def test_blocks_cover_the_half_once_and_respect_their_bound(largest: int) -> None:
     lattice = Lattice(1.0, 8)
@@ -57,6 +51,10 @@ def test_blocks_cover_the_half_once_and_respect_their_bound(largest: int) -> Non
     blocks = lattice.split(largest)
     for block in blocks:
         assert block.size <= largest
+        # As the chunks of a regular grid do, they differ at the high ends alone.
+        for axis, part in enumerate(lattice.place(block)):
+            assert part.start % blocks[0].shape[axis] == 0
+            assert block.shape[axis] == blocks[0].shape[axis] or part.stop == lattice.shape[axis]
         seen[lattice.place(block)] += 1
         frequencies = lattice.frequencies(block)
         for axis, part in enumerate(lattice.place(block)):
@@ -64,22 +62,9 @@ def test_blocks_cover_the_half_once_and_respect_their_bound(largest: int) -> Non
     assert (seen == 1).all()
 
 
-def test_block_shapes_are_those_of_a_regular_chunk_grid() -> None:
-    lattice = Lattice(1.0, 12)
-    first = lattice.split(40)[0].shape
-    for block in lattice.split(40):
-        for axis, part in enumerate(lattice.place(block)):
-            assert part.start % first[axis] == 0
-            assert block.shape[axis] == first[axis] or part.stop == lattice.shape[axis]
-
-
-def test_a_field_tells_its_lattice() -> None:
-    lattice = Lattice(2.5, 16)
-    assert Lattice.from_field(fourier_transform(Sphere(), lattice)) == lattice
-
-
 def test_parts_of_fields_are_not_taken_for_fields() -> None:
     field = fourier_transform(Sphere(), Lattice(2.5, 16))
+    assert Lattice.from_field(field) == Lattice(2.5, 16)
     with pytest.raises(LatticeError, match="select whole fields"):
         Lattice.from_field(field.isel(xi_z=slice(0, 5)))
     with pytest.raises(LatticeError, match="needs the coordinates"):
@@ -94,23 +79,15 @@ def test_shell_sums_of_blocks_add_up() -> None:
     parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
     whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
     assert np.allclose(parts, whole, rtol=1e-13, atol=0)
-    assert SobolevWeights(LATTICE, (-2.0,)).per_shell @ whole == pytest.approx(
-        norm(field, -2)["norm"].item() ** 2, rel=1e-14
-    )
+    weights = SobolevWeights(LATTICE, (-2.0,))
+    assert weights.per_shell @ whole == pytest.approx(norm(field, -2)["norm"].item() ** 2, rel=1e-14)
+    # They travel without what they can compute again.
+    copy = pickle.loads(pickle.dumps(weights))
+    assert copy == weights
+    assert "per_shell" not in vars(copy)
 
 
 def test_volumes_are_the_sums_of_ones() -> None:
     ones = np.ones(LATTICE.shape, dtype=np.complex128)
     assert shell_volumes(LATTICE) == pytest.approx(shell_sums(ones, None, LATTICE, LATTICE.half), rel=1e-13)
     assert shell_volumes(LATTICE).sum() == pytest.approx(8.0**3, rel=1e-13)
-
-
-def test_weights_travel_without_what_they_can_compute_again() -> None:
-    weights = SobolevWeights(LATTICE, (-2.0, -0.6))
-    radii = LATTICE.spacing * np.sqrt(np.arange(LATTICE.shell_count))
-    assert weights.per_shell[1] == pytest.approx((1 + radii**2) ** -0.6, rel=1e-14)
-    assert weights.per_shell is weights.per_shell
-    copy = pickle.loads(pickle.dumps(weights))
-    assert copy == weights
-    assert "per_shell" not in vars(copy)
-    assert np.array_equal(copy.per_shell, weights.per_shell)

@@ -17,11 +17,9 @@ from sobolev_batch import (
     norm,
 )
 from sobolev_batch.spectral.fields import PROBED_ORDERS, Quality
-from sobolev_batch.spectral.probe import Sample, draw, estimate, measure, needs_probe
+from sobolev_batch.spectral.probe import Sample, draw, estimate, measure
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
-from tests.support.shapes import CENTRED_BOX as BOX
 
 LATTICE = Lattice(3.0, 24)
 ORDERS = (-2.0, -5.0)
@@ -53,14 +51,6 @@ def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: S
         ratios.append(reported / true_errors)
     assert np.mean(covered) >= 0.98
     assert np.median(ratios) < 3
-
-
-def test_closed_forms_need_a_probe_in_single_precision_alone() -> None:
-    single, double = TransformSettings(dtype="complex64"), TransformSettings()
-    assert needs_probe(Sphere(), single)
-    assert not needs_probe(Sphere(), double)
-    assert needs_probe(BOX, double)
-    assert needs_probe(Ellipsoid((1.0, 0.8, 0.6)), double)
 
 
 def test_field_coordinates_and_attributes() -> None:

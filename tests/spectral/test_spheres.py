@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, OrderError, Sphere, norm
-from sobolev_batch.spectral.spheres import sphere_block, sphere_distance, sphere_inner_product, sphere_transform
+from sobolev_batch.spectral.spheres import sphere_block, sphere_inner_product, sphere_transform
 
 
 @pytest.mark.parametrize(
@@ -74,30 +74,3 @@ def test_block_and_pointwise_transform_agree() -> None:
 def test_says_when_its_functions_overflow() -> None:
     with pytest.raises(OrderError, match="too low"):
         sphere_inner_product(Sphere(), Sphere(), -1000.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("radius", "order"), [(1e-4, -10), (1e-3, -5), (1e-2, -2)])
-def test_small_spheres_apart_keep_their_digits(radius: float, order: int) -> None:
-    # Sixty digits leave nothing to cancellation.
-    with mpmath.workdps(60):
-        nu = mpmath.mpf(-order) - mpmath.mpf(1) / 2
-        separation, size = mpmath.mpf(0.965), mpmath.mpf(radius)
-
-        def matern(b: mpmath.mpf) -> mpmath.mpf:
-            scale = mpmath.sqrt(mpmath.pi) / (2**nu * mpmath.gamma(nu + mpmath.mpf(1) / 2))
-            return scale * (b**nu * mpmath.besselk(nu, b) if b else 2 ** (nu - 1) * mpmath.gamma(nu))
-
-        def product(distance: mpmath.mpf) -> mpmath.mpf:
-            def difference(t: mpmath.mpf) -> mpmath.mpf:
-                near, far = abs(distance * t), abs(2 * size + distance * t)
-                return matern(2 * mpmath.pi * near) - matern(2 * mpmath.pi * far)
-
-            if not distance:
-                return 8 * mpmath.pi * size**2 * difference(mpmath.mpf(0))
-            edges = [-1, -2 * size / distance, 0, 1]
-            return 4 * mpmath.pi * size**2 * mpmath.quad(difference, edges)
-
-        expected = float(mpmath.sqrt(2 * product(mpmath.mpf(0)) - 2 * product(separation)))
-    spheres = Sphere(radius), Sphere(radius, (0.965, 0.0, 0.0))
-    assert sphere_distance(*spheres, float(order)) == pytest.approx(expected, rel=1e-11)

@@ -107,34 +107,6 @@ def test_a_best_effort_that_succeeds_is_the_same() -> None:
 
 
 @pytest.mark.slow
-def test_a_looser_accuracy_is_never_harder() -> None:
-    # Cuboids repeat their faces, so that their tails are hard.
-    plate = Mesh(BOX.vertices * [1.0, 1.0, 0.05], BOX.triangles)
-    met, reachable = [], []
-    for rtol in (3e-1, 1e-1, 1e-2):
-        try:
-            met.append(bool(distance(BOX, plate, -1.0, rtol=rtol)["within"].item()))
-        except AccuracyError as refusal:
-            met.append(False)
-            reachable.append(refusal.reachable)
-    assert met == sorted(met, reverse=True)
-    for rtol in reachable:
-        assert distance(BOX, plate, -1.0, rtol=rtol)["within"].item()
-
-
-def test_equal_surfaces_have_the_distance_zero() -> None:
-    # Whatever the order of vertices and triangles, and their orientation.
-    order = np.random.default_rng(0).permutation(len(BOX.vertices))
-    places = np.argsort(order)
-    shuffled = Mesh(BOX.vertices[order], places[BOX.triangles[::-1, [2, 0, 1]]])
-    for other in (Mesh(BOX.vertices, BOX.triangles), shuffled):
-        dataset = distance(BOX, other, [-0.6, -3.0], rtol=1e-3)
-        assert (dataset["distance"] == 0).all()
-        assert (dataset["error"] == 0).all()
-        assert dataset["within"].all()
-
-
-@pytest.mark.slow
 def test_what_surfaces_share_cancels() -> None:
     ball = icosphere(2)
     less = Mesh(ball.vertices, ball.triangles[5:])
@@ -198,17 +170,6 @@ def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
     assert abs(apart["distance"].item() - exact) <= apart["error"].item()
 
 
-@pytest.mark.slow
-def test_what_a_small_lattice_does_not_reach_is_measured_beyond_it() -> None:
-    # Up to some 8 cycles, the distance of near meshes is still growing.
-    dataset = distance(icosphere(3), icosphere(4), -2.0, rtol=0.1)
-    assert dataset["within"].item()
-    assert dataset.attrs["M"] <= 64
-    assert dataset["truncation"].item() > 0
-    finer = distance(icosphere(3), icosphere(4), -2.0, rtol=0.01)
-    assert abs(finer["distance"].item() - dataset["distance"].item()) <= dataset["error"].item()
-
-
 def test_what_lies_below_rounding_is_refused() -> None:
     with pytest.raises(AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
         distance(icosphere(3), Sphere(), -10.0, rtol=1e-12)
@@ -223,15 +184,6 @@ def test_very_negative_orders(order: float) -> None:
     assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= 1e-4 * exact
     with pytest.raises(OrderError, match="orders go down to -100"):
         distance(Sphere(), Sphere(0.9), [order, -1e6], rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_many_orders_at_once_are_met_together() -> None:
-    orders = [-0.6, -2.0, -20.0]
-    exact = distance(Sphere(), Sphere(1.01), orders)["distance"]
-    dataset = distance(Sphere(), Sphere(1.01), orders, rtol=1e-2)
-    assert dataset["within"].all()
-    assert (abs(dataset["distance"] - exact) <= dataset["error"]).all()
 
 
 SIDES, HEIGHT = 144, 0.2

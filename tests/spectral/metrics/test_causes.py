@@ -124,15 +124,8 @@ def test_bands_are_sums_over_the_whole_lattice() -> None:
     assert dataset["squared"].sum().item() < dataset["total"].item()
 
 
-def test_energy_of_a_sphere_is_its_closed_form() -> None:
-    # ∫_{|ξ|=r} |σ^|² dS = 16π sin²(2πr): twice the area in the mean over whole periods, zero at multiples of 1/2.
-    lattice = Lattice(5.0, 160)
-    edges = np.arange(1.0, 5.01, 0.125)
-    dataset = spectrum(Sphere(), None, -2.0, bands=edges.tolist(), lattice=lattice)
-    middles = (edges[1:] + edges[:-1]) / 2
-    averages = 8 * np.pi * (1 - np.sinc(2 * 0.125) * np.cos(4 * np.pi * middles))
-    assert dataset["energy"].values == pytest.approx(averages, rel=0.1, abs=1.5)
-    whole = spectrum(Sphere(), None, -2.0, bands=[1.0, 5.0], lattice=lattice)
+def test_energy_of_a_sphere_is_twice_its_area_in_the_mean() -> None:
+    whole = spectrum(Sphere(), None, -2.0, bands=[1.0, 5.0], lattice=Lattice(5.0, 160))
     assert whole["energy"].item() == pytest.approx(2 * Sphere().area, rel=0.02)
 
 

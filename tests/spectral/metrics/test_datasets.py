@@ -44,11 +44,8 @@ def test_every_number_has_a_unit_and_a_name(name: str) -> None:
     assert dataset["order"].values.tolist() == [-2.0, -3.0]
 
 
-def test_closed_forms_have_no_lattice() -> None:
+def test_settings_of_an_accuracy_are_attributes_and_closed_forms_have_none() -> None:
     assert set(distance(Sphere(), Sphere(0.5), -2.0).attrs) == {"kernel"}
-
-
-def test_settings_of_an_accuracy_are_attributes() -> None:
     dataset = distance(icosphere(0), Sphere(), [-5.0], rtol=0.1)
     assert dataset["within"].attrs["long_name"]
     chosen = {"kernel", "rtol", "xi_max", "M", "octaves", "highest_frequency", "seed"}

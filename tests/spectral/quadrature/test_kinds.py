@@ -143,20 +143,3 @@ def test_each_place_gets_the_weights_of_all_its_triangles(
     positive = {place for place, weight in expected.items() if weight > 0}
     assert positive <= found.keys() <= expected.keys()
     assert all(found[place] == pytest.approx(expected[place], rel=1e-14) for place in found)
-
-
-@pytest.mark.parametrize(("merge", "rule"), CASES)
-def test_a_closed_mesh_costs_what_its_rule_says(merge: Merge, rule: TriangleRule) -> None:
-    mesh = icosphere(4)
-    _, weights = merge(arrays(mesh), np.arange(len(mesh.triangles)))
-    assert len(weights) / len(mesh.triangles) == pytest.approx(rule.cost, abs=1e-3)
-
-
-@pytest.mark.parametrize(("merge", "rule"), CASES)
-def test_some_of_the_triangles(merge: Merge, rule: TriangleRule) -> None:
-    mesh, members = icosphere(2), np.arange(7, 90, 3)
-    coordinates, weights = merge(arrays(mesh), members)
-    assert weights.sum() == pytest.approx(mesh.areas[members].sum(), rel=1e-14)
-    alone = Mesh(mesh.vertices, mesh.triangles[members])
-    mean = sum(np.array(place) * weight for place, weight in unmerged(alone, rule).items())
-    assert coordinates @ weights == pytest.approx(mean, abs=1e-13)

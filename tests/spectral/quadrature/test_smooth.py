@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sobolev_batch import (
     Ellipsoid,
     InputError,
-    Interval,
     Lattice,
     LatticeError,
     Mesh,
@@ -37,7 +36,6 @@ from tests.support.shapes import (
     TURN,
     Roof,
     angular_ball,
-    plate,
     turned_torus,
 )
 
@@ -109,13 +107,6 @@ def test_an_ellipsoid_on_its_axes_is_an_integral_of_elliptic_integrals() -> None
             assert values[place] == pytest.approx(exact, abs=1e-12 * ellipsoid.area)
 
 
-def test_a_rectangle_is_a_product_of_sines() -> None:
-    surface = ParametrisedSurface(plate, Interval(-1.0, 1.0), Interval(-0.5, 0.5))
-    points = frequencies()
-    exact = 2 * np.sinc(2 * points[:, 0]) * np.sinc(points[:, 1])
-    assert exact_values(surface, points) == pytest.approx(exact, abs=1e-13)
-
-
 @pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
 def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
     scale, origin = 0.6, np.array([0.5, -0.3, 0.1])
@@ -124,17 +115,6 @@ def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
     points = frequencies()
     expected = scale**2 * np.exp(2j * np.pi * scale * (points @ origin)) * exact_values(surface, scale * points)
     assert exact_values(moved, points) == pytest.approx(expected, abs=1e-12 * moved.area)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
-def test_blocks_are_parts_of_the_field(surface: Smooth) -> None:
-    settings = TransformSettings(1e-13)
-    whole = transform_block(surface, LATTICE, LATTICE.half, settings)
-    assert whole.points > 1000
-    for block in LATTICE.split(4000):
-        part = transform_block(surface, LATTICE, block, settings, Execution(allowed_bytes=1e9, batch=1 << 12))
-        assert part.values == pytest.approx(whole.values[LATTICE.place(block)], abs=1e-12 * surface.area)
 
 
 # The nodes.
@@ -192,17 +172,6 @@ def test_a_surface_beyond_the_period_is_refused() -> None:
 # What is said of the error.
 
 
-@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
-@pytest.mark.parametrize("eps", [1e-3, 1e-6])
-def test_the_error_of_the_nufft_is_reported(surface: Smooth, eps: float) -> None:
-    orders = [-2.0, -5.0]
-    field, exact = (fourier_transform(surface, LATTICE, accuracy, threads=1) for accuracy in (eps, 1e-14))
-    truth = distance(field, exact, orders)["distance"].values
-    reported = norm(field, orders)["discretisation"].values
-    assert (truth <= reported).all()
-    assert (reported < 30 * truth).all()
-
-
 def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SMOOTH[1]
     exact = fourier_transform(surface, LATTICE, 1e-14, threads=1)
@@ -253,24 +222,6 @@ def test_a_gpu_gets_the_same_nodes() -> None:
         assert (found.backend, expected.backend) == ("cufinufft", "finufft")
         assert found.points == expected.points > 1 << 12
         assert np.abs(found.values - expected.values).max() < 1e-12 * surface.area
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_reported_errors_hold_true_ones(seed: int) -> None:
-    rng = np.random.default_rng([11, seed])
-    axes, radii = rng.uniform(0.3, 0.9, 3), np.sort(rng.uniform(0.1, 0.5, 2))
-    torus = Torus(float(radii[1]) + 0.2, float(radii[0]), (0.0, 0.0, float(rng.uniform(-0.3, 0.3))))
-    ellipsoid = Ellipsoid((float(axes[0]), float(axes[1]), float(axes[2])))
-    mesh = torus.mesh(int(rng.integers(8, 40)), int(rng.integers(5, 20)))
-    orders = [-5.0, -8.0]
-    for other in (ellipsoid, mesh):
-        truth = distance(torus, other, orders, rtol=1e-5)
-        found = distance(torus, other, orders, rtol=float(10 ** rng.uniform(-3.5, -1)))
-        assert truth["within"].all()
-        assert found["within"].all()
-        error = np.abs(found["distance"].values - truth["distance"].values)
-        assert (error <= found["error"].values + truth["error"].values).all()
 
 
 @pytest.mark.slow

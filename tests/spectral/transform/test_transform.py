@@ -6,14 +6,13 @@ import shlex
 import subprocess
 import sys
 from dataclasses import replace
-from math import prod
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends import CPU_COSTS, GPU_COSTS, ComplexDtype, Costs, NufftSpec, Workload
+from sobolev_batch.spectral.backends import CPU_COSTS, ComplexDtype, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.nufft import transform_points
@@ -25,16 +24,12 @@ from tests.support.shapes import CENTRED_BOX as BOX
 Reals = NDArray[np.float64]
 
 
-def slivers(rng: np.random.Generator) -> Mesh:
-    corners = rng.uniform(-0.9, 0.9, size=(40, 3, 3))
-    corners[:, 2] = corners[:, 0] + 1e-4 * rng.normal(size=(40, 3))
-    return Mesh(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3))
-
-
 def soup(rng: np.random.Generator) -> Mesh:
     centers = rng.uniform(-0.8, 0.8, size=(60, 1, 3))
-    sizes = 10.0 ** rng.uniform(-4, -0.7, size=(60, 1, 1))
-    return Mesh((centers + sizes * rng.normal(size=(60, 3, 3))).reshape(-1, 3), np.arange(180).reshape(-1, 3))
+    corners = centers + 10.0 ** rng.uniform(-4, -0.7, size=(60, 1, 1)) * rng.normal(size=(60, 3, 3))
+    # Half of them are slivers.
+    corners[:30, 2] = corners[:30, 0] + 1e-4 * rng.normal(size=(30, 3))
+    return Mesh(corners.reshape(-1, 3), np.arange(180).reshape(-1, 3))
 
 
 def moved_box(rng: np.random.Generator) -> Mesh:
@@ -49,7 +44,7 @@ def bumpy(rng: np.random.Generator) -> Mesh:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [slivers, soup, moved_box, bumpy])
+@pytest.mark.parametrize("make", [soup, moved_box, bumpy])
 @pytest.mark.parametrize("eps", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
 def test_agrees_with_the_exact_transform_to_a_small_multiple_of_eps(make, eps: float) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(17)
@@ -211,16 +206,6 @@ def test_refuses_meshes_that_would_fold() -> None:
     fourier_transform(icosphere(1), Lattice(5.0, 22))
 
 
-@pytest.mark.parametrize("shape", [(65, 65, 33), (129, 129, 65), (17, 90, 3), (5, 4, 2)])
-@pytest.mark.parametrize("sigma", [1.25, 1.5, 2.0])
-@pytest.mark.parametrize("costs", [CPU_COSTS, GPU_COSTS], ids=["cpu", "gpu"])
-def test_smaller_sub_blocks_never_take_more(shape: tuple[int, int, int], sigma: float, costs: Costs) -> None:
-    workload = Workload(1e6, 1e6)
-    specs = [NufftSpec(sub_shape, 1e-6, oversampling=sigma) for sub_shape in sub_shapes(shape, sigma)]
-    projected = [costs.projected_bytes(spec, workload) for spec in specs]
-    assert projected == sorted(projected, reverse=True)
-
-
 @pytest.mark.parametrize("allowed_bytes", [2.2e7, 4e7, 8e7, 1.2e8])
 def test_it_is_the_fastest_of_all_that_fit(allowed_bytes: float) -> None:
     whole, workload, costs = NufftSpec((129, 129, 65), 1e-6), Workload(3e5, 6e5, 100_000), CPU_COSTS
@@ -236,13 +221,3 @@ def test_it_is_the_fastest_of_all_that_fit(allowed_bytes: float) -> None:
     fastest = min(costs.projected_nanoseconds(other, whole.shape, workload) for other in fitting)
     assert found != whole
     assert costs.projected_nanoseconds(found, whole.shape, workload) <= 1.05 * fastest
-
-
-def test_sub_blocks_cover_the_block_once() -> None:
-    block = Block((-3, 1, 2), (5, 4, 4))
-    covered = np.zeros(block.shape, dtype=int)
-    for sub_block, (x, y, z) in block.tiles((2, 3, 3)):
-        assert prod(sub_block.shape) == 18
-        assert sub_block.start == (block.start[0] + x.start, block.start[1] + y.start, block.start[2] + z.start)
-        covered[x, y, z] += 1
-    assert (covered == 1).all()
