@@ -1,4 +1,7 @@
-"""Meshes made of one other mesh: coarser ones, those with vertices elsewhere, and those carried along by a flow."""
+"""Meshes made of one other mesh: coarser ones, those with vertices elsewhere, and those carried along by a flow.
+
+docs/studies.md has the keys of each source.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,6 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Point
 from sobolev_batch.surfaces.sources.generated import Levels, Triple
 from sobolev_batch.surfaces.sources.registry import (
-    Fingerprint,
     MadeMember,
     Member,
     NestedSource,
@@ -28,8 +30,6 @@ from sobolev_batch.surfaces.sources.registry import (
     single_member,
 )
 
-# Takes a mesh and a number of triangles.
-_Reduction = Callable[[Mesh, int], Mesh]
 # Measured peak of simplifying and of clustering, for each triangle of the original.
 _REDUCING_BYTES = 450
 # No mesh that can be read has as many.
@@ -87,10 +87,6 @@ class DecimateSource(NestedSource):
 
     M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
     doi:10.1145/258734.258849; by the library fast-simplification.
-
-    Attributes:
-        mesh: Table of a source with one member, the mesh to reduce.
-        triangles: Triangle counts of the coarser versions; each must be below that of the mesh.
     """
 
     triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
@@ -98,7 +94,7 @@ class DecimateSource(NestedSource):
     kind: ClassVar[str] = "decimate"
     library: ClassVar[str] = "fast-simplification"
     # What the library does to a mesh, down to a number of triangles.
-    reduce: ClassVar[_Reduction] = staticmethod(decimated)
+    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(decimated)
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per triangle count, coarse to fine."""
@@ -119,7 +115,7 @@ class DecimateSource(NestedSource):
         )
 
 
-def _reduced(mesh: Mesh, reduce: _Reduction, triangles: int) -> Mesh:
+def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int) -> Mesh:
     if triangles >= len(mesh.triangles):
         raise MeshError(
             f"the mesh has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: choose fewer"
@@ -136,7 +132,7 @@ class RemeshSource(DecimateSource):
     """
 
     kind, library = "remesh", "pyacvd"
-    reduce: ClassVar[_Reduction] = staticmethod(remeshed)
+    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(remeshed)
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -150,11 +146,6 @@ class SphericalLevelsSource(NestedSource):
     The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:
     the first 10*4^N + 2 form level N. Its map to the sphere has the same vertices in the same order,
     and the convex hull of the first ones gives the triangles of the level.
-
-    Attributes:
-        mesh: Table of a source with one member, the surface.
-        sphere: Table of a source with one member, its map to the sphere.
-        levels: Levels N.
     """
 
     sphere: OtherSource
@@ -197,13 +188,7 @@ def _first_vertices(surface: Mesh, sphere: Mesh, level: int) -> Mesh:
 
 
 class MovedSource(NestedSource):
-    """A mesh moved by some distances.
-
-    Attributes:
-        mesh: Table of a source with one member, the mesh to move.
-        distances: Distances, as fractions of the radius of the mesh's bounding sphere.
-        direction: Direction to move in; its length does not matter.
-    """
+    """A mesh moved by some distances, as fractions of the radius of its bounding sphere."""
 
     distances: Fractions
     direction: Triple = (1.0, 0.0, 0.0)
@@ -217,21 +202,14 @@ class MovedSource(NestedSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each distance, the smallest first."""
-        original = single_member(self.mesh, folder)
         direction = (np.asarray(self.direction) / np.linalg.norm(self.direction)).tolist()
-        return tuple(
-            _displaced("moved", original, distance, _moved, direction, {"direction": direction})
-            for distance in sorted(set(self.distances))
-        )
+        return _displaced("moved", single_member(self.mesh, folder), self.distances, _moved, direction=direction)
 
 
 class NoisySource(NestedSource):
     """A mesh whose vertices are displaced along its normals at random; see `with_noise`.
 
-    Attributes:
-        mesh: Table of a source with one member, the mesh to displace.
-        amplitudes: Standard deviations of the noise, as fractions of the radius of the mesh's bounding sphere.
-        seed: Seed of the noise, which is the same for all amplitudes but for their size.
+    Amplitudes are fractions of the radius of its bounding sphere. The noise is the same for all, but for its size.
     """
 
     amplitudes: Fractions
@@ -239,11 +217,7 @@ class NoisySource(NestedSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each amplitude, the smallest first."""
-        original = single_member(self.mesh, folder)
-        return tuple(
-            _displaced("noisy", original, amplitude, _noisy, self.seed, {"seed": self.seed})
-            for amplitude in sorted(set(self.amplitudes))
-        )
+        return _displaced("noisy", single_member(self.mesh, folder), self.amplitudes, _noisy, seed=self.seed)
 
 
 class FlowSource(NestedSource):
@@ -255,12 +229,6 @@ class FlowSource(NestedSource):
 
     Source: R. Nair, P. Lauritzen, "A class of deformational flow test cases for linear transport problems on the
     sphere" (2010), doi:10.1016/j.jcp.2010.08.014.
-
-    Attributes:
-        mesh: Table of a source with one member, the mesh at time 0.
-        times: Times, in the unit of the period.
-        period: Time after which all is as it was.
-        strength: Strength k of the deformation, in radians per unit of time.
     """
 
     times: Times
@@ -274,7 +242,7 @@ class FlowSource(NestedSource):
             MadeMember(
                 repr(time),
                 -1,
-                _carried,
+                carried,
                 {"time": time, "settings": [self.period, self.strength], "version": _VERSION},
                 (time, self.period, self.strength),
                 originals={"flow": start},
@@ -286,17 +254,20 @@ class FlowSource(NestedSource):
 
 
 def _displaced(
-    kind: str, original: Member, amount: float, displace: Callable[..., Mesh], argument: Any, what: Fingerprint
-) -> Member:
-    """Return the member of a mesh displaced by a fraction of the radius of its bounding sphere."""
-    return MadeMember(
-        f"{amount:g}",
-        -1,
-        displace,
-        {"amount": amount, "version": _VERSION, **what},
-        (amount, argument),
-        originals={kind: original},
-        triangle_bytes=_DISPLACING_BYTES,
+    kind: str, original: Member, amounts: tuple[float, ...], displace: Callable[..., Mesh], **settings: Any
+) -> tuple[Member, ...]:
+    """Return a member for each fraction of the radius by which a mesh is displaced, the smallest first."""
+    return tuple(
+        MadeMember(
+            f"{amount:g}",
+            -1,
+            displace,
+            {"amount": amount, "version": _VERSION, **settings},
+            (amount, *settings.values()),
+            originals={kind: original},
+            triangle_bytes=_DISPLACING_BYTES,
+        )
+        for amount in sorted(set(amounts))
     )
 
 
@@ -308,10 +279,6 @@ def _moved(mesh: Mesh, amount: float, direction: Point) -> Mesh:
 def _noisy(mesh: Mesh, amount: float, seed: int) -> Mesh:
     _, radius = mesh.bounding_sphere
     return with_noise(mesh, amount * radius, seed)
-
-
-def _carried(mesh: Mesh, time: float, period: float, strength: float) -> Mesh:
-    return Mesh(carried(np.asarray(mesh.vertices), time, period, strength), mesh.triangles)
 
 
 def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
@@ -342,25 +309,19 @@ def _normals(vertices: Reals, triangles: NDArray[np.int64]) -> Reals:
     return np.asarray(np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0))
 
 
-def carried(points: Reals, time: float, period: float, strength: float) -> Reals:
-    """Return where the flow of `FlowSource` carries points from time 0 on, (n, 3).
-
-    Args:
-        points: Points at time 0, (n, 3).
-        time: Time at which they are requested.
-        period: Period T.
-        strength: Strength k, in radians per unit of time.
+def carried(mesh: Mesh, time: float, period: float, strength: float) -> Mesh:
+    """Return a mesh whose vertices the flow of `FlowSource` has carried along from time 0 on.
 
     On the unit sphere, in a frame that turns once around z in a period T, the velocity at x is
-    2k cos(πt/T) y (x × e_y), where y is the point's own coordinate. It keeps y, so each circle around the y axis turns
-    as a whole, by the angle -(2kT/π) sin(πt/T) y.
+    2k cos(πt/T) y (x × e_y), where y is the point's own coordinate and k the strength, in radians per unit of time.
+    It keeps y, so each circle around the y axis turns as a whole, by the angle -(2kT/π) sin(πt/T) y.
     """
-    x, y, z = points.T
-    radii = np.linalg.norm(points, axis=1)
+    x, y, z = mesh.vertices.T
+    radii = np.linalg.norm(mesh.vertices, axis=1)
     heights = np.divide(y, radii, out=np.zeros_like(y), where=radii > 0)
     angles = -2 * strength * period / np.pi * np.sin(np.pi * time / period) * heights
     cosines, sines = np.cos(angles), np.sin(angles)
     wound = np.stack([cosines * x + sines * z, y, cosines * z - sines * x])
     turn = 2 * np.pi * time / period
     rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray((rotation @ wound).T)
+    return Mesh((rotation @ wound).T, mesh.triangles)

@@ -1,4 +1,7 @@
-"""The sources `sphere`, `ellipsoid` and `torus`: closed forms, and with levels triangulations of them; `icosphere`."""
+"""The sources `sphere`, `ellipsoid` and `torus`: closed forms, and with levels triangulations of them; `icosphere`.
+
+docs/studies.md has the keys of each source.
+"""
 
 from __future__ import annotations
 
@@ -62,12 +65,7 @@ class ClosedFormSource(Source, ABC):
 
 
 class SphereSource(ClosedFormSource):
-    """A sphere in closed form.
-
-    Attributes:
-        radius: Radius, in units of length.
-        center: Centre, in units of length.
-    """
+    """A sphere in closed form."""
 
     label = "sphere"
 
@@ -81,13 +79,7 @@ class SphereSource(ClosedFormSource):
 
 
 class EllipsoidSource(ClosedFormSource):
-    """An ellipsoid as a smooth surface, or icospheres with their vertices moved onto it.
-
-    Attributes:
-        axes: Semi-axes along x, y and z, in units of length.
-        center: Centre, in units of length.
-        levels: Levels of the icospheres; None for the ellipsoid itself.
-    """
+    """An ellipsoid as a smooth surface, or icospheres with their vertices moved onto it."""
 
     label = "ellipsoid"
 
@@ -116,13 +108,7 @@ class EllipsoidSource(ClosedFormSource):
 class TorusSource(ClosedFormSource):
     """A torus as a smooth surface, its axis along z, or grids of points on it, each cell cut into two triangles.
 
-    Attributes:
-        R: Distance from the centre to the middle of the tube, in units of length.
-        r: Radius of the tube, less than R.
-        center: Centre, in units of length.
-        levels: Levels N of grids, each with twice as many cells each way as the one before; None for the torus itself.
-        around: Number of cells around the axis at level 0.
-        across: Number of cells around the tube at level 0.
+    Each level has twice as many cells each way as the one before.
     """
 
     label = "torus"
@@ -163,11 +149,7 @@ class TorusSource(ClosedFormSource):
 
 
 class IcosphereSource(Source):
-    """Icosahedral triangulations T_N of the unit sphere.
-
-    Attributes:
-        levels: Levels N.
-    """
+    """Icosahedral triangulations T_N of the unit sphere."""
 
     levels: Levels
 

@@ -141,8 +141,8 @@ def test_what_the_vertices_depend_on_is_in_the_fingerprint(table: dict[str, Any]
 
 
 def test_a_vertex_at_the_centre_stays() -> None:
-    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
-    np.testing.assert_array_equal(carried(points, 1.0, 5.0, 2.0)[0], 0.0)
+    mesh = Mesh([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]], [[0, 1, 2]])
+    np.testing.assert_array_equal(carried(mesh, 1.0, 5.0, 2.0).vertices[0], 0.0)
 
 
 def test_decimated_meshes_have_the_counts_asked_for() -> None:
